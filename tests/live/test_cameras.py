@@ -1,11 +1,12 @@
 """Cameras that need no client library: folders of images, and what OpenCV opens."""
 
 import os
+import queue
 import threading
 import time
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,12 +15,13 @@ import pytest
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers import extras
 from visioncal.live.drivers.images import FolderCamera
-from visioncal.live.drivers.newest import Arrival
 from visioncal.live.drivers.oak import OakCamera
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
-from visioncal.live.drivers.uvc import GrabbedPictures, UvcCamera
+from visioncal.live.drivers.uvc import UvcCamera
 
 RNG = np.random.default_rng(7)
+# Longer than anything takes that comes at all [s].
+PATIENT_S = 20.0
 
 
 def test_a_missing_extra_tells_the_command_that_installs_it(monkeypatch):
@@ -91,37 +93,15 @@ def test_a_folder_without_images_or_with_a_bad_one_is_refused_by_name(tmp_path):
         camera.frame()
 
 
-def a_video(path, count=5):
-    # FFV1 is lossless; random pictures tell a wrong order from a right one.
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 10.0, (64, 48))
-    assert writer.isOpened()
-    images = [RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(count)]
-    for image in images:
-        writer.write(image)
+def test_a_video_file_is_refused_whose_pictures_have_no_time(tmp_path):
+    path = str(tmp_path / "a.avi")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 10.0, (64, 48))
+    for _ in range(3):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
-    return images
-
-
-def test_a_video_file_gives_its_pictures_and_then_says_that_it_is_at_its_end(tmp_path):
-    images = a_video(tmp_path / "a.avi")
-    camera = UvcCamera(str(tmp_path / "a.avi"))
-    assert isinstance(camera, CameraDevice)
-    assert camera.resolution == (64, 48)
-    assert camera.settings["rate_hz"] == 10.0
-    # FFV1 stores colours as luma and chroma, so they come back within some levels.
-    for image in images:
-        taken = camera.frame().image.astype(float)
-        assert np.abs(taken.mean(axis=(0, 1)) - image.mean(axis=(0, 1))).max() < 3.0
-    with pytest.raises(DriverError, match="at its end"):
-        camera.frame()
-    camera.close()
-    camera.close()
-
-
-def test_another_resolution_than_wished_is_refused(tmp_path):
-    a_video(tmp_path / "a.avi")
-    with pytest.raises(DriverError, match="gives 64x48 pixels, not 640x480"):
-        UvcCamera(str(tmp_path / "a.avi"), DeviceSetup(resolution=(640, 480)))
+    with pytest.raises(DriverError, match="video file") as error:
+        UvcCamera(path)
+    assert "folder:" in error.value.next_step
 
 
 def test_what_cannot_be_opened_tells_where_to_look(tmp_path, capfd):
@@ -132,90 +112,138 @@ def test_what_cannot_be_opened_tells_where_to_look(tmp_path, capfd):
     capfd.readouterr()
 
 
-class Queued:
-    """A capture as V4L2's or a stream's: when pictures come, and what it tells of that [s]."""
-
-    def __init__(self, *pictures):
-        self.pictures, self.told_s = list(pictures), 0.0
-
-    def grab(self):
-        """Takes the next picture."""
-        if not self.pictures:
-            return False
-        self.now_s, self.told_s = self.pictures.pop(0)
-        return True
-
-    def get(self, what):
-        """Tells when it came, where the driver does."""
-        return 1e3 * self.told_s if what == cv2.CAP_PROP_POS_MSEC else 0.0
-
-    def retrieve(self):
-        """Gives nothing."""
-        return False, None
-
-
-def arrivals_of(monkeypatch, *pictures, **words):
-    """What becomes of pictures that come, and are stamped, at given times."""
-    capture = Queued(*pictures)
-    clock = SimpleNamespace(monotonic=lambda: capture.now_s)
-    monkeypatch.setattr("visioncal.live.drivers.uvc.time", clock)
-    source = GrabbedPictures(capture, "camera", **words)
-    return [source.grab() for _ in pictures], source
-
-
-def test_a_kernels_time_is_taken_where_it_can_be_true(monkeypatch):
-    told, source = arrivals_of(
-        monkeypatch, (100.0, 99.0), (101.0, 0.0), (102.0, 1.7e9), exposure_s=0.02, is_stream=False
-    )
-    assert told == [Arrival(99.0, 98.98), Arrival(101.0), Arrival(102.0)]
-    with pytest.raises(DriverError, match="gives no picture"):
-        source.take()
-    with pytest.raises(DriverError, match="unplugged"):
-        source.grab()
-
-
-def test_a_stream_whose_decoding_lags_is_stamped_as_if_it_did_not(monkeypatch):
-    # Its clock says 0.1 s a picture; decoding takes 0.3 s each. It then begins anew.
-    pictures = [(100.0, 5.0), (100.3, 5.1), (100.6, 5.2), (100.65, 5.9), (101.0, 2.0)]
-    found, _ = arrivals_of(monkeypatch, *pictures, is_stream=True)
-    # By 0.1 ms a second their clocks may run apart, which counts as a delay.
-    assert [value.stamp_s for value in found] == pytest.approx(
-        [100.0, 100.1, 100.2, 100.65, 101.0], abs=1e-4
-    )
-    assert [item.began_s for item in found[1:]] == [item.stamp_s for item in found[:-1]]
-
-
-class Hanging(Queued):
-    """A capture that gives one picture; then its camera is lost, and whoever waits hangs."""
+class Scripted:
+    """A capture whose pictures come when a test says so; a picture is its number."""
 
     def __init__(self):
-        super().__init__((0.0, 0.0))
-        self.freed = threading.Event()
+        self.coming, self.taken, self.count = queue.Queue(), [], 0
+        self.is_released = threading.Event()
         self.isOpened, self.set = (lambda *_: True,) * 2
 
     def grab(self):
-        """Gives the first, then hangs."""
-        return super().grab() or not self.freed.wait()
+        """Waits for the next picture, or the end."""
+        self.at_s = self.coming.get()
+        self.count += 1
+        return self.at_s is not None
+
+    def get(self, what):
+        """Tells the time of the driver, where the test gives it one."""
+        return 1e3 * self.at_s if what == cv2.CAP_PROP_POS_MSEC and self.count else 0.0
 
     def retrieve(self):
-        """Gives it."""
-        return True, np.zeros((48, 64, 3), np.uint8)
+        """Decodes."""
+        self.taken.append(self.count)
+        return True, np.full((48, 64, 3), self.count, np.uint8)
 
     def release(self):
-        """Frees nobody."""
+        """Is told to the test."""
+        self.is_released.set()
 
 
-def test_a_camera_that_hangs_is_told_in_time(monkeypatch):
-    capture = Hanging()
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture)
-    camera = UvcCamera(0)
+@pytest.fixture
+def capture(monkeypatch):
+    made = Scripted()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: made)
+    yield made
+    made.coming.put(None)
+    assert made.is_released.wait(PATIENT_S)
+
+
+def opened(capture, source=0, requested=None):
+    """A camera whose first picture has come."""
+    capture.coming.put(0.0)
+    return UvcCamera(source, requested)
+
+
+def asked(camera, capture, *times_s, pause_s=0.0):
+    """The number of the picture that a request gets, of those that come after it."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(camera.frame, timeout_s=PATIENT_S)
+        while camera._request_s is None:
+            time.sleep(1e-3)
+        for at_s in times_s:
+            time.sleep(pause_s)
+            capture.coming.put(at_s)
+        frame = waiting.result()
+    return int(frame.image[0, 0, 0]), frame
+
+
+def test_what_was_under_way_when_it_was_asked_for_is_passed_by(capture):
+    camera = opened(capture)
+    number, frame = asked(camera, capture, 0.0, 0.0, pause_s=0.05)
+    assert number == 3
+    assert abs(frame.stamp_s - time.monotonic()) < PATIENT_S
+    # Only what is given is decoded.
+    assert capture.taken == [1, 3]
+
+
+def test_a_burst_after_a_stall_had_waited_and_is_passed_by(capture):
+    camera = opened(capture)
+    for _ in range(5):
+        time.sleep(0.1)
+        capture.coming.put(0.0)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(camera.frame, timeout_s=PATIENT_S)
+        while camera._request_s is None:
+            time.sleep(1e-3)
+        # Ten at once, then one after an interval.
+        for _ in range(10):
+            capture.coming.put(0.0)
+        time.sleep(0.3)
+        capture.coming.put(0.0)
+        assert int(waiting.result().image[0, 0, 0]) == 17
+
+
+def test_a_kernels_time_is_taken_where_it_can_be_true(capture):
+    camera = opened(capture, requested=DeviceSetup(exposure_us=20_000))
+    soon_s = time.monotonic() + 0.1
+    time.sleep(0.3)
+    # Exposed before the request; then after it.
+    fresh_s = time.monotonic() + 0.1
+    number, frame = asked(camera, capture, soon_s, fresh_s, pause_s=0.2)
+    assert number == 3
+    assert frame.stamp_s == pytest.approx(fresh_s - 0.01)
+    assert frame.exposure_s == 0.02
+
+
+def test_a_stream_whose_decoding_lags_is_stamped_as_if_it_did_not(capture):
+    camera = opened(capture, "rtsp://somewhere/stream")
+    stamps = []
+    # Its clock says 0.1 s a picture; decoding takes 0.3 s each. It then begins anew.
+    for now_s, told_s in ((100.0, 5.0), (100.3, 5.1), (100.6, 5.2), (100.65, 5.9), (101.0, 2.0)):
+        capture.at_s = told_s
+        stamps.append(camera._arrival(now_s)[0])
+    # By 0.1 ms a second their clocks may run apart, which counts as a delay.
+    assert stamps == pytest.approx([100.0, 100.1, 100.2, 100.65, 101.0], abs=1e-4)
+
+
+def test_a_camera_that_hangs_or_ends_is_told(capture):
+    camera = opened(capture)
     for _ in range(2):
         with pytest.raises(DriverError, match=r"camera 0 stalls: no picture has come for 0\.\d s"):
             camera.frame(timeout_s=0.01)
-    capture.freed.set()
+    capture.coming.put(None)
     with pytest.raises(DriverError, match="unplugged"):
-        camera.frame(timeout_s=10.0)
+        camera.frame(timeout_s=PATIENT_S)
     camera.close()
+    camera.close()
+    assert not camera._thread.is_alive()
+
+
+def test_pictures_that_all_come_late_are_told(capture):
+    camera = opened(capture)
+    old_s = time.monotonic()
+    time.sleep(0.01)
+    for _ in range(10):
+        capture.coming.put(old_s)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(camera.frame, timeout_s=0.5)
+        while camera._request_s is None:
+            time.sleep(1e-3)
+        for _ in range(5):
+            capture.coming.put(old_s)
+        with pytest.raises(DriverError, match="no fresh pictures"):
+            waiting.result()
 
 
 def test_a_stream_that_nobody_serves_is_told_in_seconds(capfd):

@@ -43,10 +43,7 @@ class NetworkCamera:
     Attributes:
         draw: Draws what the camera sees, (h, w) grey.
         period_s: From one picture to the next [s].
-        boundary: What it states to stand between pictures.
-        is_sized: Whether it states how long each is.
         password: `user:password` that it asks for; empty for none.
-        cut: Numbers of pictures that it sends half.
         stalls_at: The picture from which on it sends nothing.
         ends_at: The picture from which on it is closed.
         drawn_s: When each picture was drawn, by its number, on the monotonic clock [s].
@@ -54,10 +51,7 @@ class NetworkCamera:
 
     draw: Callable[[], Image]
     period_s: float = 0.02
-    boundary: str = "frame"
-    is_sized: bool = True
     password: str = ""
-    cut: tuple[int, ...] = ()
     stalls_at: int = 1 << _BITS
     ends_at: int = 1 << _BITS
     drawn_s: list[float] = field(default_factory=list)
@@ -87,10 +81,7 @@ class NetworkCamera:
         _, jpeg = cv2.imencode(".jpg", with_number(self.draw(), number))
         self.drawn_s.append(drawn_s)
         content = jpeg.tobytes()
-        if number in self.cut:
-            content = content[: len(content) // 2]
-        size = f"Content-Length: {len(content)}\r\n" if self.is_sized else ""
-        head = f"--{self.boundary}\r\nContent-Type: image/jpeg\r\n{size}\r\n"
+        head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
         return head.encode() + content + b"\r\n"
 
 
@@ -114,7 +105,7 @@ def served(camera: NetworkCamera) -> Iterator[str]:
                 self.end_headers()
                 return
             self.send_response(200)
-            kind = f"multipart/x-mixed-replace; boundary={camera.boundary}"
+            kind = "multipart/x-mixed-replace; boundary=frame"
             self.send_header("Content-Type", kind)
             self.end_headers()
             with suppress(OSError):

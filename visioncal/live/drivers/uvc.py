@@ -1,7 +1,13 @@
-"""Cameras that OpenCV opens: USB video class, a device file, a stream's URL, or a video file."""
+"""Cameras that OpenCV opens: USB video class, a device file, or a stream's URL.
+
+Unread pictures wait in a driver's or a network's buffers and get old. A thread therefore grabs all
+of them as they come, and notes the time.
+"""
 
 import math
+import threading
 import time
+from collections import deque
 from types import MappingProxyType
 
 import cv2
@@ -9,41 +15,37 @@ import numpy as np
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, Image
-from visioncal.live.drivers.multipart import (
-    UNREACHED,
-    MultipartPictures,
-    open_multipart,
-    without_password,
-)
-from visioncal.live.drivers.newest import Arrival, Newest
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.live.drivers.stopwatch import Stopwatch
 
-# Timeout of the first picture [s].
-_OPENING_S = 5.0
-# Timeouts of opening a stream, and of a picture [ms].
-_OPEN_MS, _READ_MS = 5000, 1500
+# Timeout of the first picture [s]; of opening a stream, and of a picture of it [ms].
+_OPENING_S, _OPEN_MS, _READ_MS = 5.0, 5000, 1500
 # Streams whose pictures carry the camera's own timestamps.
 _TIMESTAMPED = ("rtsp", "rtsps", "rtmp", "srt")
 # V4L2's value for manual exposure, and its unit [s].
-_MANUAL_EXPOSURE = 1.0
-_EXPOSURE_UNIT_S = 1e-4
+_MANUAL_EXPOSURE, _EXPOSURE_UNIT_S = 1.0, 1e-4
 # A driver's timestamp no older than this is taken as one of this host's clock [s].
 _RECENT_S = 10.0
 # Greatest relative drift between the clocks of a camera and of this host.
 _DRIFT = 1e-4
+# The longest wait, in intervals between this camera's pictures: one under way at the request, the
+# requested one, and one more for network jitter; and the pictures of which the mean counts.
+_INTERVALS, _PACED = 3.0, 50
+# A picture that comes after less than this share of an interval had waited in a buffer.
+_BURST = 0.3
+# Timeout of the thread's end, and polling interval of waiting callers [s].
+_JOIN_S, _GLANCE_S = 2.0, 0.05
 
 
 class UvcCamera:
-    """Camera device through OpenCV's VideoCapture, or a stream of JPEG files over HTTP.
+    """Camera device through OpenCV's VideoCapture.
 
     Requested settings are set where the camera supports them; `settings` are what it then reports.
     Autofocus, which would change the intrinsics, is switched off. Exposure stays as the camera has
-    it unless requested, which is automatic for most. All pictures are read at once, so that none
-    gets old in a buffer; of a video file every picture is returned.
+    it unless requested, which is automatic for most.
 
     Args:
-        source: The camera's index, the path of its device, a URL, or a video file.
+        source: The camera's index, the path of its device, or a URL.
         requested: Requested settings; of a URL, the resolution that it must have.
 
     Raises:
@@ -57,24 +59,25 @@ class UvcCamera:
         requested = requested or DeviceSetup()
         self.name = f"camera {without_password(str(source))}"
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
-        settings: dict[str, str | float] = {}
-        self._feed: Newest[bytes] | Newest[Image] | FilePictures
-        pictures = _open_jpeg_stream(source, requested)
-        if pictures is not None:
-            self._feed = Newest(pictures, self.name)
-        else:
-            capture = _open_capture(source, self.name)
-            settings = _configure(capture, requested)
-            # Only a file has a number of pictures.
-            if int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
-                self._feed = FilePictures(capture, self.name)
-            else:
-                is_stream = _scheme(source) in _TIMESTAMPED
-                grabbed = GrabbedPictures(capture, self.name, self._exposure_s, is_stream=is_stream)
-                self._feed = Newest(grabbed, self.name)
-        self.settings = MappingProxyType(settings)
+        self._is_timestamped = _scheme(source) in _TIMESTAMPED
+        self._capture = _open_capture(source, self.name, requested)
+        self.settings = MappingProxyType(_configure(self._capture, requested))
+        self._reported_s, self._ahead_s = math.inf, math.inf
+        self._arrivals_s: deque[float] = deque(maxlen=_PACED)
+        self._news = threading.Condition()
+        # The moment after which the exposure of a requested picture begins, how many were too old
+        # for it, and the picture with its stamp.
+        self._request_s: float | None = -math.inf
+        self._too_old = 0
+        self._answer: tuple[float, Image] | None = None
+        self._error: Exception | None = None
+        self._is_closing = False
+        self._thread = threading.Thread(
+            target=self._read, name=f"pictures of {self.name}", daemon=True
+        )
+        self._thread.start()
         try:
-            first = self._frame(*self._feed.first(_OPENING_S))
+            first = self._wait(_OPENING_S)
             self._check_resolution(first, requested.resolution, "gives")
         except BaseException:
             self.close()
@@ -87,28 +90,90 @@ class UvcCamera:
 
         Without timestamps from the driver that is the second picture after the call; a delay of
         more than one picture within the camera remains unknown. The stamp is the time of arrival,
-        minus half the exposure where it is known. Of a video file it is the next picture.
+        minus half the exposure where it is known.
 
         Raises:
             DriverError: None came in time, or it has another resolution than before.
         """
-        frame = self._frame(*self._feed.after(time.monotonic(), timeout_s))
+        with self._news:
+            self._request_s, self._too_old, self._answer = time.monotonic(), 0, None
+        frame = self._wait(timeout_s)
         self._check_resolution(frame, self.resolution, "now gives")
         return frame
 
     def close(self) -> None:
-        """Releases the camera; may be called twice."""
-        self._feed.close()
+        """Ends the thread, which releases the camera; may be called twice."""
+        self._is_closing = True
+        # One that hangs in a driver ends with the process.
+        self._thread.join(_JOIN_S)
 
-    def _frame(self, arrival: Arrival, content: Image | bytes) -> Frame:
-        image = decode_image(content, colour=True) if isinstance(content, bytes) else content
-        if isinstance(image, str):
-            raise DriverError(
-                f"The {self.name} sent a picture that is {image}.",
-                culprits=[self.name],
-                next_step="Look at its network; then go on with --resume.",
-            )
-        return Frame(image, arrival.stamp_s - 0.5 * self._exposure_s, self._exposure_s or None)
+    def _wait(self, timeout_s: float) -> Frame:
+        waiting = Stopwatch()
+        with self._news:
+            while self._answer is None:
+                if self._error is not None:
+                    raise self._error
+                limit_s = max(timeout_s, _INTERVALS * self._interval_s())
+                if waiting.read() > limit_s:
+                    raise self._timeout_error(waiting.read())
+                self._news.wait(_GLANCE_S)
+            stamp_s, image = self._answer
+        return Frame(image, stamp_s - 0.5 * self._exposure_s, self._exposure_s or None)
+
+    def _read(self) -> None:
+        error: Exception = self._no_picture_error()
+        try:
+            while not self._is_closing and self._capture.grab():
+                self._handle(*self._arrival(time.monotonic()))
+        except Exception as caught:  # noqa: BLE001
+            error = caught
+        self._capture.release()
+        # Raised to whoever waits for a picture.
+        with self._news:
+            self._error = error
+            self._news.notify_all()
+
+    def _arrival(self, now_s: float) -> tuple[float, float]:
+        """Stamp of the grabbed picture, and earliest possible start of its exposure [s]."""
+        reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        before_s = self._arrivals_s[-1] if self._arrivals_s else -math.inf
+        if self._is_timestamped:
+            # Decoding may lag: the least delay so far counts, as far as the clocks drift apart.
+            # Without times, or after a restart of the stream, the time of arrival counts.
+            ahead_s, passed_s = now_s - reported_s, reported_s - self._reported_s
+            if passed_s > 0.0:
+                ahead_s = min(ahead_s, self._ahead_s + _DRIFT * passed_s)
+            self._ahead_s, self._reported_s = ahead_s, reported_s
+            return reported_s + ahead_s, before_s
+        # Only V4L2 of Linux reports the kernel's timestamp.
+        if now_s - _RECENT_S < reported_s <= now_s:
+            return reported_s, reported_s - self._exposure_s
+        # Otherwise it began after the picture before had arrived, unless it waited in a buffer.
+        waited = now_s - before_s < _BURST * self._interval_s()
+        return now_s, -math.inf if waited else before_s
+
+    def _handle(self, stamp_s: float, began_s: float) -> None:
+        """Answers a request with the grabbed picture if it is new enough."""
+        self._arrivals_s.append(stamp_s)
+        request_s = self._request_s
+        if request_s is None:
+            return
+        if began_s < request_s:
+            self._too_old += 1
+            return
+        # Not under the lock: it may take long, and a waiting caller must be able to time out.
+        read, image = self._capture.retrieve()
+        if not read or image is None:
+            raise self._no_picture_error()
+        with self._news:
+            if self._request_s == request_s:
+                self._request_s, self._answer = None, (stamp_s, np.asarray(image, np.uint8))
+                self._news.notify_all()
+
+    def _interval_s(self) -> float:
+        """Mean interval between recent pictures [s]; 0 where it is not known."""
+        recent = list(self._arrivals_s)
+        return (recent[-1] - recent[0]) / (len(recent) - 1) if len(recent) > 1 else 0.0
 
     def _check_resolution(self, frame: Frame, needed: tuple[int, int] | None, how: str) -> None:
         height, width = frame.image.shape[:2]
@@ -121,6 +186,35 @@ class UvcCamera:
             "a URL, on the camera's own page).",
         )
 
+    def _no_picture_error(self) -> DriverError:
+        return DriverError(
+            f"The {self.name} gives no picture: it is unplugged, or closed its stream.",
+            culprits=[self.name],
+            next_step="Look at its cable, its power and its network; then go on with --resume.",
+        )
+
+    def _timeout_error(self, waited_s: float) -> DriverError:
+        if self._too_old > _INTERVALS:
+            return DriverError(
+                f"The {self.name} gives no fresh pictures: {self._too_old} that came were older "
+                "than the request.",
+                culprits=[self.name],
+                next_step="It sends more than can be carried or decoded: set it to a lower rate or "
+                "resolution.",
+            )
+        return DriverError(
+            f"The {self.name} stalls: no picture has come for {waited_s:.1f} s.",
+            culprits=[self.name],
+            next_step="Look at its cable, its power and its network; then go on with --resume.",
+        )
+
+
+def without_password(url: str) -> str:
+    """A URL without user and password, to be shown and stored."""
+    scheme, separator, rest = url.partition("://")
+    authority, slash, path = rest.partition("/")
+    return f"{scheme}{separator}{authority.rpartition('@')[2]}{slash}{path}" if separator else url
+
 
 def _scheme(source: int | str) -> str:
     """Scheme of a URL; empty for anything else, such as a GStreamer pipeline that contains one."""
@@ -130,39 +224,39 @@ def _scheme(source: int | str) -> str:
     return scheme.lower() if separator else ""
 
 
-def _open_jpeg_stream(source: int | str, requested: DeviceSetup) -> MultipartPictures | None:
-    """Opens a URL that sends JPEG files; None for any other source."""
-    if not _scheme(source):
-        return None
-    url = str(source)
-    if (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
+def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.VideoCapture:
+    is_url = bool(_scheme(source))
+    if is_url and (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
         raise DriverError(
-            f"The camera {without_password(url)} cannot be set from here: a URL gives nothing but "
-            "pictures.",
+            f"The {name} cannot be set from here: a URL gives nothing but pictures.",
             culprits=["--exposure-us", "--gain", "--focus"],
             next_step="Leave them out, and hold exposure and focus on the camera's own page.",
         )
-    return open_multipart(url) if _scheme(url) in ("http", "https") else None
-
-
-def _open_capture(source: int | str, name: str) -> cv2.VideoCapture:
-    if isinstance(source, int) or not _scheme(source):
-        capture = cv2.VideoCapture(source)
-    else:
+    if is_url:
         # The default timeout is half a minute, and decoding in n threads delays by n pictures.
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS]
         limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS, cv2.CAP_PROP_N_THREADS, 1]
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+        capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, limits)
+    else:
+        capture = cv2.VideoCapture(source)
+    why, step = "", ""
     if not capture.isOpened():
-        capture.release()
-        raise DriverError(
-            f"The {name} cannot be opened.",
-            culprits=[name],
-            next_step=UNREACHED
-            if _scheme(source)
+        why = "cannot be opened"
+        step = (
+            "Look at its address, its power and its network: does another player on this computer "
+            "show its pictures? One that wants a password has it in its URL: "
+            "http://USER:PASSWORD@HOST/PATH."
+            if is_url
             else "Look at its cable, at whether another program holds it, and at whether this user "
-            "may read it (on Linux: the group video; v4l2-ctl --list-devices).",
+            "may read it (on Linux: the group video; v4l2-ctl --list-devices)."
         )
+    # Only a file has a number of pictures.
+    elif int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
+        why = "is a video file, whose pictures have no time"
+        step = "Extract them into a folder, and record with --camera folder:PATH."
+    if why:
+        capture.release()
+        raise DriverError(f"The {name} {why}.", culprits=[name], next_step=step)
     return capture
 
 
@@ -189,116 +283,3 @@ def _configure(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, s
     }
     # OpenCV returns 0 or -1 for settings that the camera does not have.
     return {name: value for name, value in values.items() if math.isfinite(value) and value > 0.0}
-
-
-class GrabbedPictures:
-    """Source of the pictures of a device or a stream.
-
-    Args:
-        capture: The opened capture.
-        name: Name of the camera in messages.
-        exposure_s: Exposure time; 0 where it is not known [s].
-        is_stream: Whether reported times are of the camera's clock, as with RTSP, rather than of
-            this host's.
-    """
-
-    def __init__(
-        self, capture: cv2.VideoCapture, name: str, exposure_s: float = 0.0, *, is_stream: bool
-    ) -> None:
-        self._capture, self._name, self._exposure_s = capture, name, exposure_s
-        self._is_stream = is_stream
-        self._reported_s, self._ahead_s, self._stamp_s = np.inf, np.inf, -np.inf
-
-    def grab(self) -> Arrival:
-        """Waits for the next picture.
-
-        Raises:
-            DriverError: There is none.
-        """
-        if not self._capture.grab():
-            raise _no_picture_error(self._name)
-        arrived_s = time.monotonic()
-        reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-        if self._is_stream:
-            before_s, self._stamp_s = self._stamp_s, self._least_delayed_s(arrived_s, reported_s)
-            return Arrival(self._stamp_s, before_s)
-        # Only V4L2 of Linux reports the kernel's timestamp.
-        if arrived_s - _RECENT_S < reported_s <= arrived_s:
-            return Arrival(reported_s, reported_s - self._exposure_s)
-        return Arrival(arrived_s)
-
-    def take(self) -> Image:
-        """Decodes the last grabbed picture.
-
-        Raises:
-            DriverError: It cannot be decoded.
-        """
-        return _retrieve(self._capture, self._name)
-
-    def interrupt(self) -> None:
-        """Does nothing: OpenCV's wait ends with the next picture, or its own timeout."""
-
-    def close(self) -> None:
-        """Releases the capture."""
-        self._capture.release()
-
-    def _least_delayed_s(self, arrived_s: float, reported_s: float) -> float:
-        """Arrival time of a picture that may have been delayed, from the least delay so far [s]."""
-        ahead_s = arrived_s - reported_s
-        # Without times, or after a restart of the stream, the time of arrival counts.
-        continues = reported_s > self._reported_s
-        drift_s = _DRIFT * (reported_s - self._reported_s)
-        self._ahead_s = min(ahead_s, self._ahead_s + drift_s) if continues else ahead_s
-        self._reported_s = reported_s
-        return reported_s + self._ahead_s
-
-
-class FilePictures:
-    """All pictures of a video file in order, each stamped when it is requested."""
-
-    def __init__(self, capture: cv2.VideoCapture, name: str) -> None:
-        self._capture, self._name = capture, name
-        self._unread: Image | None = None
-
-    def first(self, timeout_s: float) -> tuple[Arrival, Image]:
-        """Returns the first picture; `after` returns it again.
-
-        Raises:
-            DriverError: There is none.
-        """
-        arrival, self._unread = self.after(-np.inf, timeout_s)
-        return arrival, self._unread
-
-    def after(self, moment_s: float, timeout_s: float) -> tuple[Arrival, Image]:
-        """Returns the next picture; moment and timeout are ignored.
-
-        Raises:
-            DriverError: There is none.
-        """
-        del moment_s, timeout_s
-        arrival = Arrival(time.monotonic())
-        if self._unread is not None:
-            image, self._unread = self._unread, None
-            return arrival, image
-        if not self._capture.grab():
-            raise _no_picture_error(self._name)
-        return arrival, _retrieve(self._capture, self._name)
-
-    def close(self) -> None:
-        """Releases the file; may be called twice."""
-        self._capture.release()
-
-
-def _no_picture_error(name: str) -> DriverError:
-    return DriverError(
-        f"The {name} gives no picture: it is unplugged, or at its end.",
-        culprits=[name],
-        next_step="Look at its cable; then go on with --resume.",
-    )
-
-
-def _retrieve(capture: cv2.VideoCapture, name: str) -> Image:
-    read, image = capture.retrieve()
-    if not read or image is None:
-        raise _no_picture_error(name)
-    return np.asarray(image, np.uint8)
