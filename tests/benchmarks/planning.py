@@ -22,7 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.live.planning.candidates import candidates
-from visioncal.live.planning.design import CRITERIA, choose_stops
+from visioncal.live.planning.design import choose_stops
 from visioncal.live.planning.information import WORLDS as SAMPLE
 from visioncal.live.planning.information import World, predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
@@ -93,22 +93,6 @@ def duels_row(name: str, options: CellOptions, found: list[tuple[FloatArray, Flo
         f"|{rotation} | {expected[:, 0].mean():.3g} | {expected[:, 1].mean():.3g} "
         f"| {np.median(ratios):.2f} | {ratios.min():.2f} |"
     )
-
-
-def criteria(options: CellOptions, name: str) -> str:
-    """What each criterion gives in one cell, against random stops (median of 100)."""
-    count = STOPS[name]
-    cell = plan_cell(options, GUESS_RAD, GUESS_M)
-    q = candidates(cell, CANDIDATES).q
-    worlds = predict_worlds((cell, *cell.guesses(SAMPLE - 1, 0)), PURPOSES[name], q)
-    truth = predict_worlds([true_cell(options)], PURPOSES[name], q)[0]
-    rng = np.random.default_rng(0)
-    draws = [expected_mm(truth, rng.choice(len(q), count, replace=False)) for _ in range(100)]
-    cells = [
-        f"{expected_mm(truth, choose_stops(worlds, count, criterion=word).rows):.3g}"
-        for word in CRITERIA
-    ]
-    return f"| {name} | {count} | {' | '.join(cells)} | {np.median(draws):.3g} | {min(draws):.3g} |"
 
 
 def speed(options: CellOptions) -> str:
@@ -287,12 +271,6 @@ def main(worlds: int) -> None:
             "| ratio of rotations | planned, expected [mm] | random | ratio | least ratio |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *duels,
-            "\nExpected sigma [mm] by the criterion of the choice, in one cell, and of 100 random",
-            "choices:\n",
-            f"| purpose | stops | {' | '.join(CRITERIA)} | random, median | random, best |",
-            f"| --- | --- | {'--- | ' * len(CRITERIA)}--- | --- |",
-            criteria(ARM, "kinematics"),
-            criteria(HAND_EYE, "hand-eye"),
             f"\n{speed(ARM)}",
             f"\nCPU seconds to find {CANDIDATES} possible stops (how many there were):\n",
             "| arm | eye-in-hand, fair guess | bad guess | eye-to-hand, fair guess | bad guess |",

@@ -27,7 +27,6 @@ from visioncal.core.choices import (
     SIMULATED_ARMS,
     SIMULATED_CELLS,
     Convention,
-    Criterion,
     SolverName,
 )
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
@@ -333,7 +332,7 @@ def test_help_has_every_word_within_the_terminal(columns):
 
 CHOICES = {
     "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName), "device": DEVICES},
-    "plan": {"purpose": PURPOSES, "criterion": get_args(Criterion), "mount": get_args(Mount)},
+    "plan": {"purpose": PURPOSES, "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
     "simulate": {"robot": SIMULATED_ARMS},
     "export": {

@@ -1,11 +1,10 @@
-"""Many postures at a time: frames, the atlas that knows where an arm reaches, and ways to poses."""
+"""Many postures at a time: frames, and ways to poses."""
 
 import numpy as np
 import pytest
 
 from visioncal.robot import load_robot, robot_names
 from visioncal.robot.batch import chain_frames
-from visioncal.robot.capability_map import CapabilityMap
 from visioncal.robot.inverse import Inverse
 
 ARMS = [name for name in robot_names() if load_robot(name).joint_count >= 6]
@@ -22,36 +21,27 @@ def test_frames_are_those_of_pinocchio(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_an_atlas_knows_what_is_in_reach_and_leads_there(name):
+def test_random_starts_lead_to_poses_in_reach_by_all_branches(name):
     robot, rng = load_robot(name), np.random.default_rng(2)
     inverse = Inverse(robot)
-    atlas = CapabilityMap(robot, inverse, rng)
-    q = robot.chain.encoded(inverse.starts(300, rng))
-    poses = robot.base_from_flange(q)
-    within, starts = atlas.starts(poses, rng)
-    # It learned from a thousand poses how far the next posture is: one in a thousand is farther.
-    assert within.mean() > 0.98
-    positions, reached = inverse.from_starts(poses[within], starts)
-    # What fails is near a limit or a singular posture; a start at random fails as often.
-    assert reached.mean() > 0.65
+    q = robot.chain.encoded(inverse.starts(100, rng))
+    poses = np.repeat(robot.base_from_flange(q), 4, axis=0)
+    positions, reached = inverse.from_starts(poses, inverse.starts(400, rng))
+    # What fails ends at a limit, or near a singular posture. The search for stops tries three times
+    # as many views as it still needs: a quarter that succeeds takes it a second round.
+    assert reached.mean() > 0.25
     there = robot.base_from_flange(robot.chain.encoded(positions[reached]))
     # A nanometre and a nanoradian, as promised.
-    np.testing.assert_allclose(there, poses[within][reached], atol=1e-9)
+    np.testing.assert_allclose(there, poses[reached], atol=1e-9)
     bounds = robot.chain.effective(np.array([robot.lower_rad, robot.upper_rad]))
     assert np.all((positions[reached] >= bounds[0]) & (positions[reached] <= bounds[1]))
+    # Four starts of one pose end on several branches of most.
+    ends = [
+        found[mask]
+        for found, mask in zip(positions.reshape(100, 4, -1), reached.reshape(100, 4), strict=True)
+    ]
+    apart = [np.ptp(np.sin(end), axis=0).max() > 0.1 for end in ends if len(end) > 1]
+    assert np.mean(apart) > 0.5
     farther = poses.copy()
     farther[:, :3, 3] *= 10.0 / np.linalg.norm(farther[:, :3, 3], axis=1, keepdims=True)
-    assert not atlas.starts(farther, rng)[0].any()
-
-
-def test_an_atlas_leads_to_all_branches():
-    robot, rng = load_robot("ur5e"), np.random.default_rng(3)
-    inverse = Inverse(robot)
-    (pose,) = robot.base_from_flange(np.array([[0.4, -1.3, 1.5, -1.75, -1.2, 0.3]]))
-    poses = np.repeat(pose[None], 400, axis=0)
-    positions, reached = inverse.from_starts(
-        poses, CapabilityMap(robot, inverse, rng).starts(poses, rng)[1]
-    )
-    branches = {tuple(np.sign(np.sin(position[[2, 4]]))) for position in positions[reached]}
-    # Six neighbours of one pose lie on several branches.
-    assert len(branches) > 1
+    assert not inverse.from_starts(farther, inverse.starts(400, rng))[1].any()

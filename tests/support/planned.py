@@ -75,7 +75,7 @@ def next_best(
     """The stops that a plan adds to a session, wherever the arm can drive."""
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
     worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)
-    design = choose_stops(worlds, count, criterion="I", wish=wish)
+    design = choose_stops(worlds, count, wish=wish)
     names = [f"added stop {index + 1}" for index in range(len(design.rows))]
     said = stop_contributions(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
     return Additions(design, tuple(said))

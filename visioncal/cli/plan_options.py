@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from visioncal.cli.parsing import numbers_in
-from visioncal.core.choices import Criterion, Mount
+from visioncal.core.choices import Mount
 from visioncal.core.errors import DataError
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 
@@ -40,13 +40,6 @@ class PlanOptions:
     stops: Annotated[int | None, _what(min=1, max=500, help=f"How many stops: {_USUAL_STOPS}.")] = (
         None
     )
-    criterion: Annotated[
-        Criterion,
-        _what(
-            help="I: mean variance of the relevant positions; D, A, E: of the parameters; O1: of "
-            "the Jacobian."
-        ),
-    ] = "I"
     wish_mm: Annotated[
         float | None, _what(help="Fewer stops where they predict this sigma, in mm.")
     ] = None
@@ -98,7 +91,6 @@ class PlanOptions:
         return PlanRequest(
             purpose,
             self.add or self.stops or (purpose.stops if has_no_need else _MOST_FOR_NEED),
-            self.criterion,
             None if has_no_wish else Wish(self.wish_mm, self.wish_deg),
             self.candidates,
             _box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,

@@ -19,8 +19,6 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # Mount of the observing device: a camera on the flange, a fixed camera, or a fixed measuring
 # instrument that observes a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
-# Optimality criteria of planned stops, see `live.planning.design`.
-Criterion: TypeAlias = Literal["I", "D", "A", "E", "O1"]
 # Formats that `convert` reads and `export` writes, in the order of their registries.
 FOREIGN_NAMES = (
     *("industrial-calibration", "industrial-kinematics", "visp", "zivid", "easy-handeye2"),

@@ -10,8 +10,8 @@ from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain
 
-# Newton steps to a near pose; convergence is quadratic.
-_STEPS = 8
+# Newton steps from any posture: of poses in reach half converge, most of them within twenty.
+_STEPS = 40
 # Regularises singular systems; far below the square of any relevant singular value.
 _FLOOR = 1e-13
 
@@ -52,7 +52,7 @@ def reached_from(
     bounds: tuple[FloatArray, FloatArray],
     good: float,
 ) -> tuple[FloatArray, Mask]:
-    """Inverse kinematics by damped Newton steps from near postures.
+    """Inverse kinematics by damped Newton steps from given postures.
 
     The damping vanishes with the error (Sugihara 2011); an arm with more than six joints takes the
     shortest step. Postures that do not converge in a few steps are given up.

@@ -158,7 +158,7 @@ class Inverse:
     def from_starts(
         self, base_from_flange: FloatArray, starts: FloatArray
     ) -> tuple[FloatArray, Mask]:
-        """Solves many poses (m, 4, 4) [m] from near starts, for six joints or more; some may fail.
+        """Solves many poses (m, 4, 4) [m] from given starts, for six joints or more; some may fail.
 
         Returns:
             (m, n) effective positions, by whole turns nearest to zero, and (m,) whether reached.

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collision_model
 from visioncal.live.planning.visibility import Occlusion, board_views
 from visioncal.robot import Robot
-from visioncal.robot.capability_map import CapabilityMap
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
 
@@ -137,10 +135,6 @@ class _CandidateSearch:
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []
 
-    @cached_property
-    def _atlas(self) -> CapabilityMap:
-        return CapabilityMap(self._cell.robot, self._inverse, self._rng)
-
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""
         in_views = self._cell.robot.joint_count >= _FULL_JOINTS
@@ -202,16 +196,16 @@ class _CandidateSearch:
         flange = self._cell.flange_at(views)
         flange = flange[self._not_behind_boxes(self._shade.behind_boxes(flange))]
         flange = flange[passed(AWAY, _within(robot, flange))]
-        within, starts = self._atlas.starts(flange, self._rng)
-        self._unreached += list(flange[~within][: _RETRIED - len(self._unreached)])
-        flange = flange[passed(REACH, within)]
         share = sight.share(flange, self._least_share)
         likely = passed(GUESS, share >= self._least_share)
-        # No more than are still needed are solved.
+        # Not many more than are still needed are solved.
         few = np.flatnonzero(likely)[: 3 * (self._count - len(self.kept)) + 50]
-        flange, starts, share = flange[few], starts[few], share[few]
-        positions, reached = self._inverse.from_starts(flange, starts)
-        self.losses.lost[REACH] += int(np.sum(~reached))
+        flange, share = flange[few], share[few]
+        positions, reached = self._inverse.from_starts(
+            flange, self._inverse.starts(len(flange), self._rng)
+        )
+        self._unreached += list(flange[~reached][: _RETRIED - len(self._unreached)])
+        reached = passed(REACH, reached)
         return robot.chain.encoded(positions[reached]), share[reached]
 
     def _from_postures(self) -> tuple[FloatArray, FloatArray]:

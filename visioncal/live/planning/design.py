@@ -1,13 +1,7 @@
-"""Choosing the most informative stops: optimal design by greedy selection and exchange.
+"""Choosing the most informative stops: I-optimal design by greedy selection and exchange.
 
-Criteria (Atkinson, Donev and Tobias 2007, chapter 10; Borm and Menq 1991 for O1), each as a mean
-over the possible cells ("worlds"):
-
-    I   mean variance of the positions that count
-    D   determinant of the unknowns' covariance
-    A   mean variance of the unknowns, each in its own unit
-    E   largest variance of a combination of unknowns, of those that the candidates determine
-    O1  geometric mean of the stacked Jacobian's singular values, over the root of the stops
+The criterion is the mean variance of the positions that count, over the possible cells ("worlds")
+(Atkinson, Donev and Tobias 2007, chapter 10).
 
 A stop adds six rows F, so that its effect on a covariance C is a rank-six update (Woodbury):
 `C - C F^T (1 + F C F^T)^-1 F C`, computed for all candidates in a few products.
@@ -16,11 +10,9 @@ A stop adds six rows F, so that its effect on a covariance C is a rank-six updat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import get_args
 
 import numpy as np
 
-from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
@@ -32,18 +24,9 @@ from visioncal.live.planning.information import World
 # Least relative gain of an exchange, and the most exchanges per stop.
 _GAIN, _EXCHANGES = 1e-4, 1.0
 
-CRITERIA: tuple[str, ...] = get_args(Criterion)
-
 # Directions in which all candidates together add less information than this, relative to the
 # prior, are dropped: that changes no figure.
 _NULL = 1e-9
-# Directions whose singular value is below this share of the largest count as undetermined.
-_LEAST_SHARE = 1e-7
-# For O1 the prior is scaled down by this.
-_LITTLE = 1e-4
-# The largest variance is not smooth: stops are ranked by the gradient of the mean of the variances
-# raised to a power, and the best few are evaluated exactly.
-_TRIED, _POWER = 12, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +53,9 @@ class Reduced:
     Attributes:
         factors: (k, 6, r) whitened Jacobians of the candidates.
         start: (r, r) information without any candidate.
-        objective: Variance that the criterion minimises.
+        objective: Variance that is minimised.
         position: Variance of the position whose accuracy is reported [m^2].
         rotation: The same for the rotation [rad^2].
-        determined: (r, t) directions that the candidates determine well enough to count for O1.
-        extremes: (r, r) edges and arm in their units, as far as the candidates determine them; E
-            minimises the largest variance among them.
         unestimated: (k, 6, a) as in `World`.
         gradient: (r, a) as in `World`.
     """
@@ -85,31 +65,21 @@ class Reduced:
     objective: Variance
     position: Variance
     rotation: Variance
-    determined: FloatArray
-    extremes: FloatArray
     unestimated: FloatArray
     gradient: FloatArray
 
 
-def reduced(world: World, criterion: Criterion) -> Reduced:
-    """Transforms a world to the coordinates in which a criterion chooses stops."""
-    prior = world.prior * (_LITTLE if criterion == "O1" else 1.0)
-    size = len(prior)
+def reduced(world: World) -> Reduced:
+    """Transforms a world to the coordinates in which stops are chosen."""
+    size = len(world.prior)
     # theta = unwhitened @ phi, where phi has unit prior information. The information of corners on
     # a rational lens is singular to rounding.
-    unwhitened = covariance_root(prior)
+    unwhitened = covariance_root(world.prior)
     factors = (world.factors.reshape(-1, size) @ unwhitened).reshape(-1, 6, size)
     rows = factors.reshape(-1, size)
     recorded = unwhitened.T @ world.recorded @ unwhitened
     values, vectors = np.linalg.eigh(rows.T @ rows + recorded)
     basis = vectors[:, values > _NULL]
-    share = values[values > _NULL]
-    # Lens and board are nuisance parameters.
-    inverse = 1.0 / world.units
-    inverse[12 : 12 + world.shared_count] = 0.0
-    counted = world.objective
-    if criterion == "A":
-        counted = np.diag(inverse**2) / (size - world.shared_count)
 
     def variance(square: FloatArray) -> Variance:
         transformed = unwhitened.T @ square @ unwhitened
@@ -118,15 +88,12 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
             _square_root(reduced_square), float(np.trace(transformed) - np.trace(reduced_square))
         )
 
-    extremes = np.linalg.qr(inverse[:, None] * (unwhitened @ basis) * (share > 1.0)).R
     return Reduced(
         factors @ basis,
-        np.eye(len(share)) + basis.T @ recorded @ basis,
-        variance(counted),
+        np.eye(basis.shape[1]) + basis.T @ recorded @ basis,
+        variance(world.objective),
         variance(world.position),
         variance(world.rotation),
-        np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
-        extremes,
         world.unestimated,
         basis.T @ (unwhitened.T @ world.gradient),
     )
@@ -151,16 +118,15 @@ class Selection:
     """
 
     problem: tuple[Reduced, ...]
-    criterion: Criterion
     rows: tuple[int, ...]
     information: tuple[FloatArray, ...]
     gradients: tuple[FloatArray, ...]
 
     @classmethod
-    def of(cls, problem: tuple[Reduced, ...], criterion: Criterion) -> "Selection":
+    def of(cls, problem: tuple[Reduced, ...]) -> "Selection":
         """Starts with no candidate, only the recorded stops."""
         starts, gradients = ((item.start for item in problem), (item.gradient for item in problem))
-        return cls(problem, criterion, (), tuple(starts), tuple(gradients))
+        return cls(problem, (), tuple(starts), tuple(gradients))
 
     @cached_property
     def covariances(self) -> tuple[FloatArray, ...]:
@@ -196,44 +162,18 @@ class Selection:
             before + sign * gram(factors, unestimated)
             for before, (factors, unestimated) in zip(self.gradients, added, strict=True)
         )
-        return Selection(self.problem, self.criterion, rows, information, gradients)
+        return Selection(self.problem, rows, information, gradients)
 
     @cached_property
     def value(self) -> float:
-        """The minimised value: a mean over the worlds, above zero."""
-        return float(np.mean([self._criterion_value(*world) for world in self._worlds()]))
-
-    def _criterion_value(self, world: Reduced, covariance: FloatArray) -> float:
-        if self.criterion in ("I", "A"):
-            return world.objective.of(covariance)
-        if self.criterion == "E":
-            extremes = np.linalg.eigvalsh(_extreme_covariance(world, covariance))
-            return float(extremes.max(initial=0.0))
-        return float(np.exp(np.linalg.slogdet(covariance)[1] / max(len(covariance), 1)))
+        """The minimised variance: a mean over the worlds [m^2]."""
+        return float(np.mean([world.objective.of(array) for world, array in self._worlds()]))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
         pairs = zip(self.covariances, self.gradients, strict=True)
         biased = ((covariance, covariance @ gradient) for covariance, gradient in pairs)
         totals = (covariance + bias @ bias.T for covariance, bias in biased)
         return zip(self.problem, totals, strict=True)
-
-    @property
-    def figure(self) -> float:
-        """The criterion's value as it is reported."""
-        if self.criterion == "I":
-            return 1e3 * float(np.sqrt(self.value))
-        if self.criterion != "O1":
-            return float(np.sqrt(self.value))
-        # The prior is not part of the Jacobian.
-        volumes = [
-            np.linalg.slogdet(world.determined.T @ (array - np.eye(len(array))) @ world.determined)
-            for world, array in zip(self.problem, self.information, strict=True)
-        ]
-        mean = [
-            np.exp(value / (2 * max(world.determined.shape[1], 1))) if sign > 0 else 0.0
-            for world, (sign, value) in zip(self.problem, volumes, strict=True)
-        ]
-        return float(np.mean(mean)) / float(np.sqrt(max(len(self.rows), 1)))
 
     @property
     def accuracy(self) -> Accuracy:
@@ -258,38 +198,17 @@ class Selection:
             ],
             axis=0,
         )
-        if self.criterion != "E":
-            return rows[int(np.argmax(gains))]
-        promising: list[int] = [rows[index] for index in np.argsort(-gains)[:_TRIED].tolist()]
-        changed = (self.with_one(row) if sign > 0 else self.without(row) for row in promising)
-        return promising[int(np.argmin([selection.value for selection in changed]))]
+        return rows[int(np.argmax(gains))]
 
-    def _gains(
-        self, world: Reduced, covariance: FloatArray, rows: list[int], sign: float
-    ) -> FloatArray:
+    @staticmethod
+    def _gains(world: Reduced, covariance: FloatArray, rows: list[int], sign: float) -> FloatArray:
         """Decrease (k,) of the value if each of the rows were added, or removed."""
         factors = world.factors[rows]
         carried = factors @ covariance
         changed = np.eye(6) + sign * carried @ np.swapaxes(factors, 1, 2)
-        if self.criterion in ("D", "O1"):
-            return np.asarray(np.linalg.slogdet(changed)[1])
-        roots = (
-            world.objective.roots if self.criterion != "E" else _extreme_roots(world, covariance)
-        )
-        moved = carried @ roots.T
+        moved = carried @ world.objective.roots.T
         squares = moved @ np.swapaxes(moved, 1, 2)
         return np.asarray(sign * np.trace(np.linalg.solve(changed, squares), axis1=1, axis2=2))
-
-
-def _extreme_covariance(world: Reduced, covariance: FloatArray) -> FloatArray:
-    return np.asarray(world.extremes @ covariance @ world.extremes.T)
-
-
-def _extreme_roots(world: Reduced, covariance: FloatArray) -> FloatArray:
-    """Root (r, r) of the gradient of the mean of a high power of the variances."""
-    values, vectors = np.linalg.eigh(_extreme_covariance(world, covariance))
-    weights = (np.maximum(values, 0.0) / values[-1]) ** (_POWER - 1)
-    return np.asarray(np.sqrt(weights)[:, None] * (vectors.T @ world.extremes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +217,7 @@ class Design:
 
     Attributes:
         rows: (n,) chosen candidates, the most informative first.
-        value: The criterion at these stops: a sigma [mm] for I, else in its own units.
+        sigma_mm: Root mean variance of the positions that count, with these stops [mm].
         history: Accuracy predicted without any of them, and after each in the order of `rows`.
         best: Accuracy with all candidates.
         best_known_lens_board: The same if lens and board were known exactly.
@@ -307,8 +226,7 @@ class Design:
     """
 
     rows: IntArray
-    criterion: Criterion
-    value: float
+    sigma_mm: float
     history: tuple[Accuracy, ...]
     best: Accuracy
     best_known_lens_board: Accuracy
@@ -330,7 +248,6 @@ def choose_stops(
     worlds: Sequence[World],
     count: int,
     *,
-    criterion: Criterion = "I",
     wish: Wish | None = None,
 ) -> Design:
     """Chooses at most `count` of the candidates to add to the recorded stops, the most informative.
@@ -340,12 +257,12 @@ def choose_stops(
     DETMAX, with excursions of one).
 
     Raises:
-        DataError: The criterion is not known, or there are fewer candidates than stops.
+        DataError: There are fewer candidates than stops.
     """
-    _check(worlds, count, criterion)
+    _check(worlds, count)
     with one_blas_thread():
         # A wish that is met already needs no stop.
-        state = Selection.of(tuple(reduced(world, criterion) for world in worlds), criterion)
+        state = Selection.of(tuple(map(reduced, worlds)))
         while len(state.rows) < count and not (wish and state.accuracy.meets(wish)):
             state = state.with_one(state.best_to_add())
         state = _exchange(state)
@@ -356,7 +273,8 @@ def choose_stops(
         known_lens_board = _all_of([world.with_known_lens_board() for world in worlds]).accuracy
         exact_arm = _all_of([world.without_unestimated_arm() for world in worlds]).accuracy
     met = None if wish is None else history[-1].meets(wish)
-    return Design(rows, criterion, state.figure, history, best, known_lens_board, exact_arm, met)
+    sigma_mm = 1e3 * float(np.sqrt(state.value))
+    return Design(rows, sigma_mm, history, best, known_lens_board, exact_arm, met)
 
 
 def shortfall(design: Design, wish: Wish, count: int) -> str:
@@ -398,11 +316,7 @@ def _wished(wish: Wish) -> str:
     return _accuracy_words(Accuracy(wish.mm or 0.0, wish.deg or 0.0), wish)
 
 
-def _check(worlds: Sequence[World], count: int, criterion: str) -> None:
-    if criterion not in CRITERIA:
-        raise DataError(
-            f"criterion {criterion!r} is not one of {', '.join(CRITERIA)}.", culprits=["criterion"]
-        )
+def _check(worlds: Sequence[World], count: int) -> None:
     candidates = len(worlds[0].factors)
     if not 0 < count <= candidates:
         raise DataError(
@@ -446,7 +360,7 @@ def _ranked(state: Selection) -> IntArray:
         replace(item, factors=item.factors[rows], unestimated=item.unestimated[rows])
         for item in state.problem
     )
-    selection = Selection.of(few, state.criterion)
+    selection = Selection.of(few)
     for _ in rows:
         selection = selection.with_one(selection.best_to_add())
     return rows[list(selection.rows)]
@@ -454,7 +368,7 @@ def _ranked(state: Selection) -> IntArray:
 
 def _history(worlds: Sequence[World], rows: IntArray) -> tuple[tuple[Accuracy, ...], Accuracy]:
     """Accuracy predicted after each of some candidates in order, and after all candidates."""
-    selection = Selection.of(tuple(reduced(world, "I") for world in worlds), "I")
+    selection = Selection.of(tuple(map(reduced, worlds)))
     history = [selection.accuracy]
     for row in rows.tolist():
         selection = selection.with_one(row)
@@ -463,4 +377,4 @@ def _history(worlds: Sequence[World], rows: IntArray) -> tuple[tuple[Accuracy, .
 
 
 def _all_of(worlds: Sequence[World]) -> Selection:
-    return Selection.of(tuple(reduced(world, "I") for world in worlds), "I").with_all()
+    return Selection.of(tuple(map(reduced, worlds))).with_all()

@@ -44,8 +44,6 @@ WORLDS = 4
 # A calibration does not use the guesses. This weak prior on the edges only keeps the information
 # invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
-# Units of an edge's components where unknowns of different kinds are compared [rad and m].
-_EDGE_UNITS: FloatArray = np.tile(np.repeat([1e-3, 5e-4], 3), 2)
 # Postures drawn for a declared workspace, and the most of those inside it that are used.
 _TRIED, _POSTURES = 8000, 400
 # Least number of corners with which a partly visible ChArUco board is detected.
@@ -107,7 +105,6 @@ class World:
             covariance C: of a position, as a mean over where it matters [m^2].
         position: (p, p) the same for the position whose accuracy is reported [m^2].
         rotation: (p, p) the same for the rotation [rad^2].
-        units: (p,) unit of each unknown where unknowns of different kinds are compared.
         lens_board_count: Number of unknowns of lens and boards; they come after the edges.
         unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
             estimate: arm errors that it treats as noise, in their sigmas, and held parameters of
@@ -122,7 +119,6 @@ class World:
     objective: FloatArray
     position: FloatArray
     rotation: FloatArray
-    units: FloatArray
     shared_count: int
     unestimated: FloatArray
     gradient: FloatArray
@@ -140,7 +136,6 @@ class World:
             self.objective[block],
             self.position[block],
             self.rotation[block],
-            self.units[kept],
             0,
             self.unestimated[:, :, of_arm],
             self.gradient[kept, of_arm],
@@ -223,30 +218,6 @@ def stop_factors(
     return factors
 
 
-def place_sigmas(
-    cell: PlanCell, purpose: Purpose, covariance: FloatArray, workspace: Box | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Predicts the arm's position uncertainty over its workspace.
-
-    Args:
-        cell: The cell, as guessed.
-        purpose: One that judges the workspace.
-        covariance: (p, p) covariance of the unknowns, from `World.covariance`.
-        workspace: Region that counts; None for all.
-
-    Returns:
-        (w, 3) positions of what the arm carries, in the base [m], and their (w,) standard
-        deviations, roots of the covariances' traces [m].
-    """
-    q = _workspace_postures(cell, workspace)
-    jacobian = _workspace_jacobian(cell, purpose, q)
-    arm = jacobian.shape[2] - 12
-    rows = np.concatenate([np.arange(12), np.arange(len(covariance) - arm, len(covariance))])
-    inner = covariance[np.ix_(rows, rows)]
-    carried = cell.robot.base_from_flange(q) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
-    return carried[:, :3, 3], np.sqrt(np.einsum("wij,jk,wik->w", jacobian, inner, jacobian))
-
-
 def stated(cell: PlanCell) -> LensBoardParameters:
     """Stated lens and board; the board's size is free within its stated uncertainty."""
     positions = corner_positions(cell.target)
@@ -291,8 +262,6 @@ def _world(
     scale = np.ones(all_columns)
     scale[:size] = inflation**-0.5
     factors, recorded_information = scale * factors, np.outer(scale, scale) * recorded_information
-    shared_sigmas = np.sqrt(np.diag(covariance_from(shared))) if shared_count else np.zeros(0)
-    units = np.concatenate([_EDGE_UNITS, shared_sigmas, np.full(arm, sigma)])
     if purpose.judged == "sight":
         weights = _sight_weights(cell, arm, q)
     else:
@@ -314,7 +283,6 @@ def _world(
         counted,
         place,
         turn,
-        units,
         shared_count,
         misfit,
         gradient,

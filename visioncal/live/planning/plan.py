@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
-from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, percent, some_of
@@ -18,7 +17,7 @@ from visioncal.live.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.live.planning.candidates import Candidates, candidates
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.design import Design, choose_stops, shortfall
-from visioncal.live.planning.information import WORLDS, World, place_sigmas, predict_worlds
+from visioncal.live.planning.information import WORLDS, World, predict_worlds
 from visioncal.live.planning.path import Route, order_stops
 from visioncal.live.planning.pick_probability import (
     NeedPlanned,
@@ -61,7 +60,6 @@ class PlanRequest:
 
     purpose: Purpose
     count: int
-    criterion: Criterion = "I"
     wish: Wish | None = None
     candidates: int = 1500
     workspace: Box | None = None
@@ -113,9 +111,6 @@ class Plan:
         shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is met
             or there is none.
         need: Prediction for picks; None where there is no need.
-        map_m: (w, 3) positions all over the workspace, in the base [m]; empty where the purpose
-            does not judge it.
-        map_sigma_m: (w,) predicted standard deviations there [m].
     """
 
     cell: PlanCell
@@ -128,8 +123,6 @@ class Plan:
     lost: Mapping[str, int]
     in_the_way: tuple[str, ...]
     shortfall: str
-    map_m: FloatArray
-    map_sigma_m: FloatArray
     need: NeedPlanned | None = None
 
 
@@ -170,7 +163,6 @@ def make_plan(
     progress("choice", 0, 1)
     planning = _Planning(cells, request, stops, worlds, begun)
     design, route, in_the_way = planning.drivable_design(progress)
-    map_m, map_sigma_m = planning.sigma_map(design)
     need = None
     if request.need is not None:
         picking = Picking(cells, worlds, stops.q, request.need)
@@ -188,8 +180,6 @@ def make_plan(
         stops.lost,
         in_the_way,
         " ".join(name for name in shortfalls if name),
-        map_m,
-        map_sigma_m,
         need,
     )
 
@@ -264,7 +254,7 @@ class _Planning:
         )
 
         def design_of(count: int) -> Design:
-            return choose_stops(worlds, count, criterion=request.criterion, wish=request.wish)
+            return choose_stops(worlds, count, wish=request.wish)
 
         design = design_of(request.count)
         if not len(design.rows):
@@ -317,14 +307,6 @@ class _Planning:
             )
             for row, via in zip(route.order, segments, strict=True)
         )
-
-    def sigma_map(self, design: Design) -> tuple[FloatArray, FloatArray]:
-        """Positions (w, 3) over the workspace with their (w,) sigmas [m]; empty if not judged."""
-        request = self.request
-        if request.purpose.judged != "workspace" or design.predicted.is_open:
-            return np.zeros((0, 3)), np.zeros(0)
-        covariance = self.worlds[0].covariance(design.rows)
-        return place_sigmas(self.cells[0], request.purpose, covariance, request.workspace)
 
 
 def _need_met_error(need: Need, before: float) -> DataError:

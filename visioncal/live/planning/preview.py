@@ -29,8 +29,6 @@ def preview_of(plan: Plan, name: str) -> Preview:
         np.array(history),
         tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),
         cell.limits.floor_m,
-        plan.map_m,
-        1e3 * plan.map_sigma_m,
         _plan_note(plan, name),
     )
 

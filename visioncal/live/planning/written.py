@@ -69,7 +69,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
             "after": _accuracy(design.predicted),
             "all_candidates": _accuracy(design.best),
         },
-        "criterion": {"name": design.criterion, "value": design.value},
+        "criterion": {"name": "I", "value": design.sigma_mm},
     }
     if plan.start is not None and plan.start.refusal:
         document["refusal_before"] = plan.start.refusal
@@ -224,7 +224,6 @@ def _request_document(request: PlanRequest) -> dict[str, Any]:
     document: dict[str, Any] = {
         "purpose": request.purpose.name,
         "stops": request.count,
-        "criterion": request.criterion,
         "candidates": request.candidates,
         "seed": request.seed,
     }

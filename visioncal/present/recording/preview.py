@@ -16,7 +16,6 @@ from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.dynamics.motion import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.accuracy import log_map
 from visioncal.present.recording.arm import Obstacle, log_arm, log_frames, log_obstacles
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.markdown import markdown
@@ -61,8 +60,6 @@ class Preview:
         sigmas_mm: Predicted sigma by number of stops; NaN where something is undetermined [mm].
         obstacles: Obstacles in the cell.
         floor_m: Height of the floor in the base [m]; None without a floor.
-        places_m: (w, 3) points of the workspace [m]; may be empty.
-        places_sigma_mm: (w,) predicted sigma there [mm].
         note: Text of the plan in Markdown.
     """
 
@@ -77,8 +74,6 @@ class Preview:
     sigmas_mm: FloatArray
     obstacles: Sequence[Obstacle]
     floor_m: float | None
-    places_m: FloatArray
-    places_sigma_mm: FloatArray
     note: str
 
     @property
@@ -156,8 +151,6 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     stream.log(f"{paths.TARGET}/sheet", on_target, sheet, static=True)
     log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
     _log_carried(stream, preview, size_m)
-    if len(preview.places_m):
-        log_map(stream, preview.places_m, preview.places_sigma_mm, size_m)
     charts.log_static(stream)
     note = markdown(preview.note)
     stream.log(paths.PLAN_NOTE, note, static=True)

@@ -8,8 +8,6 @@ from visioncal.dynamics import Run
 from visioncal.present.recording import paths
 from visioncal.present.recording.preview import MotionPreview, Preview
 from visioncal.present.viewer.layout import (
-    EYE_DISTANCE,
-    MAP_DISTANCE,
     disc_views,
     eye_on,
     image_view,
@@ -33,15 +31,10 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     places = np.array(
         [np.zeros(3), *flange[:, :3, 3], *(pose_in_base[:3, 3] for pose_in_base in poses)]
     )
-    tabs = [_overview(places), _coverage()]
-    if len(preview.places_m):
-        tabs.insert(1, _workspace(preview))
-    return with_panels(rrb.Tabs(*tabs, active_tab=0))
+    return with_panels(rrb.Tabs(_overview(places), _coverage(), active_tab=0))
 
 
-def _cell(
-    name: str, places: FloatArray, *more: str, distance: float = EYE_DISTANCE
-) -> rrb.Spatial3DView:
+def _cell(name: str, places: FloatArray, *more: str) -> rrb.Spatial3DView:
     entities = (
         paths.BASE,
         paths.ROBOT,
@@ -57,7 +50,7 @@ def _cell(
         f"- {paths.IMAGE}/**",
         f"+ {paths.IMAGE}",
     ]
-    return space_view(name, contents, eye_on(places, distance))
+    return space_view(name, contents, eye_on(places))
 
 
 def _overview(places: FloatArray) -> rrb.Container:
@@ -67,16 +60,6 @@ def _overview(places: FloatArray) -> rrb.Container:
     cell = _cell("Cell: stops in blue, way in orange", places, paths.STOPS, paths.WAY)
     right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
     return rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
-
-
-def _workspace(preview: Preview) -> rrb.Container:
-    cell = _cell(
-        "Predicted sigma of a tool's place",
-        preview.places_m,
-        paths.WORKSPACE,
-        distance=MAP_DISTANCE,
-    )
-    return rrb.Horizontal(cell, name="Workspace")
 
 
 def _coverage() -> rrb.Container:
