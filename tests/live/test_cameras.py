@@ -35,16 +35,6 @@ def test_a_missing_extra_tells_the_command_that_installs_it(monkeypatch):
     assert os.environ["DEPTHAI_TELEMETRY"] == "0"
 
 
-def test_all_missing_extras_are_named_at_once():
-    uses = {"ur": "no_such_rtde", "oak": "no_such_depthai"}
-    with pytest.raises(DriverError, match="no_such_rtde and no_such_depthai are not") as caught:
-        extras.refuse_without("ur", uses)
-    assert "'ur-rtde" in caught.value.next_step
-    assert "'depthai" in caught.value.next_step
-    # What is only welcome may be missing.
-    extras.refuse_without("ur", {**uses, "ur": "json"})
-
-
 def test_the_command_installs_what_the_extra_would():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     declared = project["project"]["optional-dependencies"]

@@ -11,7 +11,7 @@ from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import Faults
 from visioncal.interchange.outputs import write_outputs
-from visioncal.live.drivers.extras import refuse_without
+from visioncal.live.drivers.extras import client_library
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def demo_command(
     if fault is not None and not live:
         raise typer.BadParameter("--fault belongs to --live.")
     if live:
-        refuse_without("ur", {"ur": "rtde_control"})
+        client_library("rtde_control", "ur")
     session, result = out / "session", out / "result"
     if truth_path(session).exists():
         # An earlier demonstration's; nothing else is ever removed.

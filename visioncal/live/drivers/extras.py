@@ -4,9 +4,7 @@ DepthAI, the library of Luxonis' OAK cameras, is imported only here, with its te
 """
 
 import os
-from collections.abc import Mapping
 from importlib import import_module
-from importlib.util import find_spec
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -16,27 +14,6 @@ from visioncal.core.errors import DriverError
 _PACKAGES = {"ur": "ur-rtde>=1.6.5,<2", "oak": "depthai>=3.12,<4"}
 # A pipeline, a node, an output, a message: their classes exist only where the library is installed.
 Handle: TypeAlias = Any
-
-
-def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
-    """Checks that a required client library is installed, naming all that are missing.
-
-    Args:
-        needed: The required extra.
-        extras: Modules of the required and the optional extras.
-
-    Raises:
-        DriverError: The required one is not installed, with the command that installs all.
-    """
-    missing = [extra for extra, module in extras.items() if find_spec(module) is None]
-    if needed in missing:
-        modules = [extras[name] for name in missing]
-        packages = " ".join(f"'{_PACKAGES[name]}'" for name in missing)
-        raise DriverError(
-            f"{' and '.join(modules)} {'are' if len(missing) > 1 else 'is'} not installed.",
-            culprits=modules,
-            next_step=f"Install what is missing: pip install {packages}",
-        )
 
 
 def client_library(module: str, extra: str) -> ModuleType:
