@@ -4,6 +4,7 @@ import threading
 import time
 from contextlib import closing
 
+import cv2
 import numpy as np
 import pytest
 from support.mjpeg import NetworkCamera, number_of, served
@@ -15,17 +16,22 @@ from visioncal.live.drivers.uvc import UvcCamera
 SMALL = np.full((240, 320), 110, np.uint8)
 
 
+# Five megapixels that take long to decode.
+LARGE = cv2.resize(
+    np.random.default_rng(5).integers(0, 255, (486, 648), dtype=np.uint8), (2592, 1944)
+)
+
+
 def frames_of(camera, count, *, timeout_s=10.0):
     return [camera.frame(timeout_s=timeout_s) for _ in range(count)]
 
 
 def test_no_picture_is_from_before_it_was_asked_for():
-    # Small pictures: one that takes longer to decode than the next to come would be behind.
-    sent = NetworkCamera(lambda: SMALL, period_s=0.2)
+    sent = NetworkCamera(lambda: LARGE, period_s=0.05)
     with served(sent) as url, closing(UvcCamera(url)) as camera:
         assert isinstance(camera, CameraDevice)
-        assert camera.resolution == (320, 240)
-        for pause in (1, 15, 0, 3):
+        assert camera.resolution == (2592, 1944)
+        for pause in (0, 40, 0, 10):
             # Pictures that nobody asks for would fill every buffer on the way.
             sent.wait_for(len(sent.drawn_s) + pause)
             count, asked = len(sent.drawn_s), time.monotonic()
@@ -34,6 +40,13 @@ def test_no_picture_is_from_before_it_was_asked_for():
             assert number >= count
             assert asked <= frame.stamp_s <= time.monotonic()
             assert sent.drawn_s[number] <= frame.stamp_s
+
+
+def test_pictures_that_are_cut_short_are_passed_by():
+    sent = NetworkCamera(lambda: SMALL, cut=tuple(range(0, 1000, 2)))
+    with served(sent) as url, closing(UvcCamera(url)) as camera:
+        numbers = [number_of(frame.image) for frame in frames_of(camera, 5)]
+    assert all(number % 2 for number in numbers)
 
 
 def test_a_password_is_given_and_not_shown():
@@ -66,6 +79,16 @@ def test_a_closed_stream_is_told():
         with pytest.raises(DriverError, match="closed its stream") as caught:
             frames_of(camera, 3)
         assert "--resume" in caught.value.next_step
+
+
+def test_a_camera_that_changes_its_resolution_is_told():
+    sent = NetworkCamera(lambda: SMALL if len(sent.drawn_s) < 2 else LARGE)
+    with (
+        served(sent) as url,
+        closing(UvcCamera(url)) as camera,
+        pytest.raises(DriverError, match="now gives 2592x1944 pixels, not 320x240"),
+    ):
+        frames_of(camera, 3)
 
 
 def test_what_a_url_cannot_do_is_refused():

@@ -44,6 +44,7 @@ class NetworkCamera:
         draw: Draws what the camera sees, (h, w) grey.
         period_s: From one picture to the next [s].
         password: `user:password` that it asks for; empty for none.
+        cut: Numbers of pictures that it sends half.
         stalls_at: The picture from which on it sends nothing.
         ends_at: The picture from which on it is closed.
         drawn_s: When each picture was drawn, by its number, on the monotonic clock [s].
@@ -52,6 +53,7 @@ class NetworkCamera:
     draw: Callable[[], Image]
     period_s: float = 0.02
     password: str = ""
+    cut: tuple[int, ...] = ()
     stalls_at: int = 1 << _BITS
     ends_at: int = 1 << _BITS
     drawn_s: list[float] = field(default_factory=list)
@@ -81,6 +83,8 @@ class NetworkCamera:
         _, jpeg = cv2.imencode(".jpg", with_number(self.draw(), number))
         self.drawn_s.append(drawn_s)
         content = jpeg.tobytes()
+        if number in self.cut:
+            content = content[: len(content) // 2]
         head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
         return head.encode() + content + b"\r\n"
 

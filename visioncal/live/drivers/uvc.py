@@ -17,9 +17,12 @@ from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
+from visioncal.vision.finders.imaging import decode_image
 
 # Timeout of the first picture [s]; of opening a stream, and of a picture of it [ms].
 _OPENING_S, _OPEN_MS, _READ_MS = 5.0, 5000, 1500
+# OpenCV's format of packets as they come, and the code of JPEG files.
+_UNDECODED, _JPEG = -1, cv2.VideoWriter.fourcc(*"MJPG")
 # Streams whose pictures carry the camera's own timestamps.
 _TIMESTAMPED = ("rtsp", "rtsps", "rtmp", "srt")
 # V4L2's value for manual exposure, and its unit [s].
@@ -61,6 +64,9 @@ class UvcCamera:
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
         self._is_timestamped = _scheme(source) in _TIMESTAMPED
         self._capture = _open_capture(source, self.name, requested)
+        # JPEG files of a network camera are decoded only when they are asked for: at a high
+        # resolution they come faster than they could be decoded.
+        self._is_jpeg = self._capture.get(cv2.CAP_PROP_FORMAT) == _UNDECODED
         self.settings = MappingProxyType(_configure(self._capture, requested))
         self._reported_s, self._ahead_s = math.inf, math.inf
         self._arrivals_s: deque[float] = deque(maxlen=_PACED)
@@ -165,6 +171,13 @@ class UvcCamera:
         read, image = self._capture.retrieve()
         if not read or image is None:
             raise self._no_picture_error()
+        if self._is_jpeg:
+            decoded = decode_image(image.tobytes(), colour=True)
+            if isinstance(decoded, str):
+                # Cut short, as where the network lost a part; the next one may be whole.
+                self._too_old += 1
+                return
+            image = decoded
         with self._news:
             if self._request_s == request_s:
                 self._request_s, self._answer = None, (stamp_s, np.asarray(image, np.uint8))
@@ -197,7 +210,7 @@ class UvcCamera:
         if self._too_old > _INTERVALS:
             return DriverError(
                 f"The {self.name} gives no fresh pictures: {self._too_old} that came were older "
-                "than the request.",
+                "than the request, or cut short.",
                 culprits=[self.name],
                 next_step="It sends more than can be carried or decoded: set it to a lower rate or "
                 "resolution.",
@@ -236,7 +249,12 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
         # The default timeout is half a minute, and decoding in n threads delays by n pictures.
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS]
         limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS, cv2.CAP_PROP_N_THREADS, 1]
-        capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, limits)
+        undecoded = [*limits, cv2.CAP_PROP_FORMAT, _UNDECODED]
+        capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, undecoded)
+        if capture.isOpened() and int(capture.get(cv2.CAP_PROP_FOURCC)) != _JPEG:
+            # Pictures of other codecs depend on those before them.
+            capture.release()
+            capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, limits)
     else:
         capture = cv2.VideoCapture(source)
     why, step = "", ""
