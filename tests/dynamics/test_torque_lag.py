@@ -65,6 +65,18 @@ def test_torques_in_time_have_none(motion):
     assert found(record(real_dynamics("ur5e", rng, stribeck=True), motion(6, rng), rng)) is None
 
 
+def test_a_torque_that_never_changes_is_no_warning():
+    """Warnings are errors here: a share of nothing is no number."""
+    rng = np.random.default_rng(4)
+    stream = late(record(real_dynamics("ur5e", rng), multi_sine(6, rng), rng), 0.08)
+
+    def still(columns):
+        columns["tau1_nm"] = np.zeros(len(stream))
+
+    # It contradicts the other five, and no lag mends that.
+    assert found(changed(stream, still)) is None
+
+
 def test_what_no_lag_mends_has_none():
     rng = np.random.default_rng(5)
     stream = late(record(real_dynamics("ur5e", rng), multi_sine(6, rng), rng), 0.08)

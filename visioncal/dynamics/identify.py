@@ -176,9 +176,11 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
         if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
             break
     lag = Lag(lag_s, sigma, _change_share(fit, lag_s))
+    # A torque that never changes tells nothing of a lag.
     residual_shares = [
-        rms_of(residual, block.used) / std_of(block.y, block.used)
+        np.divide(rms_of(residual, block.used), std, out=np.ones(len(std)), where=std > 0.0)
         for residual, block in zip(fit.residuals, fit.blocks, strict=True)
+        for std in (std_of(block.y, block.used),)
     ]
     significant = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
     return lag if significant and np.median(residual_shares) < _LEFT else None
