@@ -13,7 +13,6 @@ robot reports: what of an arm's errors is one twist of the base and one of the f
 postures is in no residual, and an arm that goes where it is sent does it again.
 """
 
-import sys
 import tempfile
 import warnings
 from collections import Counter
@@ -26,6 +25,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from results import WORDS, few, first, write_section
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
@@ -637,19 +637,24 @@ def row(name: str, mount: str, given: bool, seeds: int) -> str:
 
 
 def main() -> None:
-    words = [argument for argument in sys.argv[1:] if not argument.startswith("-")]
-    quick = "--quick" in sys.argv
-    seeds = int(words[0]) if words and words[0].isdigit() else 1 if quick else SEEDS
-    names = [word for word in words if word in WORLDS] or list(WORLDS)[: 2 if quick else None]
-    print(
+    """Prints the table row by row, and keeps it where all worlds are in it."""
+    seeds = int(WORDS[0]) if WORDS and WORDS[0].isdigit() else few(SEEDS, 1)
+    asked = [word for word in WORDS if word in WORLDS]
+    table = [
         "| world | mount | lens | X | pick | X [mm], Park's | pick [mm], Park's "
-        "| good/check/bad | good beyond 3 sigma | likeliest causes | refused |"
-    )
-    print(f"|{' --- |' * 11}")
-    for name in names:
+        "| good/check/bad | good beyond 3 sigma | likeliest causes | refused |",
+        f"|{' --- |' * 11}",
+    ]
+    print("\n".join(table))
+    for name in asked or first(list(WORLDS), 2):
         for mount in ("eye-in-hand", "eye-to-hand"):
             for given in (True, False) if WORLDS[name].off_px == 0.0 else (True,):
-                print(row(name, mount, given, seeds), flush=True)
+                table.append(row(name, mount, given, seeds))
+                print(table[-1], flush=True)
+    if not asked:
+        text = "\n".join([f"{seeds} cells a row.\n", *table])
+        command = "PYTHONPATH=tests python tests/benchmarks/elsewhere.py"
+        write_section("Cells of another generator", command, text)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,11 @@ Every script takes `--quick`: the same way with the least of everything, in some
 that it still runs. It measures nothing, and leaves RESULTS.md as it is.
 """
 
+import datetime
+import fcntl
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -22,8 +25,8 @@ WORDS = tuple(argument for argument in sys.argv[1:] if argument != _OPTION)
 _Any = TypeVar("_Any")
 _HEAD = """# What the benchmarks measured
 
-Each section between `begin` and `end` marks is written by the command that it names; run that
-command to update it.
+Each section between `begin` and `end` marks is written by the command that it names, with the
+commit and the date of its run; run that command, or `.ci/nightly --full` for all, to update it.
 """
 
 
@@ -64,6 +67,16 @@ def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> N
         return
     begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
     section = f"{begin}\n## {name}\n\n`{command}`, {_machine()}\n\n{text.strip()}\n{end}\n"
+    # Benchmarks that run side by side write one after the other.
+    folder = os.open(path.parent, os.O_RDONLY)
+    fcntl.flock(folder, fcntl.LOCK_EX)
+    try:
+        _replace(path, section, begin, end)
+    finally:
+        os.close(folder)
+
+
+def _replace(path: Path, section: str, begin: str, end: str) -> None:
     old = path.read_text(encoding="utf-8") if path.exists() else _HEAD
     before, found, rest = old.partition(begin)
     if not found:
@@ -71,7 +84,7 @@ def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> N
     else:
         _, closed, after = rest.partition(f"{end}\n")
         if not closed:
-            raise ValueError(f"{path}: the section {name!r} has no line {end!r}; mend it by hand.")
+            raise ValueError(f"{path}: there is no line {end!r}; mend it by hand.")
         new = before + section + after
     path.write_text(new, encoding="utf-8")
 
@@ -79,4 +92,8 @@ def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> N
 def _machine() -> str:
     packages = (("numpy", "numpy"), ("OpenCV", "opencv-contrib-python-headless"))
     versions = ", ".join(f"{label} {version(package)}" for label, package in packages)
-    return f"on {os.cpu_count()} cores with Python {platform.python_version()}, {versions}."
+    told = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    at = subprocess.run(told, cwd=RESULTS.parent, capture_output=True, text=True, check=False)
+    commit = f"commit {at.stdout.strip()}, " if at.stdout else ""
+    return (f"{commit}{datetime.date.today().isoformat()}, on {os.cpu_count()} cores with Python "
+            f"{platform.python_version()}, {versions}.")  # fmt: skip
