@@ -24,15 +24,24 @@ from support.paired import Outcome
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
     SimulatedCell,
     WarmUpOptions,
     cell_session,
+    fine_camera,
     simulate,
     simulate_warm_up,
 )
 from visioncal.simulation.heat import heated_poses
-from visioncal.simulation.layout import Moved, NetworkOptions, RobotAt
+from visioncal.simulation.layout import (
+    BoardAt,
+    CameraAt,
+    Moved,
+    NetworkOptions,
+    RobotAt,
+    Swept,
+)
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -196,13 +205,19 @@ def foreign(name: str):
 FOREIGN_CAUSES = {"camera bumped 1 mm": "moved|step|slip|drift", "drift 0.5 mm": "drift|moved"}
 
 
-def network(cause: str = "", **options):
-    """A cell of two arms, two cameras and three boards."""
+def network(cause: str = "", gauge_m: float = 0.0, **options):
+    """A cell of two arms, cameras and boards; a gauge may tell the height of the second base."""
     pushed = {move.frame for move in options.get("moved", ())}
 
     def write(seed: int, folder: Path) -> Made:
-        cell = simulate(NetworkOptions(stops=24, seed=seed, **options))
+        cell = simulate(NetworkOptions(**{"stops": 24, "seed": seed} | options))
         cell_session(cell, "network", seen="corners").save(folder / "session")
+        if gauge_m:
+            noise_m = gauge_m * float(np.random.default_rng([seed, 77]).standard_normal())
+            height_m = cell.between("base_a", "base_b")[2, 3] + noise_m
+            with (folder / "session" / "session.toml").open("a") as file:
+                prior = {"z_m": float(height_m), "sigma_m": gauge_m}
+                file.write("\n" + tomli_w.dumps({"prior": {"base_a_from_base_b": prior}}))
 
         def judge(document, *_):
             reference, truth = np.linalg.inv(cell.mountings[document["reference"]]), {}
@@ -210,13 +225,36 @@ def network(cause: str = "", **options):
                 # What was pushed has two places, and names of its own in the result.
                 frame = name.partition("_from_")[2]
                 if frame in cell.mountings and frame not in pushed:
-                    is_fixed = name.startswith("cell")
+                    is_fixed = cell.parents[frame] == "cell"
                     truth[name] = (reference if is_fixed else np.eye(4)) @ cell.mountings[frame]
             return errors(document, truth)
 
         return Made(folder / "session", judge, cause)
 
     return write
+
+
+# Two arms with errors of their zeros, two fixed cameras and one in hand, a board 0.2 % too large, a
+# gauge, and a sweep by a clock of its own.
+EVERYTHING = {
+    "stops": 40,
+    "gauge_m": 5e-4,
+    "robots": tuple(
+        RobotAt(name, place_m, offset_sigma_rad=1e-3)
+        for name, place_m in (("a", (-0.6, 0.0, 0.0)), ("b", (0.6, 0.05, 0.02)))
+    ),
+    "cameras": (
+        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=fine_camera()),
+        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
+        CameraAt("hand", "b"),
+    ),
+    "boards": (
+        BoardAt("floor", place_m=(0.0, 0.0, 0.05), scale=1.002),
+        BoardAt("plate_a", "a", target=BOARDS["checkerboard"]),
+        BoardAt("plate_b", "b"),
+    ),
+    "sweeps": (Swept("left", "a", "plate_a", camera_minus_robot_s=0.0437),),
+}
 
 
 def various(seed: int, folder: Path) -> Made | None:
@@ -339,27 +377,33 @@ def tool(*, slips: bool):
     return write
 
 
-def warming(seed: int, folder: Path) -> Made:
+def warming(*, temperatures: bool, dh_sigma_m: float = 0.0):
     """An arm that warms up for 100 minutes; what is left of its drift up to the fifth hour."""
-    how = WarmUpOptions(CellOptions(seed=seed, branches=True, roll_rad=np.pi))
-    cell, heat = simulate_warm_up(how), how.heats
-    cell_session(cell, "warm-up", seen="poses").save(folder / "session")
-    q = postures(load_robot(cell.options.robot))[::EVERY]
-    hot = how.warming().at(np.linspace(6000.0, 18000.0, len(q)))
-    still = np.full_like(hot, heat.ambient_c)
-    arm = cell.robot.true_arm
-    drift = np.subtract(*(heated_poses(arm, heat, q, at)[:, :3, 3] for at in (hot, still)))
 
-    def judge(document, out, ask):
-        job = {"do": "arm", "calibration": str(out / "calibration.json"), "q": q.tolist()}
-        replies = [ask(**job, temperatures_c=at.tolist())["out"] for at in (hot, still)]
-        if any(isinstance(reply, str) for reply in replies):  # No drift was found.
-            return errors(document, cell.transforms)
-        ours = np.subtract(*(np.array(reply)[:, :3, 3] for reply in replies))
-        found = errors(document, cell.transforms)
-        return found | {"errors": found["errors"] | {"drift mm": 1e3 * rms(ours - drift)}}
+    def write(seed: int, folder: Path) -> Made:
+        options = CellOptions(seed=seed, branches=True, roll_rad=np.pi, dh_sigma_m=dh_sigma_m,
+                              dh_sigma_rad=1.7 * dh_sigma_m)  # fmt: skip
+        how = WarmUpOptions(options, temperatures=temperatures)
+        cell, heat = simulate_warm_up(how), how.heats
+        cell_session(cell, "warm-up", seen="poses").save(folder / "session")
+        q = postures(load_robot(cell.options.robot))[::EVERY]
+        hot = how.warming().at(np.linspace(6000.0, 18000.0, len(q)))
+        still = np.full_like(hot, heat.ambient_c)
+        arm = cell.robot.true_arm
+        drift = np.subtract(*(heated_poses(arm, heat, q, at)[:, :3, 3] for at in (hot, still)))
 
-    return Made(folder / "session", judge)
+        def judge(document, out, ask):
+            job = {"do": "arm", "calibration": str(out / "calibration.json"), "q": q.tolist()}
+            replies = [ask(**job, temperatures_c=at.tolist())["out"] for at in (hot, still)]
+            if any(isinstance(reply, str) for reply in replies):  # No drift was found.
+                return errors(document, cell.transforms)
+            ours = np.subtract(*(np.array(reply)[:, :3, 3] for reply in replies))
+            found = errors(document, cell.transforms)
+            return found | {"errors": found["errors"] | {"drift mm": 1e3 * rms(ours - drift)}}
+
+        return Made(folder / "session", judge)
+
+    return write
 
 
 def driven(seed: int, folder: Path) -> Command:
@@ -409,6 +453,7 @@ WORLDS: Mapping[str, Callable[[int, Path], Made | Command | None]] = {
     "cells: zeros 1 mrad": network(robots=_OFF),
     "cells: board moved": network("moved", moved=(Moved("target_floor", 12),)),
     "cells: wrong rows": network("wrong|exchanged|stray", swapped_rows=1, stray_images=4),
+    "cells: everything": network(**EVERYTHING),
     "variety": various,
     **{f"guess: {kind}": misread(kind) for kind in mistakes.MISTAKES
        if kind != "base_link for base"},
@@ -416,6 +461,8 @@ WORLDS: Mapping[str, Callable[[int, Path], Made | Command | None]] = {
     "verify": verified,
     "tcp: touches": tool(slips=False),
     "tcp: a slip of 1.4 mm": tool(slips=True),
-    "thermal": warming,
+    "thermal: by temperatures": warming(temperatures=True),
+    "thermal: by currents": warming(temperatures=False),
+    "thermal: arm off by 0.3 mm": warming(temperatures=True, dh_sigma_m=3e-4),
     "dynamics": driven,
 }  # fmt: skip

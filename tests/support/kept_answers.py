@@ -1,25 +1,26 @@
-"""Sixty cells whose answers are kept, so that a change of the estimator shows what it changes.
+"""Cells and recordings whose answers are kept, so that a change of the estimator shows.
 
-What is compared: which views are used, what moved, which causes and refusals are named (exactly),
-and every edge and noise level (in units of their sigmas). `tests/benchmarks/answers.py --write`
-renews the kept answers, and also prints where today's differ from them.
+What is compared is what the contracts of calibration.json give: the verdict, the likeliest cause,
+every edge in units of its sigma, sizes of noise, and messages by their kinds and figures.
+
+    PYTHONPATH=tests python -m support.kept_answers [NAME ...]    keeps today's answers
 """
 
 import json
-from collections.abc import Callable, Mapping
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.cells import calibrated
+from scipy.spatial.transform import RigidTransform
+from support.broken_sessions import BROKEN, broken_session
 
-from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.pipeline.result import result_of
-from visioncal.core.codec import write
-from visioncal.core.errors import VisioncalError
-from visioncal.core.transforms import invert, log
-from visioncal.results.sections import CalibrationSections
+import visioncal
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -42,7 +43,8 @@ from visioncal.simulation.layout import (
     RobotAt,
 )
 
-KEPT = Path(__file__).parents[1] / "data" / "answers.json"
+DATA = Path(__file__).parents[1] / "data"
+REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 _PLAIN = CellOptions()
@@ -56,118 +58,95 @@ _LOADS = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))
 _SHELF = Second(target=replace(BOARDS["checkerboard"], columns=8, rows=5))
 
 
+Message = tuple[str, list[float]]
+_FIGURE = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.]*\w)")
+
+
 @dataclass(frozen=True)
 class Answer:
     """What is kept of one cell.
 
     Attributes:
-        words: Facts that have to stay exactly as they are.
-        edges: Each edge as (4, 4) and its (6, 6) covariance.
-        sigmas: Standard deviations of the noise, by name.
+        status: The verdict, or "refused".
+        message: Kind and figures of the likeliest cause, or class and figures of a refusal; none
+            of a result without causes.
+        edges: Of each edge the upper rows (3, 4) of its matrix, and its sigmas (6,).
+        sizes: Standard deviations of noise, by name.
     """
 
-    words: Mapping[str, Any]
-    edges: Mapping[str, tuple[np.ndarray, np.ndarray]]
-    sigmas: Mapping[str, float]
-
-    def document(self) -> dict[str, Any]:
-        """The answer as JSON has it."""
-        return {
-            "words": dict(self.words),
-            "edges": {
-                name: {"matrix": edge[:3].round(12).tolist(), "sigma": _sigma(covariance)}
-                for name, (edge, covariance) in self.edges.items()
-            },
-            "sigmas": {name: float(f"{sigma:.6g}") for name, sigma in self.sigmas.items()},
-        }
+    status: str
+    message: Message | None
+    edges: Mapping[str, Mapping[str, list[Any]]]
+    sizes: Mapping[str, float]
 
 
-def _sigma(covariance: np.ndarray) -> list[float]:
-    return [float(f"{value:.6g}") for value in np.sqrt(np.diag(covariance))]
+def message(kind: str, words: str) -> Message:
+    """A message by its kind and the figures in it."""
+    return kind, [float(figure) for figure in _FIGURE.findall(words)]
 
 
-def _flat(noise: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    found: dict[str, float] = {}
+def answer_of(session: Session | Path, **asked: Any) -> Answer:
+    """Calibrates; a refusal is an answer, too."""
+    try:
+        result = visioncal.calibrate(session, **asked)
+    except visioncal.VisioncalError as error:
+        return Answer("refused", message(type(error).__name__, error.message), {}, {})
+    with tempfile.TemporaryDirectory() as folder:
+        result.save(Path(folder) / "calibration.json")
+        document = json.loads((Path(folder) / "calibration.json").read_text("utf-8"))
+    causes = document["verdict"].get("causes", ())
+    edges = {
+        name: {"matrix": np.array(edge["matrix"])[:3].round(12).tolist(),
+               "sigma": [float(f"{value:.6g}") for value in np.sqrt(np.diag(edge["covariance"]))]}
+        for name, edge in document["transforms"].items()
+    }  # fmt: skip
+    first = message(causes[0]["cause"], causes[0]["sentence"]) if causes else None
+    return Answer(document["verdict"]["status"], first, edges, dict(_flat(document["noise"])))
+
+
+def _flat(noise: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
     for name, value in noise.items():
         if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{name} ")
+            yield from _flat(value, f"{prefix}{name} ")
         elif isinstance(value, int | float):
-            found[f"{prefix}{name}"] = float(value)
-    return found
+            yield f"{prefix}{name}", float(f"{value:.6g}")
 
 
-def _of_calibration(result) -> Answer:
-    words = {
-        "unused": [view.view for view in result.views if not view.used],
-        "status": result.verdict.status,
-        "findings": sorted(finding.kind for finding in result.verdict.findings),
-        "level": "" if result.arm is None else result.arm.level,
-        "stages": sorted(write(CalibrationSections, result)),
-    }
-    edges = {name: (edge.matrix, edge.covariance) for name, edge in result.edges.items()}
-    return Answer(words, edges, _flat(result.noise))
+def _cell(
+    options: CellOptions, *, joints: bool = True, solver: str = "joint"
+) -> Callable[[], Answer]:
+    def case() -> Answer:
+        session = cell_session(simulate(options), "cell", seen="corners")
+        return answer_of(session if joints else without_joints(session), solver=solver)
+
+    return case
 
 
-def _of_cell(result) -> Answer:
-    words = {
-        "unused": [view.view for view in result.views if not view.used],
-        "moved": [
-            f"{value.frame} {value.last_stop} {value.first_stop}" for value in result.cell.moved
-        ],
-        "untied": sorted(value.frame for value in result.cell.untied),
-        "status": result.verdict.status,
-        "levels": {
-            name: "" if robot.arm is None else robot.arm.level
-            for name, robot in result.cell.robots.items()
-        },
-    }
-    edges = {name: (edge.matrix, edge.covariance) for name, edge in result.edges.items()}
-    return Answer(words, edges, _flat(result.cell.noise))
-
-
-def answer_of(case: Callable[[], Answer]) -> Answer:
-    """Runs a case; a refusal is an answer, too."""
-    try:
-        return case()
-    except VisioncalError as error:
-        words = {"refused": type(error).__name__, "first": error.message.split(":")[0]}
-        return Answer(words, {}, {})
-
-
-def answer_of_session(path: Path) -> Answer:
-    """Calibrates or, where it is a whole cell, aligns a recorded session."""
-    session = Session.load(path)
-    if len(session.robots) > 1 or len(session.cameras) > 1:
-        return _of_cell(calibrate(session))
-    return _of_calibration(calibrate(session))
-
-
-def _cell(options: CellOptions, **changes) -> Callable[[], Answer]:
-    return lambda: _of_calibration(result_of(calibrated(simulate(options), **changes)))
+def without_joints(session: Session) -> Session:
+    """The session of a robot of which poses are all that is said."""
+    document = {name: value for name, value in session.document.items() if name != "robot"}
+    columns = [name for name in session.columns if not re.fullmatch(r"q\d+_rad", name)]
+    rows = [[view.cell(column) for column in columns] for view in session.views]
+    return Session.assemble(
+        document, columns, rows, session.images, target_document=session.target_document,
+        corners=session.corner_table,
+    )  # fmt: skip
 
 
 def _tracked(options: instrument_session.InstrumentOptions, **document) -> Callable[[], Answer]:
-    def case() -> Answer:
-        session = instrument_session.session_of(instrument_session.tracked(options), **document)
-        return _of_calibration(calibrate(session))
-
-    return case
-
-
-def _swept(options: CellOptions, how: SweepOptions) -> Callable[[], Answer]:
-    return lambda: _of_calibration(
-        calibrate(cell_session(sweep(options, how), "sweep", seen="poses"))
+    return lambda: answer_of(
+        instrument_session.session_of(instrument_session.tracked(options), **document)
     )
 
 
-def _network(level: str = "auto", **options) -> Callable[[], Answer]:
-    def case() -> Answer:
-        cell = simulate(NetworkOptions(**options))
-        session: Session = cell_session(cell, "network", seen="names")
-        corners = {view_corners.view: view_corners for view_corners in cell.corners}
-        return _of_cell(calibrate(session, level=level, corners=corners))
+def _swept(options: CellOptions, how: SweepOptions) -> Callable[[], Answer]:
+    return lambda: answer_of(cell_session(sweep(options, how), "sweep", seen="poses"))
 
-    return case
+
+def _network(level: str = "auto", **options) -> Callable[[], Answer]:
+    return lambda: answer_of(
+        cell_session(simulate(NetworkOptions(**options)), "network", seen="corners"), level=level
+    )
 
 
 def cases() -> dict[str, Callable[[], Answer]]:
@@ -253,39 +232,68 @@ def cases() -> dict[str, Callable[[], Answer]]:
     points = (PointAt("ball_a", "a", (0.0, 0.05, 0.1)), PointAt("nest", "cell", (0.4, 0.4, 0.2)))
     trackers = (InstrumentAt("tracker", (1.8, -1.5, 0.5), 2.0),)
     found["cell, tracker"] = _network(**half, instruments=trackers, points=points, seed=9)
-    return found
+    recorded = sorted(REAL.glob("*/views.csv"))
+    return found | {
+        f"real, {path.parent.name}": partial(answer_of, path.parent) for path in recorded
+    }
 
 
-def kept() -> dict[str, Any]:
-    """The answers that are kept, by name."""
-    return json.loads(KEPT.read_text(encoding="utf-8"))
+def kept(name: str = "answers") -> dict[str, Any]:
+    """The answers that are kept, by name; or the messages."""
+    return json.loads((DATA / f"{name}.json").read_text("utf-8"))
 
 
 def away_in_sigmas(answer: Answer, before: Mapping[str, Any]) -> float:
     """By how many of the kept sigmas the farthest component of any edge differs from the kept."""
-    worst = 0.0
-    for name, (matrix, _) in answer.edges.items():
-        then = before["edges"][name]
-        base = np.vstack([then["matrix"], [0.0, 0.0, 0.0, 1.0]])
-        sigma = np.array(then["sigma"])
-        moved = np.abs(log(invert(base) @ matrix))
-        asked = sigma > 0.0
-        worst = max(worst, float((moved[asked] / sigma[asked]).max(initial=0.0)))
-    return worst
+    return max((_away(edge, before["edges"][name]) for name, edge in answer.edges.items()),
+               default=0.0)  # fmt: skip
 
 
-def sigmas_apart(answer: Answer, before: Mapping[str, Any]) -> float:
-    """By which share the sigma of an edge's component differs the most."""
-    worst = 0.0
-    for name, (_, covariance) in answer.edges.items():
-        then = np.array(before["edges"][name]["sigma"])
-        asked = then > 0.0
-        now = np.sqrt(np.diag(covariance))[asked]
-        worst = max(worst, float(np.abs(now / then[asked] - 1.0).max(initial=0.0)))
-    return worst
+def _away(edge: Mapping[str, Any], then: Mapping[str, Any]) -> float:
+    now, base = (RigidTransform.from_matrix(np.vstack([at["matrix"], [0.0, 0.0, 0.0, 1.0]]))
+                 for at in (edge, then))  # fmt: skip
+    moved, sigma = np.abs((base.inv() * now).as_exp_coords()), np.array(then["sigma"])
+    asked = sigma > 0.0
+    return float((moved[asked] / sigma[asked]).max(initial=0.0))
 
 
-def levels_apart(answer: Answer, before: Mapping[str, Any]) -> float:
-    """By which share a noise level differs the most."""
-    pairs = [(sigma, before["sigmas"][name]) for name, sigma in answer.sigmas.items()]
-    return max((abs(now / then - 1.0) for now, then in pairs if then > 0.0), default=0.0)
+def sizes_apart(answer: Answer, before: Mapping[str, Any]) -> float:
+    """By which share a noise's size, or the sigma of an edge (mm or deg), differs the most."""
+    pairs = [(size, before["sizes"].get(name, 0.0)) for name, size in answer.sizes.items()]
+    for name, edge in answer.edges.items():
+        now, then = (np.reshape(at["sigma"], (2, 3)) for at in (edge, before["edges"][name]))
+        pairs += zip(np.linalg.norm(now, axis=1), np.linalg.norm(then, axis=1), strict=True)
+    return float(max((abs(now / then - 1.0) for now, then in pairs if then > 0.0), default=0.0))
+
+
+def checkup_of(mistake: str) -> list[Message]:
+    """What the doctor says of a broken session: each finding, or why it cannot be read."""
+    with tempfile.TemporaryDirectory() as folder:
+        session = broken_session(Path(folder) / "session", BROKEN[mistake])
+        try:
+            found = visioncal.doctor(session).findings
+        except visioncal.VisioncalError as error:
+            return [message(type(error).__name__, error.message.replace(folder, ""))]
+    return [message(finding.kind, finding.words.replace(folder, "")) for finding in found]
+
+
+def keep(names: Iterable[str]) -> None:
+    """Writes the answers of some cases, or of all, into the files in tests/data."""
+    answers, messages = (kept(name) if (DATA / f"{name}.json").exists() else {}
+                         for name in ("answers", "messages"))  # fmt: skip
+    every = cases()
+    for name in names or [*every, *BROKEN]:
+        if name in BROKEN:
+            messages[name] = checkup_of(name)
+        else:
+            answer = every[name]()
+            messages[name] = [] if answer.message is None else [answer.message]
+            answers[name] = {"status": answer.status, "edges": answer.edges, "sizes": answer.sizes}
+        print(name, messages[name], flush=True)
+        for file, of in (("answers", answers), ("messages", messages)):
+            rows = (f"{json.dumps(key)}: {json.dumps(of[key])}" for key in sorted(of))
+            (DATA / f"{file}.json").write_text("{\n" + ",\n".join(rows) + "\n}\n", "utf-8")
+
+
+if __name__ == "__main__":
+    keep(sys.argv[1:])
