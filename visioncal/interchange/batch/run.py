@@ -114,11 +114,11 @@ def batch(
         raise DataError(f"{folder} cannot be written: {error.strerror}.") from error
     rows: list[FleetRow] = []
     # Reported before the first result, which may take minutes.
-    report = progress or (lambda *_: None)
-    report("batch", 0, len(jobs))
+    progress = progress or (lambda *_: None)
+    progress("batch", 0, len(jobs))
     for row in _rows(jobs, workers, scheduler):
         rows.append(row)
-        report("batch", len(rows), len(jobs))
+        progress("batch", len(rows), len(jobs))
     if against is not None:
         earlier, failed = Path(against), {row.name for row in rows if row.state == "failed"}
         rows = with_changes(
