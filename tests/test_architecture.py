@@ -139,8 +139,8 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.cli.dynamics_payload, visioncal.cli.dynamics_plan, "
             "visioncal.cli.dynamics_record, visioncal.cli.dynamics_validate, "
             "visioncal.cli.export, visioncal.cli.fixture, visioncal.cli.locate, "
-            "visioncal.cli.plan, visioncal.cli.record, "
-            "visioncal.cli.report, visioncal.cli.review, visioncal.cli.simulate, "
+            "visioncal.cli.plan, visioncal.cli.record, visioncal.cli.show, "
+            "visioncal.cli.simulate, "
             "visioncal.cli.target, visioncal.cli.tcp, visioncal.cli.touch_test, "
             "visioncal.cli.verify",
             {"numpy", "visioncal.core.types"},

@@ -34,6 +34,6 @@ def test_broken_inputs_end_in_a_result_or_a_clear_refusal(tmp_path, count):
         "export",
         "fixture",
         "plan",
-        "report",
+        "show",
         "tcp",
     }

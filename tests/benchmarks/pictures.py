@@ -42,7 +42,7 @@ def main() -> None:
         visioncal("calibrate", "cell-4", "-o", "out", "--need-mm", "0.5")
         visioncal("calibrate", "cell-5", "-o", "doubted")
         signed = ("--operator", "A. Smith", "--serial", "camera=1944301", "--serial", "robot=UR-77")
-        visioncal("report", "out", "--certificate", *signed, "-o", "certificate.html")
+        visioncal("show", "out", "--certificate", *signed, "-o", "certificate.html")
         card = package.Calibration.load("out")._repr_html_()
         Path("card.html").write_text(f"<meta charset=utf-8>{card}", "utf-8")
         with chromium(Path("profile")) as page:

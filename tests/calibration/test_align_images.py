@@ -107,6 +107,6 @@ def test_the_recording_is_the_session_and_holds_the_result(folder, out, tmp_path
         texts = [text.replace(path, same) for text in texts]
     one, other = map(json.loads, texts)
     assert one | {"created": ""} == other | {"created": ""}
-    assert visioncal("report", recording, "-o", tmp_path / "report.html").status == 0
+    assert visioncal("show", recording, "-o", tmp_path / "report.html").status == 0
     pages = [value.read_text() for value in (tmp_path / "report.html", out / "report.html")]
     assert pages[0].replace(str(tmp_path), str(out)) == pages[1]

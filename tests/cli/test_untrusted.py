@@ -10,12 +10,12 @@ from support.commands import visioncal
 COMMANDS = (
     ("calibrate", "{}", "-o", "out"),
     ("convert", "{}", "out"),
-    ("report", "{}"),
+    ("show", "{}"),
     ("export", "{}", "--to", "ros"),
     ("diff", "{}", "{}"),
     ("verify", "{}", "--against", "{}"),
     ("locate", "{}", "-c", "{}"),
-    ("review", "{}"),
+    ("show", "{}", "--viewer"),
     ("tcp", "{}", "--robot-model", "ur10e"),
     ("dynamics", "identify", "{}"),
     ("target", "check", "{}"),
@@ -51,8 +51,8 @@ def test_a_name_does_not_steer_the_terminal(tmp_path: Path) -> None:
     calls = (
         ("doctor", cell),
         ("calibrate", cell, "-o", out),
-        ("report", out, "-o", tmp_path / "report.html"),
-        ("report", out, "--certificate", "-o", tmp_path / "certificate.html"),
+        ("show", out, "-o", tmp_path / "report.html"),
+        ("show", out, "--certificate", "-o", tmp_path / "certificate.html"),
         ("verify", cell, "--against", out, "-o", tmp_path / "check"),
     )
     for call in calls:

@@ -14,7 +14,7 @@ from support.drawn import column
 from support.small_arm import small_arm, small_document
 
 from visioncal.cli import planned_motions
-from visioncal.cli.review import find_recording
+from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics.excitation import excite

@@ -13,7 +13,7 @@ from support.commands import Done, visioncal
 from support.drawn import column
 
 from visioncal.calibration.pipeline.running import with_proposal
-from visioncal.cli.review import find_recording
+from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
 from visioncal.results import Calibration

@@ -330,13 +330,13 @@ def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str)
 def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> None:
     page = (outputs / "report.html").read_text(encoding="utf-8")
     worst = worst_view(sample.calibration.views, sample.calibration.rms)
-    assert f"visioncal review '{outputs}' --view {worst}" in unescape(page)
+    assert f"visioncal show '{outputs}' --viewer --view {worst}" in unescape(page)
     for view in sample.calibration.views:
         anchor = f"view-{view.view}"
         assert f'id="{anchor}"' in page
         assert f"(report.html#{anchor})" in view_markdown(view)
     # Where there is no recording, nothing leads to it.
-    assert "visioncal review" not in render(sample.calibration, None, ())
+    assert "--viewer" not in render(sample.calibration, None, ())
 
 
 def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> None:

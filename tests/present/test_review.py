@@ -1,4 +1,4 @@
-"""`visioncal review`: what it opens, who can reach it, and that nothing stays behind."""
+"""`visioncal show --viewer`: what it opens, who can reach it, and that nothing stays behind."""
 
 import json
 import os
@@ -24,7 +24,7 @@ ENVIRONMENT = os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHON
 
 
 def command(*arguments) -> list[str]:
-    return [sys.executable, "-m", "visioncal", "review", *map(str, arguments)]
+    return [sys.executable, "-m", "visioncal", "show", "--viewer", *map(str, arguments)]
 
 
 def review(*arguments, **environment) -> subprocess.CompletedProcess:
@@ -68,7 +68,7 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
         (other, "first bytes"),
         (tmp_path / "nowhere.rrd", "does not exist"),
     ):
-        done = visioncal("review", path)
+        done = visioncal("show", "--viewer", path)
         assert done.status == 2
         assert words in done.err
 
@@ -77,14 +77,14 @@ def test_it_opens_at_the_worst_view_or_at_the_named_one(out, monkeypatch):
     opened = []
     monkeypatch.setattr(viewer, "review_native", lambda _, row: opened.append(row))
     views = load_result(out / "recording.rrd").views
-    assert visioncal("review", out).status == 0
+    assert visioncal("show", "--viewer", out).status == 0
     worst = views[opened[0]]
     assert not worst.used
     assert worst.residual_mm == max(view.residual_mm or 0.0 for view in views)
     # Views are numbered as the session says, and stand in its order.
-    assert visioncal("review", out, "--view", views[3].view).status == 0
+    assert visioncal("show", "--viewer", out, "--view", views[3].view).status == 0
     assert opened[1] == 3
-    refused = visioncal("review", out, "--view", "99")
+    refused = visioncal("show", "--viewer", out, "--view", "99")
     assert refused.status == 2
     assert "no view 99" in refused.err
 
@@ -161,7 +161,7 @@ def test_rerun_without_a_web_viewer_is_an_error_with_a_next_step(out, stub):
 
 
 def test_a_browser_is_not_opened_at_a_view(out):
-    done = visioncal("review", out, "--web", "--view", "3")
+    done = visioncal("show", "--viewer", out, "--web", "--view", "3")
     assert done.status == 2
     assert "--web" in done.err
 

@@ -79,11 +79,6 @@ def test_the_file_has_the_sections_of_one_camera_by_name(folder):
     assert "null" not in (folder / "out" / "calibration.json").read_text()
 
 
-def test_a_cell_comes_out_again_of_its_recording(folder):
-    done = visioncal("report", folder / "out", "--recompute")
-    assert (done.status, "bit for bit" in done.out) == (0, True), done.err
-
-
 def test_the_file_says_what_each_frame_is_uncertain_by(folder, found):
     budgets = json.loads((folder / "out" / "calibration.json").read_text())["uncertainty"]
     assert budgets["budget_mm"].keys() == found.edges.keys()

@@ -20,7 +20,7 @@ from support.varied_cells import Cell, cell, write
 
 import visioncal.cli.console
 from visioncal import Session
-from visioncal.cli.review import find_recording
+from visioncal.cli.show import find_recording
 from visioncal.core.errors import VisioncalError
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT
 from visioncal.interchange.result_files import load_calibration
@@ -103,7 +103,7 @@ def walk(seed: int, beside: Path, *, whole: bool = True) -> Walk:
 def _use(done: Walk, item: Cell, rng: np.random.Generator, folder: Path, out: Path, beside: Path,
          *, whole: bool) -> None:  # fmt: skip
     """All that is done with a result."""
-    if (whole or rng.random() < 0.2) and _run(done, "report", out, "-o", beside / "again.html"):
+    if (whole or rng.random() < 0.2) and _run(done, "show", out, "-o", beside / "again.html"):
         _check_page(done, beside / "again.html")
     with _stepped(done, "review"):
         recording = find_recording(out)

@@ -56,7 +56,7 @@ SOURCES = (
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
-REVIEW = "visioncal review OUT"
+REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 # Least number of views for a separate calibration.
 _FEWEST_ALONE = 6

@@ -33,7 +33,7 @@ _Writer: TypeAlias = Callable[[Path], None]
 def review_command(recording: Path) -> str:
     """The command that opens a recording, named by its folder."""
     named = recording.parent if recording.name == RECORDING else recording
-    return f"visioncal review {shlex.quote(str(named))}"
+    return f"visioncal show {shlex.quote(str(named))} --viewer"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,184 @@
+"""`visioncal show`."""
+
+import shlex
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from visioncal.cli.console import say
+from visioncal.cli.parsing import refuse_given
+from visioncal.core.errors import DataError
+from visioncal.core.files import absence
+from visioncal.core.number_format import some_of
+from visioncal.interchange.outputs import PREVIEW, RECORDING
+
+# The first bytes of every rerun recording.
+_MAGIC = b"RRF2"
+
+
+def show_command(
+    result: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="An output folder, its calibration.json, or a recording (.rrd); with --viewer a "
+            "plan, too.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="The page; report.html or certificate.html otherwise."),
+    ] = None,
+    viewer: Annotated[
+        bool, typer.Option("--viewer", help="Open the recording in the rerun viewer, instead.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="With --viewer: in a browser, not in a window.")
+    ] = False,
+    view: Annotated[
+        int | None,
+        typer.Option(
+            help="With --viewer: the number of the view to open the window at. Default: the worst; "
+            "in a browser the first."
+        ),
+    ] = None,
+    certificate: Annotated[
+        bool, typer.Option("--certificate", help="One page to print and sign, instead.")
+    ] = False,
+    operator: Annotated[str, typer.Option(help="With --certificate: who calibrated.")] = "",
+    serial: Annotated[
+        list[str] | None,
+        typer.Option(metavar="WHAT=NUMBER", help="With --certificate, as camera=1234."),
+    ] = None,
+) -> None:
+    """Show an earlier result: its report, its recording, or its certificate.
+
+    Pictures, coverage and joint angles of the report come from the recording.rrd beside a
+    calibration.json; where it is missing or belongs to another result, the report says so. With
+    --viewer --web the page's URL goes to stdout, and only this machine can reach it; Ctrl-C ends.
+    """
+    if not certificate:
+        given = {"--operator": operator or None, "--serial": serial}
+        refuse_given(given, "they are for --certificate", "Give that, too, or leave it out.")
+    if not viewer:
+        given_view = {"--web": web or None, "--view": view}
+        refuse_given(given_view, "they are for --viewer", "Give that, too, or leave it out.")
+        _write_page(result, out, None if not certificate else (operator, serial or []))
+        return
+    if web and view is not None:
+        raise typer.BadParameter("--view goes without --web: a browser opens at the first view.")
+    refuse_given({"--out": out}, "--viewer writes no page", "Leave it out.")
+    file = find_recording(result)
+    # Imported late, so that --help stays fast.
+    from visioncal.present.viewer import review_native, review_web
+
+    if not web:
+        review_native(file, _row(file, view))
+        return
+
+    def opened(url: str) -> None:
+        say("Ctrl-C ends.")
+        typer.echo(url)
+        if not webbrowser.open(url):
+            say("No browser could be opened; visit the address above.")
+
+    review_web(file, opened)
+
+
+def _write_page(result: Path, out: Path | None, signed: tuple[str, list[str]] | None) -> None:
+    """Writes the report, or the certificate with its operator and serial numbers."""
+    from visioncal.interchange.result_files import load_stored
+
+    stored = load_stored(result)
+    if signed is not None:
+        from visioncal.present.report.certificate import CertificateEntries, write_certificate
+
+        out = out or Path("certificate.html")
+        entries = CertificateEntries(signed[0], dict(map(_pair, signed[1])))
+        write_certificate(out, stored.calibration, stored.session, entries)
+    else:
+        # Imported late, so that --help stays fast.
+        from visioncal.present.report import write_report
+
+        out = out or Path("report.html")
+        write_report(
+            out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
+        )
+        # A cell's page shows nothing that a recording adds.
+        if stored.note and stored.calibration.cell is None:
+            say(stored.note)
+    say(f"wrote {out}")
+
+
+def _pair(text: str) -> tuple[str, str]:
+    what, sign, number = text.partition("=")
+    if not sign or not what:
+        raise DataError(
+            f"--serial is {text!r}; what it is of and the number are needed, as camera=1234.",
+            culprits=["--serial"],
+        )
+    return what, number
+
+
+def _row(file: Path, view: int | None) -> int | None:
+    """Index of the view at which a recording is opened; None for the first."""
+    from visioncal.interchange.result_files import load_result
+    from visioncal.present.recording import read_session
+    from visioncal.results.views import worst_view
+
+    if view is None:
+        # A plan and an uncalibrated session have no worst view.
+        with suppress(DataError):
+            result = load_result(file)
+            view = worst_view(result.views, result.rms)
+        if view is None:
+            return None
+    numbers = [other.number for other in read_session(file).views]
+    if view not in numbers:
+        raise DataError(
+            f"{file} has no view {view}; it has {some_of([*map(str, numbers)])}.",
+            culprits=["--view"],
+        )
+    return numbers.index(view)
+
+
+def find_recording(path: Path) -> Path:
+    """Path of a recording: an `.rrd`, or the recording.rrd, else plan.rrd, in a folder.
+
+    Raises:
+        DataError: There is none, or it is something else, such as a session's folder.
+    """
+    file = path / RECORDING if path.is_dir() else path
+    if path.is_dir() and not file.is_file() and (path / PREVIEW).is_file():
+        file = path / PREVIEW
+    if path.is_dir() and not file.is_file():
+        is_session = (path / "session.toml").is_file()
+        raise DataError(
+            f"{path} is a session, which has no recording yet."
+            if is_session
+            else f"{path} holds no {RECORDING}.",
+            culprits=[str(path)],
+            next_step="Calibrate first: visioncal calibrate "
+            f"{shlex.quote(str(path)) if is_session else 'SESSION'} -o OUT; then visioncal show "
+            "OUT --viewer.",
+        )
+    why_not = absence(file)
+    if why_not:
+        raise DataError(f"{file} {why_not}.", culprits=[str(file)])
+    try:
+        with file.open("rb") as stream:
+            magic = stream.read(len(_MAGIC))
+    except OSError as error:
+        raise DataError(
+            f"{file} cannot be read: {error.strerror or error}.", culprits=[str(file)]
+        ) from error
+    if magic != _MAGIC:
+        raise DataError(
+            f"{file} is no recording: its first bytes are not those of an .rrd.",
+            culprits=[str(file)],
+            next_step=f"Give the {RECORDING} that visioncal calibrate wrote.",
+        )
+    return file
