@@ -1,12 +1,9 @@
 """Whole cells from sessions: frames, faults, symmetric boards, lenses, and what is refused."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated, session_of
-from support.commands import visioncal
 from support.whole_cells import OPTIONS
 
 from visioncal.calibration.pipeline import calibrate
@@ -14,7 +11,6 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
 from visioncal.interchange.exports import Selection, document
-from visioncal.results import Calibration, to_document
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
@@ -118,22 +114,6 @@ def test_a_frame_that_moves_with_a_robot_asks_for_its_pose(clean):
         found.between("cam_left", "target_plate_b")
     with pytest.raises(DataError, match="no frame 'cam_lft'"):
         found.between("cam_lft", "base_a")
-
-
-def test_it_is_the_same_after_it_was_saved(clean, tmp_path):
-    _, found = clean
-    found.save(tmp_path / "calibration.json")
-    again = Calibration.load(tmp_path)
-    assert to_document(again) == to_document(found)
-    (tmp_path / "calibration.json").write_text(json.dumps({"schema": 9}))
-    with pytest.raises(DataError, match="schema is 9, this version reads 2"):
-        Calibration.load(tmp_path)
-
-
-def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
-    _, found = clean
-    worst = max(found.edges, key=lambda index: found.edges[index].sigma_mm).partition("_from_")[2]
-    assert found.cell.weakest.startswith(f"The weakest link is {worst}: sigma ")
 
 
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
@@ -314,26 +294,6 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
     assert all(view.residual_deg is None for view in found.views)
     # Some 250 coordinates tell what a tracker's noise is of what is said of it, to 5 %.
     assert found.cell.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
-
-
-def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
-    cell = simulate(NetworkOptions(instruments=TRACKERS, points=POINTS, stops=4))
-    session = cell_session(cell, "cell", seen="names")
-    views = tuple(
-        replace(
-            view,
-            numbers={
-                name: 1e3 * at if name.startswith("meas_") else at
-                for name, at in view.numbers.items()
-            },
-        )
-        if view.text.get("instrument") == "t2"
-        else view
-        for view in session.views
-    )
-    # Its images are not there, either, which is said before.
-    with pytest.raises(DataError, match="no instrument reads farther than 160 m"):
-        calibrate(replace(session, views=views))
 
 
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
@@ -541,31 +501,6 @@ def test_motion_that_leaves_an_offset_from_an_only_robot_open_is_named(
     assert f"'s {left_open} {frame}" in culprit
 
 
-def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
-    # A small board far away: in frontal views perspective hardly tells the tilt's sign.
-    small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
-    cell = simulate(
-        CellOptions(
-            target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
-        )
-    )
-    found = calibrate(session_of(cell), corners=dict(enumerate(cell.corners)))
-    reasons = calibrated(cell, joints=False).reasons
-    assert reasons[4] == "ambiguous: two poses of the target fit image and motion alike"
-    assert {view.view: view.reason for view in found.views}[4] == reasons[4]
-
-
-def test_two_stops_of_an_only_robot_are_too_few():
-    cell = simulate(CellOptions(mount="eye-to-hand", views=2))
-    with pytest.raises(DegenerateError, match="2 usable stops of the robot, at least 3"):
-        calibrate(one_camera(cell))
-    with pytest.raises(
-        DegenerateError, match=r"too few, .* all 2 stops of the robot turn"
-    ) as caught:
-        calibrate(two_cameras(cell))
-    assert "see target at 5 stops or more" in caught.value.next_step
-
-
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
     apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))
@@ -617,48 +552,6 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
         aligned(cell)
 
 
-@pytest.mark.slow
-def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
-    cell, _ = clean
-    session = cell_session(cell, "cell", seen="names")
-    corners = {corner.view: corner for corner in cell.corners}
-    held = set(list(corners)[::7])
-    views = [replace(view, holdout=view.number in held) for view in session.views]
-    rng = np.random.default_rng(0)
-    spoilt = {
-        view: replace(corner, px=corner.px + rng.normal(0.0, 3.0, corner.px.shape))
-        if view in held
-        else corner
-        for view, corner in corners.items()
-    }
-    kept, without = (
-        calibrate(replace(session, views=tuple(views)), corners=mapping)
-        for mapping in (
-            spoilt,
-            {view: corner for view, corner in corners.items() if view not in held},
-        )
-    )
-    assert {view.view for view in kept.views if not view.used} == held
-    assert kept.cell.noise == without.cell.noise
-    for name, edge in without.edges.items():
-        np.testing.assert_array_equal(kept.edges[name].matrix, edge.matrix)
-        np.testing.assert_array_equal(kept.edges[name].covariance, edge.covariance)
-    # Their residuals are told all the same: three pixels in each coordinate.
-    px = [view.rms_px for view in kept.views if not view.used]
-    assert np.sqrt(np.mean(np.square(px))) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
-    found = calibrate(replace(session, views=tuple(views)), corners=corners)
-    written = to_document(found)["validation"]
-    # Left out once or in turn is the same to chance, of so many views; in its pair, of some.
-    assert written["holdout"]["px"] == pytest.approx(written["held_out"]["px"], rel=0.3)
-    assert written["holdout"]["mm"] == pytest.approx(written["held_out"]["mm"], rel=0.5)
-    assert found.of("left", "b").validation.holdout is not None
-    assert found.verdict.status == "good"
-    assert kept.verdict.status == "check"
-    assert any(
-        "that the session holds back are missed by" in reason for reason in kept.verdict.reasons
-    )
-
-
 def with_elbow_of_b(session, change):
     """The session with no more than joints of one robot, the third of them changed."""
     views = [
@@ -687,42 +580,6 @@ def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     turned = with_elbow_of_b(session, lambda value: value | {"q3_rad": -value["q3_rad"]})
     with pytest.raises(DataError, match=r"^robot b: .* not those of ur5e .* of the opposite sign"):
         calibrate(turned, corners=corners)
-
-
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_one_camera_on_one_robot_is_a_cell_of_one(mount):
-    session = cell_session(simulate(CellOptions(mount=mount, views=15)), "cell", seen="poses")
-    found, other = calibrate(session), calibrate(session)
-    assert to_document(replace(found, created="")) == to_document(replace(other, created=""))
-    stood = session.views[0].base_from_flange().as_matrix()
-    first, second = (found.edges[edge].matrix for edge in found.edges)
-    chain = (
-        invert(first) @ invert(stood) @ second
-        if mount == "eye-in-hand"
-        else invert(first) @ stood @ second
-    )
-    seen = found.between("cam", "target", {"robot": stood})
-    np.testing.assert_allclose(seen.matrix, chain, atol=1e-12)
-    # Both edges are known to about as much as one view sees.
-    assert 0.0 < seen.sigma_mm < 2.0 * max(edge.sigma_mm for edge in found.edges.values())
-
-
-def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path):
-    options = NetworkOptions(
-        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate_a", "a"),), stops=STOPS
-    )
-    session = cell_session(simulate(options), "cell", seen="poses")
-    session.save(tmp_path / "session")
-    out = tmp_path / "out"
-    done = visioncal("calibrate", tmp_path / "session", "-o", out, "--json")
-    assert done.status == 0
-    written = json.loads((out / "calibration.json").read_text())
-    assert written == json.loads(done.out)
-    assert set(written["transforms"]) == {
-        "cell_from_cam_left",
-        "cell_from_cam_right",
-        "flange_a_from_target_plate_a",
-    }
 
 
 def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
@@ -790,24 +647,6 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
 
 
 @pytest.mark.slow
-def test_a_board_of_another_size_is_found_beside_arms_that_err():
-    robots = (
-        RobotAt("a", (-0.6, 0.0, 0.0), offset_sigma_rad=1e-3),
-        RobotAt("b", (0.6, 0.05, 0.02), offset_sigma_rad=1e-3),
-    )
-    boards = (replace(FLOOR, scale=1.002), BoardAt("plate_a", "a"), BoardAt("plate_b", "b"))
-    cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
-    options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
-    found = aligned(simulate(options))
-    floor = found.boards["floor"]
-    # Four of its sigmas: one run in fifteen thousand.
-    assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
-    assert set(found.boards["plate_a"].sigma) == {"scale"}
-    assert not found.cell.moved
-    assert {found.cell.robots[name].arm.level for name in "ab"} == {"offsets"}
-
-
-@pytest.mark.slow
 def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     """What all three have in common the arms' links may have, too: free together none is clear."""
     robots = (replace(robot, offset_sigma_rad=1e-3) for robot in NetworkOptions().robots)
@@ -822,17 +661,3 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)
     # 0.03 mm is planted: sizes that stay wrong count as ten times that.
     assert max(found.cell.noise[name]["translation_mm"] for name in "ab") < 0.06
-
-
-@pytest.mark.slow
-def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end():
-    """Boards of slightly other sizes look like errors of both arms, until they are free."""
-    scales = 1.0 + 1e-3 * np.random.default_rng([47, 41]).standard_normal(3)
-    boards = [
-        replace(board, scale=float(scale))
-        for board, scale in zip(NetworkOptions().boards, scales, strict=True)
-    ]
-    cell = simulate(NetworkOptions(boards=tuple(boards), stops=30, seed=47))
-    found = aligned(cell)
-    # The worst of fifty such cells; chi-square of 6 beyond 28 is 0.01 %.
-    assert off(cell, found, "base_a", "base_b")[1] < 28.0

@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
-from support.cells import arm_found, board_numbers, calibrated, error_of, reporting, showing
+from support.cells import board_numbers, calibrated, error_of, showing
 
 from visioncal.calibration.pipeline import run
-from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.appearance import BOARD_NAMES
-from visioncal.estimation.workspace import postures
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.results import Calibration, to_document
@@ -27,7 +25,6 @@ from visioncal.simulation import (
     CellOptions,
     Second,
     fine_camera,
-    forward,
     simulate,
     wide_camera,
     write_session,
@@ -90,47 +87,6 @@ def test_boards_have_names_and_a_common_covariance(mount):
         assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
 
 
-@pytest.mark.slow
-def test_two_boards_tell_more_of_an_arm_than_one():
-    """The same number of views, and the tool's place all over the workspace."""
-    ratios = []
-    for seed in range(2):
-        options = replace(TWO, **WRONG_LINKS, mount="eye-to-hand", views=24, seed=seed)
-        errors = []
-        for second in (None, Second(target=BOARDS["charuco"])):
-            cell = simulate(replace(options, second=second))
-            known = calibrated(cell)
-            assert known.robot_arm.kinematics.level == "geometry"
-            errors.append(error_m(cell, known))
-        ratios.append(errors[1] / errors[0])
-    # Both boards are seen by most stops: 0.55 in the median of five cells.
-    assert max(ratios) < 0.8
-
-
-def test_each_board_adds_six_values_that_are_determined():
-    """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
-    cell = simulate(replace(TWO, **WRONG_LINKS, views=24, seed=1))
-    known = calibrated(cell)
-    counts = arm_found(known).identifiability.counts
-    assert known.robot_arm.kinematics.level == "geometry"
-    assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
-    # The first board alone determines thirty.
-    one = calibrated(without(cell, set(np.flatnonzero(board_numbers(cell) == 1).tolist())))
-    counts = arm_found(one).identifiability.counts
-    assert (counts.columns, counts.identifiable) == (48, 30)
-
-
-def error_m(cell, known):
-    """Root mean square error of the first board's place, seen from the camera [m]."""
-    robot = known.robot_arm.model.robot
-    q = postures(robot)
-    x, z, *_ = cell.transforms.values()
-    board = known.assessment.state.edges[1]
-    true = invert(x) @ forward(cell.robot.true_arm, q) @ z
-    ours = invert(known.assessment.state.edges[0]) @ robot.base_from_flange(q) @ board
-    return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
-
-
 def test_a_wrong_view_of_one_board_is_named():
     cell = simulate(replace(TWO, seed=4))
     corners = list(cell.corners)
@@ -146,17 +102,6 @@ def test_a_wrong_view_of_one_board_is_named():
     assert set(range(len(corners))) - set(known.used) == {slipped}
     assert "disagrees with the other views" in known.reasons[slipped]
     assert any(f"View {slipped} was left out" in reason for reason in known.verdict.reasons)
-
-
-def test_a_board_of_another_size_is_named():
-    known = calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5)))
-    told = [reason for reason in known.verdict.reasons if "By the robot's motion" in reason]
-    assert len(told) == 1
-    assert "the board second is 1 % larger than stated" in told[0]
-    shapes = result_of(known).boards
-    # The robot measures a size to some hundredths of a percent.
-    assert shapes["second"].shape["scale"] == pytest.approx(0.01, abs=1e-3)
-    assert shapes["first"].shape["scale"] == 0.0
 
 
 def test_files_from_before_boards_were_sheared_mean_the_same_values():
@@ -254,16 +199,6 @@ def test_the_turn_of_a_symmetric_board_is_told_by_its_other_views():
     turned = np.linalg.norm(away[:3]) > 1.0
     assert np.linalg.norm(away[3:]) < (0.5 if turned else 2e-4)
     assert known.findings.held_out.mm < 0.5
-
-
-def test_inverse_poses_are_told_by_the_views_of_one_board(tmp_path):
-    cell = simulate(replace(TWO, seed=14))
-    inverse = reporting(cell, base_from_flange=invert(cell.robot.base_from_flange))
-    session = Session.load(write_session(inverse, tmp_path / "pairs", images=False))
-    guess = guess_session(session)
-    assert not guess.declared.closes
-    assert guess.stands_out
-    assert guess.best.closes
 
 
 def test_every_output_shows_all_boards(tmp_path):

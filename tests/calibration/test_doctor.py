@@ -17,7 +17,6 @@ from support.typed_fixes import mended
 import visioncal
 from visioncal.calibration.pipeline import checkup
 from visioncal.calibration.pipeline.checkup import to_document
-from visioncal.calibration.stages import detect
 from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
@@ -25,7 +24,6 @@ from visioncal.interchange.formats import load_for_rereading
 from visioncal.session import Session
 from visioncal.simulation import BOARDS
 from visioncal.vision.camera import project
-from visioncal.vision.finders import find_target
 from visioncal.vision.finders.board import FINDERS
 from visioncal.vision.targets import load_target
 
@@ -134,16 +132,6 @@ def test_a_board_too_blurred_for_its_markers_is_no_other_board(columns, sigma_px
     assert "target check" not in str(found.do)
 
 
-def test_how_blurred_and_how_small_markers_are_is_said():
-    said = first_of_blurred(charuco(9, 6), 2.9).words
-    blur_px, module_px, read_px = map(float, re.findall(r"([0-9.]+) px", said))
-    # With what every picture here has of its own; the sharpest edges are looked for, to a tenth.
-    assert blur_px == pytest.approx(3.0, rel=0.1)
-    # Tilted by 25 deg, its squares are up to a tenth narrower than 28 px.
-    assert module_px == pytest.approx(28 * 0.022 / 0.03 / 7, rel=0.1)
-    assert read_px == pytest.approx(0.4 * module_px, abs=0.06)
-
-
 @pytest.mark.parametrize(
     ("shown", "sigma_px", "words"),
     [
@@ -180,22 +168,6 @@ def test_the_declared_size_is_not_given_to_another_board(shown, advice):
     assert found.kind == "other_board"
     assert advice in found.do.words
     assert "36" not in str(found.do)
-
-
-@pytest.mark.parametrize(
-    ("declared", "words"),
-    [
-        (circles(9, 5, asymmetric=True), "an asymmetric grid of 9 x 5 circles"),
-        (circles(5, 9), "a symmetric grid of 5 x 9 circles"),
-    ],
-)
-def test_the_declared_grid_is_described_as_the_seen_one_is(declared, words):
-    image, _ = photograph(circles(5, 9, asymmetric=True), Shot(square_px=28))
-    image = np.pad(image, 20, mode="edge")
-    session = Session.from_arrays([image] * 3, np.tile(np.eye(4), (3, 1, 1)), declared)
-    said = visioncal.doctor(session).findings[0].words
-    assert "an asymmetric grid of 5 x 9 circles" in said
-    assert f"is {words}." in said
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -320,32 +292,3 @@ def test_a_turned_image_has_the_lens_that_its_rays_have(clockwise):
     seen, turned = ((799 - v, u), (-y, x, z)) if clockwise else ((v, 1279 - u), (y, -x, z))
     found = project(turned_lens(lens, clockwise=clockwise), np.stack(turned, axis=1))
     np.testing.assert_allclose(found, np.stack(seen, axis=1), atol=1e-9)
-
-
-def test_a_few_images_decide_that_a_board_with_markers_is_another(monkeypatch):
-    thorough = []
-
-    def counted(image, target, *, quick=False):
-        thorough.append(not quick)
-        return find_target(image, target, quick=quick)
-
-    monkeypatch.setattr(detect, "find_target", counted)
-    image, _ = photograph(charuco(9, 6), Shot(square_px=28))
-    image = np.pad(image, 20, mode="edge")
-    images = [np.roll(image, shift, axis=1) for shift in range(9)]
-    session = Session.from_arrays(images, np.tile(np.eye(4), (9, 1, 1)), checkerboard(9, 6))
-    found = visioncal.doctor(session).findings[0]
-    assert found.kind == "other_board"
-    assert "a ChArUco board of 9 x 6 squares" in found.words
-    # A thorough search for what is not there takes seconds in large images.
-    assert sum(thorough) == 3
-    assert len(thorough) > len(images)
-
-
-def test_a_session_of_one_view_is_described_in_the_singular(sound, tmp_path):
-    one = tmp_path / "one"
-    shutil.copytree(sound, one)
-    lines = (one / "views.csv").read_text().splitlines(keepends=True)
-    (one / "views.csv").write_text("".join(lines[:2]))
-    seen = visioncal.doctor(one).seen
-    assert {"1 view", "1 pose of the robot"} <= {*seen}

@@ -222,18 +222,6 @@ def test_an_instrument_that_sinks_is_told(options):
     assert moved == pytest.approx(0.5, rel=0.5)
 
 
-@pytest.mark.slow
-def test_views_that_are_held_back_are_predicted():
-    shop = tracked(replace(POINTS, **WRONG, stops=36))
-    session = session_of(shop)
-    views = tuple(replace(view, holdout=view.stop % 6 == 0) for view in session.views)
-    known = known_of(replace(session, views=views))
-    assert len(known.used) == 90
-    # Left out in turn, stops are predicted to 0.07 mm.
-    assert known.findings.pairs[0].holdout.mm < 0.12
-    assert known.findings.pairs[0].holdout.deg is None
-
-
 def test_measured_poses_of_a_target_come_before_readings():
     session = session_of(tracked(PROBE))
     views = tuple(

@@ -22,7 +22,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
 from visioncal.interchange.exports import Selection, document
 from visioncal.results import Calibration
-from visioncal.results.arm import ArmResult, CarriedRegion, CarriesOver
+from visioncal.results.arm import ArmResult
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.simulation.arms import forward
@@ -152,23 +152,6 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
     # One arm of errors that few values tell of: its error is within a factor of what is predicted.
     ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
     assert 0.4 < ours / found.sigma_mm < 1.5
-
-
-def test_the_words_name_where_it_is_no_better():
-    regions = [
-        CarriedRegion(*pair) for pair in (("box", 0.2, 1.0, True), ("behind", 0.9, 1.0, False))
-    ]
-    words = CarriesOver(
-        measured_mm=0.15,
-        measured_nominal_mm=0.98,
-        sigma_mm=0.5,
-        nominal_mm=1.1,
-        session_mm=0.15,
-        better_share=0.7,
-        regions=tuple(regions),
-    ).words
-    assert "errs by 0.15 mm (the stated arm by 0.98 mm). Elsewhere 0.5 mm are" in words
-    assert "70 % of the workspace; behind the base it is not clearly better than as" in words
 
 
 def test_tables_of_the_functions_are_within_their_sigmas(shop, known):

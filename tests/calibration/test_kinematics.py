@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.bound import workspace_bound_m
 from support.cells import arm_found, calibrated, error_of, known_of, reporting
 from support.marks import slow
@@ -14,16 +13,13 @@ import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.kinematics import choose_level, findings
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.workspace import postures
-from visioncal.frames.tcp import touched_tool
-from visioncal.frames.touches import TouchRows
-from visioncal.simulation import CellOptions, forward, simulate
-from visioncal.simulation.arms import inverse
+from visioncal.simulation import CellOptions, simulate
 
 
 @pytest.mark.slow
@@ -151,20 +147,6 @@ def test_a_wrong_gear_ratio_is_told():
     assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
 
-@pytest.mark.slow
-def test_a_dirty_cell_is_calibrated_all_over_its_workspace():
-    """Bent board, lens a little off, eccentric and rippling joints, size known to 0.02 %."""
-    target = replace(WRONG_LINKS.target, square_sigma_m=2e-4 * WRONG_LINKS.target.square_m)
-    wrong = replace(WRONG_LINKS, views=60, branches=True, target=target, board_scale=1.0001)
-    worn = replace(wrong, eccentricity_sigma_rad=1.5e-4, ripple_sigma_rad=3e-5)
-    cell = simulate(replace(worn, board_bow_m=3e-4, lens_mismatch_px=0.1, seed=1))
-    known, nominal = calibrated(cell), calibrated(cell, joints=False)
-    assert known.robot_arm.kinematics.level == "eccentricity"
-    share = error_m(cell, known, known.robot_arm.model.robot) / error_m(cell, nominal, known.robot)
-    # A median of 6 % over many worlds, of which nine in ten lie under twice that.
-    assert share < 0.12
-
-
 def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-6 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=3, target=sure))
@@ -257,27 +239,6 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     assert found.observability.identifiable == 30
     # The nominal model stays what it was.
     assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
-
-
-@pytest.mark.slow
-def test_touches_close_on_the_calibrated_arm():
-    cell = simulate(replace(WRONG_LINKS, seed=5, views=40))
-    result = result_of(calibrated(cell))
-    rng, tip, point = np.random.default_rng(0), np.array([0.034, 0.001, 0.16]), [0.45, 0.1, 0.1]
-    turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (12, 3))).as_matrix()
-    turns = forward(cell.robot.true_arm, cell.robot.joints[:1])[0, :3, :3] @ turns
-    poses = compose(turns, np.array(point) - turns @ tip)
-    reach = inverse(cell.robot.true_arm, poses, np.tile(cell.robot.joints[0], (12, 1)))
-    q, names = reach.joints[reach.solved], tuple(map(str, range(int(reach.solved.sum()))))
-    nothing = ("",) * len(q)
-    rows = TouchRows("t", names, names, result.robot.base_from_flange(q), q, nothing, nothing)
-    with_arm, without = touched_tool(rows, result), touched_tool(rows)
-    assert with_arm.verdict.status == "good"
-    # Exact touches: what is left is what the calibration leaves of the arm's errors nearby.
-    assert with_arm.rms_mm < 0.15 * without.rms_mm
-    # Controllers' poses are the nominal arm's.
-    told = touched_tool(replace(rows, joints_rad=None), result)
-    assert any("without joint angles" in reason for reason in told.verdict.reasons)
 
 
 def test_a_level_that_explains_too_little_is_told():

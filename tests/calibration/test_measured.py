@@ -17,7 +17,6 @@ from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import PartialCalibration, start_from_session
 from visioncal.results import Calibration
-from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import CellOptions, Second, SimulatedCell, simulate
 from visioncal.simulation.records import cell_session
@@ -64,31 +63,6 @@ def run(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunState:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     return known
-
-
-def test_an_arm_that_cannot_tilt_is_not_asked_to():
-    """Its model is known: parallel axes, as a SCARA's."""
-    joint = {"a_m": 0.4, "d_m": 0.1, "alpha_rad": 0.0}
-    last = {**joint, "a_m": 0.1}
-    model = {"schema": 1, "name": "scara", "convention": "standard"} | {
-        "joint": [joint, joint, last]
-    }
-    robot, plain = Robot.from_document(model), scara(0, {})
-    q = np.random.default_rng(1).uniform(-1.5, 1.5, (len(plain.views), robot.joint_count))
-    rows = []
-    for at, flange in enumerate(robot.base_from_flange(q)):
-        seen = invert(flange @ X) @ Z
-        pose = [*seen[:3, 3], *Rotation.from_matrix(seen[:3, :3]).as_quat()]
-        rows.append([str(at), *(repr(float(value)) for value in (*q[at], *pose))])
-    columns = ["view", "q1_rad", "q2_rad", "q3_rad", *(f"cft_{name}" for name in POSE)]
-    document = {**plain.document, "robot": {"model": "arm.toml"}}
-    session = Session.assemble(document, columns, rows, MemoryImages({}), robot_document=model)
-    with pytest.raises(DegenerateError) as refused:
-        calibrate(session)
-    assert refused.value.next_step == (
-        "This arm cannot tilt: measure that offset for [prior.flange_from_cam], as z_m and sigma_m "
-        "in session.toml."
-    )
 
 
 @pytest.mark.parametrize(
@@ -144,18 +118,6 @@ def test_what_was_measured_of_the_target_helps_as_well(mount):
     # Four sigma, for twelve numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     assert sum("was used" in note for note in known.notes) == 3
-
-
-def test_a_rotation_may_be_known_alone():
-    cell = simulate(CellOptions(robot="ur5e", views=12, seed=3))
-    name = "base_from_target"
-    turn = Rotation.from_matrix(cell.transforms[name][:3, :3]).as_quat().tolist()
-    known = run(cell, {name: {"quaternion_xyzw": turn, "sigma_rad": 1e-6}})
-    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:12])
-    # Four sigma, for twelve numbers.
-    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
-    # The board is turned no farther than that is known; the views alone know it to 2e-5.
-    assert sigmas[6:9].max() < 1.001e-6 < sigmas[9:12].max()
 
 
 def test_a_board_of_several_may_be_known_whole():

@@ -14,7 +14,6 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.findings import PointAccuracy
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks, need_met
-from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
@@ -22,7 +21,7 @@ from visioncal.core.verdict import EMPTY_IMAGE, GOOD_FOR, Finding, Remedy, remar
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.present.report.content import need_facts
-from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
+from visioncal.results import Calibration, Rms, to_document
 from visioncal.simulation import CellOptions, simulate
 
 
@@ -320,18 +319,6 @@ def test_the_worst_pair_counts_and_is_named() -> None:
     assert met.probability == min(pair.probability for pair in met.pairs)
     assert met.of("left", "a").probability == met.pairs[0].probability
     assert need_met(None, picks) is None
-
-
-@pytest.mark.parametrize(
-    "met",
-    [
-        NeedMet(Need(0.5), 0.97),
-        NeedMet(Need(None, 0.1, (0.4, 0.0, 0.2)), 0.5, (Picker("left", "a", 0.5),)),
-    ],
-)
-def test_it_is_kept(met: NeedMet) -> None:
-    document = json.loads(json.dumps(write(NeedMet, met)))
-    assert read(NeedMet, document, "need") == met
 
 
 def test_a_result_tells_what_it_is_good_for() -> None:

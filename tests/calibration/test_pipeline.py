@@ -10,7 +10,6 @@ from support.marks import slow
 from visioncal.calibration.pipeline.running import view_evidence
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import REFINE_LENS
-from visioncal.calibration.stages.observed import nothing_seen
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Camera, Target
 from visioncal.estimation.closed_form import SOLVERS
@@ -221,16 +220,3 @@ def test_a_session_that_holds_all_views_back_is_told_so(given):
     with pytest.raises(DataError, match="are held back") as caught:
         calibrated(cell, session=held)
     assert "Clear role" in caught.value.next_step
-
-
-@pytest.mark.parametrize(
-    ("reason", "words"),
-    [
-        ("too few corners: 4 of 4, needs 6", "shows enough of the target"),
-        ("no board: no marker of DICT_5X5_100 is seen", "shows the target"),
-    ],
-)
-def test_a_board_with_too_few_corners_is_told_from_one_that_is_not_seen(reason, words):
-    known = known_of(simulate(FINE))
-    unseen = replace(known, cameras={}, reasons=dict.fromkeys(known.corners, reason))
-    assert words in nothing_seen(unseen).message

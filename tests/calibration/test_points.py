@@ -578,29 +578,6 @@ def test_a_deleted_row_takes_its_corners_along(cube):
         Session.load(cube)
 
 
-@pytest.mark.parametrize("count", [1, 12])
-def test_views_that_repeat_others_are_named_and_count_once(count, tmp_path):
-    folder = write_rig(tmp_path / "rig", Rig("charuco"))
-    before = calibrate(folder)
-    for name in ("views.csv", "corners.csv"):
-        header, *lines = (folder / name).read_text().splitlines()
-        rows = [line.split(",", 1) for line in lines]
-        again = [f"{int(view) + 100},{rest}" for view, rest in rows if int(view) < count]
-        (folder / name).write_text("\n".join([header, *lines, *again]) + "\n")
-    twice = calibrate(folder)
-    (found,) = (finding for finding in twice.verdict.findings if finding.kind == "repeated_views")
-    assert found.words.startswith(
-        "View 100 repeats 0:" if count == 1 else "Views 100 to 111 repeat 0 to 11:"
-    )
-    assert twice.next_steps[0] == found.do
-    (last,) = (view for view in twice.views if view.view == 99 + count)
-    assert (last.used, last.reason) == (False, f"repeats view {count - 1}")
-    # No copy takes part, and none counts as lost.
-    assert not any(finding.kind == "lost_views" for finding in twice.verdict.findings)
-    for name, edge in before.edges.items():
-        assert np.array_equal(twice.edges[name].covariance, edge.covariance)
-
-
 @pytest.mark.parametrize("lens", [Rig.lens, ""])
 def test_a_rig_that_is_seen_mirrored_is_named(lens, tmp_path):
     """Unlike a flat board, it fits no pose then."""
@@ -643,25 +620,6 @@ def drawn(tmp_path: Path) -> Path:
     )
     session.save(tmp_path / "drawn")
     return tmp_path / "drawn"
-
-
-def test_a_view_that_is_far_off_by_its_own_noise_alone_stays():
-    """Corners that deviate by pixels leave a view seen frontally open to degrees."""
-    cell = simulate(CellOptions(views=15, seed=39, cut_views=0.0))
-    rng = np.random.default_rng(39)
-    session = Session.from_corners(
-        [
-            (corners_.ids, corners_.px + 2.0 * rng.standard_normal(corners_.px.shape))
-            for corners_ in cell.exact_corners
-        ],
-        cell.robot.base_from_flange,
-        cell.options.target,
-        cell.stated[""].resolution,
-        mount=IN_HAND,
-        camera=cell.stated[""],
-    )
-    # Without it, view 13 is five degrees off, beyond what is near on the lever of rotations.
-    assert all(view.used for view in calibrate(session).views)
 
 
 def state(folder: Path, key: str, value: object) -> None:
@@ -718,15 +676,6 @@ def test_tables_of_spreadsheets_with_decimal_commas_are_read(drawn):
         file = drawn / name
         file.write_text(file.read_text().replace(",", ";").replace(".", ","))
     assert Session.load(drawn).digest() == sound.digest()
-
-
-def test_a_misspelt_key_of_a_board_is_named(drawn):
-    document = target_document(Session.load(drawn).target) | {"legacyy": True}
-    state(drawn, "target", '"b.toml"')
-    lines = (f"{key} = {json.dumps(value)}\n" for key, value in document.items())
-    (drawn / "b.toml").write_text("".join(lines))
-    words = "b.toml: legacyy is no known name and was not read. Did you mean legacy?"
-    assert words in Session.load(drawn).warnings
 
 
 @pytest.mark.parametrize(("size", "dh_sigma"), [(1.004, 0.0), (1.0, 3e-4)])

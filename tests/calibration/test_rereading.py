@@ -22,7 +22,6 @@ from visioncal.interchange.formats import (
     ImportOptions,
     assemble,
     guess_foreign,
-    load_for_rereading,
     read_foreign,
     reread,
     reread_session,
@@ -116,22 +115,6 @@ def test_a_sound_session_is_not_accused_and_stays_what_it_is(cell, tmp_path):
     assert done.exit_code == 0, done.stderr
     assert "fit as declared" in done.stderr
     assert Session.load(tmp_path / "same").digest() == Session.load(cell).digest()
-
-
-def test_a_board_in_millimetres_is_read_so_and_said(cell):
-    board = 'kind = "charuco"\ncolumns = 9\nrows = 6\nsquare_m = 30\nmarker_m = 22\n'
-    (cell / "board.toml").write_text(f'{board}dictionary = "DICT_5X5_100"\n', encoding="utf-8")
-    declared = (cell / "session.toml").read_text(encoding="utf-8")
-    (cell / "session.toml").write_text(f'target = "board.toml"\n{declared}', encoding="utf-8")
-    session = load_for_rereading(cell).session
-    assert session.target is not None
-    # A factor of a thousand, and its rounding.
-    assert session.target.square_m == pytest.approx(0.030, rel=1e-15)
-    assert session.target.marker_m == pytest.approx(0.022, rel=1e-15)
-    assert any(
-        "board.toml cannot be in metres: 30 is read as 30 mm" in warning
-        for warning in session.warnings
-    )
 
 
 def mirrored_cell(folder, *, corners=True):
@@ -324,11 +307,3 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
         visioncal.calibrate(cell)
     assert caught.value.message.startswith("session.toml: robot.model: There is no robot named")
     assert caught.value.next_step == found.do.words
-
-
-def test_an_unknown_name_is_told_with_where_to_delete_it(cell):
-    document = cell / "session.toml"
-    document.write_text("munt = 1\n" + document.read_text("utf-8"), "utf-8")
-    (found,) = [finding for finding in visioncal.calibrate(cell).verdict.findings if finding.do]
-    assert found.words.startswith("session.toml: munt is not a known field")
-    assert found.do.words == "In session.toml, correct or delete munt."

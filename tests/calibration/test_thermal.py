@@ -1,7 +1,6 @@
 """Drift with temperature: learnt while an arm warms up, predicted, followed, and refused."""
 
 import json
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -330,15 +329,6 @@ def test_kelvin_is_no_celsius(learnt, tmp_path):
         Session.load(tmp_path / "warm")
 
 
-def test_a_view_in_kelvin_is_named(learnt):
-    session = learnt["temperatures"].session
-    columns = (*session.columns, "ambient_c")
-    cells = [[*(view.cell(name) for name in session.columns), "21.5"] for view in session.views]
-    cells[4][-1] = "294.65"
-    with pytest.raises(DataError, match=re.escape("row 5, column ambient_c: 294.65")):
-        Session.assemble(session.document, columns, cells, session.images)
-
-
 def test_samples_that_are_many_are_averaged():
     stamps = np.arange(0.0, 2000.0, 0.1)
     values = np.column_stack([stamps, np.tile([2.0], (len(stamps), 6))])
@@ -408,14 +398,6 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
     refused = run("correct", table, "--against", tmp_path, "--temperatures", kelvin)
     assert refused.status == 2
     assert "looks like kelvin" in refused.err
-
-
-def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
-    found = learnt["temperatures"]
-    # 24 views and then six again, every five minutes; the poses that are told are the same ones.
-    assert len(np.unique(found.truth.robot.base_from_flange, axis=0)) == 24
-    stations = {observation.station for observation in found.session.observations}
-    assert len(stations) == len(found.session.views)
 
 
 @pytest.mark.parametrize("points", [THREE[:1], THREE])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.sound_findings import PAIR, SOUND, changed, directions, left_out, views
+from support.sound_findings import SOUND, changed, directions, left_out, views
 
 from visioncal.calibration.stages.findings import Sensor
 from visioncal.calibration.stages.judge import judge
@@ -124,24 +124,6 @@ def test_a_run_of_wrong_views_is_told(numbers, words):
     reason = judge(left_out(numbers)).reasons[0]
     assert "were left out" in reason
     assert (words in reason) if words else "follow each other" not in reason
-
-
-def test_a_pair_of_which_all_views_are_left_out_is_told():
-    """As of one camera of several, which by itself has no view that the others could precede."""
-    found = left_out(range(20))
-    several = (replace(PAIR, name="left of floor"), replace(found.pairs[0], name="right of floor"))
-    reasons = judge(replace(found, pairs=several)).reasons
-    assert any(reason.startswith("right of floor: views 0, 1, 2") for reason in reasons)
-    assert not any("follow each other" in reason for reason in reasons)
-
-
-def test_a_reason_is_told_once():
-    found = left_out(range(12, 20))
-    reasons = judge(found).reasons
-    assert sum("view 12's figures" in reason for reason in reasons) == 1
-    assert "8 of 20 views are not used; all of them disagree with the others." in reasons
-    more = judge(changed(found, lost=[*found.sensors[0].lost, *LOST[:1]])).reasons
-    assert any("; the first but for these: view 30, blurred: very." in name for name in more)
 
 
 @pytest.mark.parametrize(

@@ -31,9 +31,7 @@ from visioncal.calibration.verification.prediction import (
     predict_stops,
 )
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import significant
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.present.report.check import render_check
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
@@ -200,31 +198,6 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     )
     assert names(found) == ["view 2"]
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
-
-
-def test_the_page_shows_what_is_left_with_the_change_undone(place):
-    found = checked(
-        place, np.random.default_rng(9), Change(camera=knock(np.random.default_rng(9), 2.0, 0.2))
-    )
-    before, after = (
-        np.linalg.norm(value[:, 3:], axis=1) for value in (found.residuals, found.remaining)
-    )
-    # Two millimetres and 0.2 deg at half a metre become the noise of stops, some tenths of that.
-    assert np.sqrt(np.mean(after**2)) < 0.3 * np.sqrt(np.mean(before**2))
-    policy = outcomes(
-        load_policy(),
-        facts_of(found.predicted.observed.session, place.calibration, failed=True, collision=True),
-    )
-    page = Page(render_check(found, policy, verdict_of(found)))
-    assert "does not hold any more" in page.words
-    assert "with the likeliest change undone: the camera moved by" in page.words
-    assert [significant(1e3 * value) in page.words for value in (*before, *after)] == [True] * 10
-    assert "now a collision" in page.words
-    passed = checked(place, np.random.default_rng(0))
-    assert (passed.remaining == passed.residuals).all()
-    assert "undone" not in Page(render_check(passed, (), verdict_of(passed))).words
-    more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
-    assert "undone" not in Page(render_check(more, (), verdict_of(more))).words
 
 
 def test_two_slips_are_more_than_one_change_explains():
