@@ -244,32 +244,12 @@ def lens_is_free(known):
     ).any()
 
 
-def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
-    cell = simulate(replace(FINE, seed=5))
-    known = with_lens(cell, np.array([0.0, 0.0, 3.0, 0.0]), intrinsics="hold")
-    (sentence,) = [
-        reason for reason in known.verdict.reasons if "do not fit these images" in reason
-    ]
-    assert 'intrinsics = "hold" keeps them' in sentence
-    assert known.verdict.status != "good"
-    assert not lens_is_free(known)
-    assert mahalanobis_sq(cell, known) < UNLIKELY
-
-
 @pytest.mark.parametrize("options", [FINE, replace(FINE, seed=11)])
 def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
     cell = simulate(options)
     known = with_lens(cell, np.zeros(4), intrinsics="refine")
     assert lens_is_free(known)
     assert known.verdict.status == "good"
-    assert mahalanobis_sq(cell, known) < UNLIKELY
-
-
-def test_intrinsics_within_their_stated_sigma_are_refined_without_a_doubt():
-    cell = simulate(replace(FINE, seed=2))
-    known = with_lens(cell, np.array([2.0, 2.0, -1.5, 1.0]), matrix_sigma_px=2.0)
-    assert known.verdict.status == "good"
-    assert any("refined within what is stated" in reason for reason in known.verdict.reasons)
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
@@ -291,40 +271,6 @@ def test_a_focal_length_that_is_off_by_less_than_shows_beyond_chance_is_in_doubt
     focal_px = cell.options.camera.matrix * [1.0, 1.0, 0.0, 0.0]
     known = with_lens(cell, 1e-3 * focal_px)
     assert mahalanobis_sq(cell, known) < UNLIKELY
-
-
-def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
-    cell = simulate(replace(FINE, seed=5, views=15))
-    off = np.array([6.0, 6.0, -8.0, 5.0])
-    wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
-    told = replace(cell, stated={"": wrong})
-    known = calibrated(told)
-    assert any("given intrinsics do not fit" in warning.reason for warning in known.warnings)
-    refined = known.cell_fit.camera_parameters.camera("cam")
-    lens = known.cell_fit.columns_of(known.cell_fit.camera_parameters.lens_of("cam"))
-    sigma = np.sqrt(np.diag(known.assessment.covariance))[lens[:4]]
-    assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.0 * sigma)
-    table = {"intrinsics": "hold"}
-    document = known_of(told).session.document
-    session = replace(
-        known_of(told).session, document=document | {"camera": document["camera"] | table}
-    )
-    held = calibrated(told, session=session)
-    assert held.cell_fit.camera_parameters.camera("cam").matrix == pytest.approx(wrong.matrix)
-
-
-def test_too_few_corners_leave_the_lens_alone():
-    marker = Target("tag", "marker", 1, 1, 0.12, 1e-4, dictionary="DICT_4X4_50", marker_id=0)
-    cell = simulate(replace(FINE, seed=2, views=15, target=marker))
-    document = known_of(cell).session.document
-    camera = document["camera"] | {"intrinsics": "refine"}
-    session = replace(known_of(cell).session, document=document | {"camera": camera})
-    known = calibrated(cell, session=session)
-    assert not lens_is_free(known)
-    assert any(
-        '"refine" was not done: 60 corners in 15 views' in warning.reason
-        for warning in known.warnings
-    )
 
 
 def test_memory_is_linear_in_the_points_of_an_exact_rig():

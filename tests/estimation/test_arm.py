@@ -106,15 +106,3 @@ def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
         for joints in (True, False):
             errors = calibrated(simulate(options), joints=joints).robot_arm.errors
             assert errors is None or not errors.is_likely
-
-
-@pytest.mark.slow
-def test_estimating_the_links_along_makes_the_answer_better():
-    errors = {True: [], False: []}
-    for seed in range(6):
-        cell = simulate(replace(WRONG, seed=seed))
-        for joints, kept in errors.items():
-            kept.append(error_of(cell, calibrated(cell, joints=joints))[:6])
-    along, not_along = (np.sqrt(np.mean(np.square(error))) for error in errors.values())
-    # Seen 0.6: half of the links' errors look the same in all views.
-    assert along < 0.8 * not_along

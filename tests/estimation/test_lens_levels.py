@@ -12,7 +12,6 @@ from visioncal.core.transforms import exp
 from visioncal.estimation import lens_levels
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
-from visioncal.estimation.joint import refit_jointly
 from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import LikelihoodValue, most_likely
@@ -172,45 +171,6 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):
     )
     assert estimated
     assert all((item.breathing, item.jitter) == (0.0, 0.0) for item in estimated)
-
-
-def test_the_size_of_breathing_does_not_hang_on_where_the_fit_before_had_it(monkeypatch):
-    """Far from where the focus is fixed, that was underrated, and each fit had more breathing."""
-    asked = []
-    original = refine.lens_levels
-    monkeypatch.setattr(refine, "lens_levels", lambda *them: asked.append(them) or original(*them))
-    calibrated(simulate(replace(FINE, mount="eye-to-hand", views=20)), joints=False)
-    side, fitted = asked[-1]
-    gains = []
-    for breathing in (0.0, 0.1, 0.3):  # shares up to 3 %, at 0.1 px of noise
-        levels = dict.fromkeys(fitted.camera_parameters.problems, LensLevels(breathing=breathing))
-        before = refit_jointly(
-            fitted, side, fitted.moving, fitted.camera_parameters.with_levels(levels)
-        )
-        (found,) = original(side, before).values()
-        gains.append(found.gains)
-    # Fits end where a step gains a thousandth of a sigma; it was 0.9 for 3 %.
-    assert gains[1:] == [pytest.approx(gains[0], abs=1e-2)] * 2
-
-
-def test_a_field_is_not_counted_beside_itself(monkeypatch):
-    """What a fit takes for a lens's field has no part in the next estimate of its size."""
-    asked = []
-    original = refine.lens_levels
-    monkeypatch.setattr(refine, "lens_levels", lambda *them: asked.append(them) or original(*them))
-    calibrated(simulate(replace(FINE, views=20, seed=2)), joints=False)
-    side, fitted = asked[-1]
-    sizes = []
-    for field in (0.0, 0.5):
-        levels = dict.fromkeys(fitted.camera_parameters.problems, LensLevels(field=field))
-        before = refit_jointly(
-            fitted, side, fitted.moving, fitted.camera_parameters.with_levels(levels)
-        )
-        (found,) = original(side, before).values()
-        sizes.append((found.field, found.gains[0]))
-    assert sizes[0][0] > 0.0
-    # Counted twice, it gained a fifth of that.
-    assert sizes[1] == pytest.approx(sizes[0], rel=0.02)
 
 
 def test_a_fit_that_has_run_away_is_no_bug_of_the_likelihood():

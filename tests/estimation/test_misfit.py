@@ -269,22 +269,6 @@ def test_the_budget_adds_up(given):
     assert ("intrinsics" in budget) == np.isin(lens, known.cell_fit.linearised_corners.free).any()
 
 
-def test_sources_that_are_known_together_add_up_as_well():
-    bent = replace(FINE, state_intrinsics=False, board_bow_m=5e-4, seed=2)
-    result, known = answered(simulate(bent))
-    is_lens = known.cell_fit.linearised_corners.free < known.cell_fit.camera_parameters.boards.start
-    owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
-    fields = (
-        known.cell_fit.field_columns
-        - known.cell_fit.columns_of(known.cell_fit.linearised_corners.free)[0]
-    )
-    owners["lens_field"] = fields
-    parts = covariance_by_source(*told(result), sources(**owners))
-    whole = covariance_of(result.problem, result.fit)[:12, :12]
-    # An identity; what is left is rounding of an inverse with a condition of 1e10.
-    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
-
-
 def test_a_point_is_as_uncertain_as_its_scatter():
     rng = np.random.default_rng(3)
     edge, point = exp(rng.normal(size=6)), np.array([0.1, -0.2, 0.6])
@@ -302,18 +286,6 @@ def test_95_percent_lie_within_the_radius(variances):
     radius = radius95(np.diag(np.array(variances, float)))
     # Imhof's fit is good to 1 %; 200000 draws to 0.1 %.
     assert np.mean(draws < radius**2) == pytest.approx(0.95, abs=0.004)
-
-
-@pytest.mark.slow
-def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
-    surprises = []
-    for seed in range(12):
-        cell = simulate(replace(FINE, seed=seed, robot_sigma_m=3e-4, robot_sigma_rad=5e-4))
-        result, known = answered(cell)
-        error = error_of(cell, known)
-        surprises.append(error @ np.linalg.solve(result.covariance[:12, :12], error) / 12)
-    # Mean of 12 chi-square of 12: 0.12; the board's scale, held at the truth, takes one of them.
-    assert np.mean(surprises) == pytest.approx(0.95, abs=0.35)
 
 
 def through_a_wavy_lens(cell, sigma_px, rng):
@@ -389,25 +361,6 @@ def test_a_focus_that_follows_the_distance_is_counted_and_named(mount):
     # 12 components: 2.8 is one in a thousand. Left out of the model, it is above 100.
     assert np.mean(squared) / 3 < 2.8
     assert named == 4
-
-
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
-    camera = fine_camera()
-    # A principal point off the middle: turned, the image is of another lens than the others.
-    camera = replace(camera, matrix=camera.matrix + np.array([0.0, 0.0, 25.0, -8.0]))
-    cell = simulate(replace(FINE, mount=mount, camera=camera, pixel_sigma_px=0.01))
-    last = np.array(camera.resolution) - 1.0
-    corners = list(cell.corners)
-    corners[5] = replace(corners[5], px=last - corners[5].px)
-    known = calibrated(showing(cell, corners), joints=False)
-    assert [warning.kind for warning in known.findings.warnings] == ["turned_images"]
-    (found,) = known.findings.warnings
-    assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
-    assert "mogrify -rotate 180 SESSION/images/005.png" in found.do.command
-    assert "its image is turned by 180 deg" in known.assessment.views[5].reason
-    # 3 components: 5.4 is one in a thousand.
-    assert mahalanobis_sq_of_place(cell, known) / 3 < 5.4
 
 
 # What was done to an image (rows, columns), and what undoes it by the words of the finding.

@@ -216,21 +216,6 @@ def test_points_nearly_on_a_line_are_refused_by_their_noise():
         fit_points(pairs_of(nominal, points, even(3, NOISE_M)))
 
 
-def test_what_was_left_out_is_said_where_the_others_are_too_poor():
-    rng = np.random.default_rng(3)
-    frame, nominal = (
-        some_frame(rng),
-        np.vstack([np.outer(np.arange(6), [0.06, 0.0, 0.0]), LINE[:1]]),
-    )
-    nominal[:6, 1:] = 5e-4 * rng.normal(size=(6, 2))
-    nominal[6] = [0.1, 0.2, 0.0]
-    points = placed(frame, nominal) + NOISE_M * rng.normal(size=(7, 3))
-    # Off along the line: in no turn about it does P6 fit.
-    points[6] += 0.02 * frame[:3, 0]
-    with pytest.raises(DegenerateError, match="without P6, which does not agree with the others"):
-        fit_points(pairs_of(nominal, points))
-
-
 def test_points_in_one_place_are_refused():
     points = np.tile([0.1, 0.2, 0.3], (4, 1))
     with pytest.raises(DegenerateError, match="all in one place"):
@@ -294,17 +279,6 @@ def test_the_expected_noise_is_compared_with_what_is_seen():
     assert fit_points(pairs).agreement.explained
     assert not fit_points(pairs, expected_noise_m=NOISE_M).agreement.explained
     assert fit_points(pairs, expected_noise_m=1e-3).agreement.explained
-
-
-def test_a_drawing_far_from_its_origin_is_no_worse():
-    rng = np.random.default_rng(14)
-    frame, nominal = some_frame(rng), some_drawing(rng, 6) + np.array([3.0, -2.0, 1.0])
-    pairs = pairs_of(nominal, placed(frame, nominal) + NOISE_M * rng.normal(size=(6, 3)))
-    found = fit_points(pairs)
-    error = away(found.base_from_fixture, frame)
-    # F of 6 and 12 degrees stays under 8.4 in all but one case of a thousand.
-    assert error @ np.linalg.solve(found.covariance, error) < 6 * 8.4
-    assert found.worst[0].sigma < 2 * NOISE_M
 
 
 def test_the_frame_moves_with_each_point_as_it_says():

@@ -151,19 +151,6 @@ def test_many_stops_are_put_by_some_columns():
     assert np.trace(more[3:6, 3:6]) > 3.0 * np.trace(covariance[3:6, 3:6])
 
 
-@pytest.mark.slow
-def test_some_blocks_of_a_long_session_tell_the_sizes_of_all(monkeypatch):
-    problem, fit = fitted(lasting, 0, stops=300)
-    sizes = []
-    for blocks in (5, 100):
-        monkeypatch.setattr(pose_errors, "_MOST_BLOCKS", blocks)
-        found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-        squares = np.sum(found.basis**2, axis=2).mean(axis=0).reshape(2, 3).mean(axis=1)
-        sizes.append(np.sqrt(squares + found.white**2))
-    # Of 300 stops of a memory of ten, 30 are independent: sizes are known to an eighth.
-    assert sizes[0] == pytest.approx(sizes[1], rel=0.25)
-
-
 def test_too_few_stops_say_nothing():
     problem, fit = fitted(white, 0, stops=5)
     assert find_pose_errors(problem, fit.state, fit.noise, ROBOT) is None

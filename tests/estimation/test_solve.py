@@ -255,19 +255,6 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     assert cost == pytest.approx(whole + problem.prior_cost(fit.state), rel=1e-8)
 
 
-def test_a_fit_at_its_answer_looks_twice(monkeypatch):
-    """Once where it starts, and once more for a change of the noise."""
-    problem, fit = answered(False, views=8, seed=2)
-    looked = []
-    linear = type(problem).linear
-    monkeypatch.setattr(
-        type(problem), "linear", lambda *at, **how: looked.append(at[1]) or linear(*at, **how)
-    )
-    noise = replace(fit.noise, robots=1.01 * fit.noise.robots)
-    solve_problem(problem, fit.state, noise, is_near=True)
-    assert len({id(value) for value in looked}) <= 2
-
-
 def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
     def runs_away(*_):
         raise np.linalg.LinAlgError("Singular matrix")

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -131,33 +130,6 @@ def test_exact_views_give_the_truth(solver: Solver, build: Build):
         for estimate, truth in ((found.x, problem.x), (found.z, problem.z)):
             assert turn_error(estimate, truth) < 1e-9
             assert shift_error(estimate, truth) < 1e-9
-
-
-@pytest.fixture
-def quiet_opencv():
-    """OpenCV's Tsai writes an error for each set of small tilts, which it refuses."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    yield
-    cv2.utils.logging.setLogLevel(level)
-
-
-@pytest.mark.usefixtures("quiet_opencv")
-@pytest.mark.parametrize("name", ["tsai", "park", "horaud", "daniilidis"])
-def test_pairs_within_groups_tell_as_much_as_all(name, monkeypatch):
-    problems = [simulate(replace(PRECISE, views=220), seed) for seed in range(12)]
-    grouped = [
-        turn_error(SOLVERS[name](problem.robot, problem.camera).x, problem.x)
-        for problem in problems
-    ]
-    monkeypatch.setattr("visioncal.estimation.closed_form.pairs._GROUP", 220)
-    whole = [
-        turn_error(SOLVERS[name](problem.robot, problem.camera).x, problem.x)
-        for problem in problems
-    ]
-    # A hundred partners leave 1 % of the variance; both share all but that of their noise, so 12
-    # ratios are known to 3 %, and with neighbours alone as partners all would be far off.
-    assert np.sqrt(np.mean(np.square(grouped))) < 1.1 * np.sqrt(np.mean(np.square(whole)))
 
 
 def test_a_view_has_no_more_partners_with_more_views():
