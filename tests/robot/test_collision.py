@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.apart import UR5E_PAIRS, UR5E_RADIUS_M, clearances, corners, line_to_box, lines, tubes
+from support.apart import UR5E_PAIRS, clearances, corners
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
@@ -87,15 +87,6 @@ def test_what_is_left_out_is_named_with_its_reason():
         assert frozenset({f"link {joints[a]}", f"link {joints[b]}"}) in kept
 
 
-def test_a_box_that_the_arm_can_never_leave_shows():
-    robot = load_robot("ur5e")
-    everywhere = Body("hall", 0, "box", np.full(3, 5.0), np.eye(4))
-    cell = Collisions(robot, [*arm_bodies(robot), everywhere], CLEARANCE, None)
-    contact = cell.first_contact(random_joints(20))
-    assert np.all(contact >= 0)
-    assert all("hall" in cell.names[place] for place in contact)
-
-
 def test_what_is_guessed_is_kept_farther_away_but_from_the_arm_that_carries_it():
     robot = load_robot("ur5e")
     flange = robot.chain.placements[-1][:3, 3]
@@ -172,17 +163,3 @@ def test_a_body_is_where_its_link_is():
     heights = corners(robot.base_from_flange(q) @ pose, size)[..., 2].min(axis=1) + 2.0
     found = np.array([cell.distances(value)[0] for value in q])
     np.testing.assert_allclose(found, heights, atol=1e-9)
-
-
-def test_the_plain_distances_can_fail():
-    """The tests' own geometry knows a line through a box and one beside it."""
-    knots = tubes(ur_arm("ur5e"), np.zeros((1, 6)))
-    assert len(knots) == len(UR5E_RADIUS_M)
-    p, q = lines(knots[1])[1]
-    beside = replace_y(p, q)
-    assert line_to_box(p, q, compose(np.eye(3), 0.5 * (p + q)[0]), np.full(3, 0.1))[0] == 0.0
-    assert line_to_box(p, q, beside, np.full(3, 0.1))[0] == pytest.approx(0.95)
-
-
-def replace_y(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    return compose(np.eye(3), 0.5 * (p + q)[0] + np.array([0, 1.0, 0]))

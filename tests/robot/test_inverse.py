@@ -50,12 +50,6 @@ def test_poses_are_reached_from_anywhere_within_the_limits(name):
         assert (joints <= robot.upper_rad + 1e-12).all()
 
 
-def test_what_encoders_tell_is_what_positions_came_from():
-    robot = disturbed(load_robot("panda"), np.random.default_rng(4))
-    q = np.random.default_rng(5).uniform(-6.0, 6.0, (50, 7))
-    assert robot.chain.encoded(robot.chain.effective(q)) == pytest.approx(q, abs=1e-14)
-
-
 def test_the_branch_is_that_of_the_seed():
     robot = load_robot("ur5e")
     flipped = HOME * [1, 1, 1, 1, -1, 1] + [0, 0, 0, np.pi, 0, np.pi]

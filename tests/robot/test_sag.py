@@ -8,7 +8,7 @@ import pytest
 from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, deflected_joints, load_robot, table_of, with_base
 from visioncal.robot.tables import table_document
-from visioncal.simulation import CellOptions, Payload, arm_named, forward, simulate
+from visioncal.simulation import Payload, arm_named
 from visioncal.simulation.elasticity import elasticity_of, loaded_joints
 
 LOAD = Payload(5.0, (0.03, -0.02, 0.11), (12.0, -30.0, 4.0))
@@ -83,21 +83,3 @@ def test_an_arm_of_unknown_masses_weighs_nothing():
     document = dict(robot.document) | {"gravity_m_s2": [0, 0, -1000]}
     with pytest.raises(DataError, match="gravity_m_s2"):
         Robot.from_document(document)
-
-
-def test_a_simulated_cell_sags_and_has_play():
-    rigid = simulate(CellOptions(views=6))
-    soft = simulate(CellOptions(views=6, compliance_rad_per_nm=COMPLIANCE, payloads=(LOAD,)))
-    away = soft.robot.true_base_from_flange - rigid.robot.true_base_from_flange
-    # A cobot with 5 kg sinks by some centimetre.
-    assert -0.1 < away[:, 2, 3].mean() < -2e-3
-    assert np.array_equal(soft.robot.base_from_flange, rigid.robot.base_from_flange)
-    worn = simulate(CellOptions(views=6, backlash_rad=(0.0, 2e-4, 0.0, 0.0, 0.0, 0.0)))
-    assert worn.robot.approach.tolist() == [-1, 1, -1, 1, -1, 1]
-    # A joint that came from above stays above its encoder.
-    up = rigid.robot.joints + np.outer(worn.robot.approach, [0, 1e-4, 0, 0, 0, 0])
-    exact = forward(rigid.robot.true_arm, up) @ (
-        np.linalg.inv(forward(rigid.robot.true_arm, rigid.robot.joints))
-        @ rigid.robot.true_base_from_flange
-    )
-    assert worn.robot.true_base_from_flange == pytest.approx(exact, abs=1e-12)

@@ -79,14 +79,6 @@ def test_another_recording_of_the_cell_is_verified_and_its_board_located(seen):
         assert error @ np.linalg.solve(np.array(value["covariance"]), error) < 21.1
 
 
-def test_a_camera_that_was_knocked_fails_the_check(seen, place):
-    _, out, _ = seen
-    done("simulate", place / "later", "--views", 4, "--recording", 2, "--camera-moved-mm", 1)
-    checked = visioncal("verify", place / "later", "--against", out)
-    assert checked.status == 3
-    assert "The camera moved by" in checked.out
-
-
 def test_a_second_board_is_placed_along(place):
     done("simulate", place / "two", "--second-board", "--no-images", "--views", 12)
     done("calibrate", place / "two", "-o", place / "two-out")
@@ -189,28 +181,6 @@ def test_tools_and_fixtures_of_every_robot_of_a_cell_are_found_by_touches(cell):
     assert "set_tcp" in done("export", out, "--to", "ur-tcp", "--robot", "b")
 
 
-@pytest.mark.slow
-def test_torques_of_one_robot_of_a_cell_are_identified(cell, place):
-    (folder, _), loaded, out = cell, place / "whole-loaded", place / "arm-b"
-    assert "several robots (a, b)" in visioncal("dynamics", "identify", folder).err
-    some = ("--cell", "two-arms", "--no-images", "--views", 2, "--torques", "--payload-kg", 2)
-    done("simulate", loaded, *some)
-    one = ("--robot", "b")
-    done("dynamics", "identify", folder, *one, "--validate-on", "b_fresh", "-o", out)
-    found, (content, _) = Identified.load(out), truth_of(folder)
-    assert [stream.label for stream in found.streams] == [
-        "streams/b_excite.csv",
-        "streams/b_sweeps.csv",
-    ]
-    assert content["dynamics"]["a"]["bodies"] != content["dynamics"]["b"]["bodies"]
-    weighed = json.loads(done("dynamics", "payload", loaded, "--against", out, *one, "--json"))
-    assert weighed["mass_kg"] == pytest.approx(2.0, abs=4.0 * weighed["mass_sigma_kg"])
-    # The arm of the other was built otherwise, which looks like a load.
-    other = ("--robot", "a", "--json")
-    mistaken = json.loads(done("dynamics", "payload", loaded, "--against", out, *other))
-    assert abs(mistaken["mass_kg"] - 2.0) > 4.0 * weighed["mass_sigma_kg"]
-
-
 def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_knocked(place):
     first, again = place / "whole-1", place / "whole-2"
     some = ("--cell", "two-arms", "--no-images", "--views", 5, "--arm-sigma-mm", 0.3)
@@ -238,24 +208,6 @@ def test_errors_that_are_asked_for_are_those_of_all_robots_and_cameras_of_a_cell
     assert {view.numbers.get("payload_kg") for view in session.views if "robot" in view.text} == {
         5.0
     }
-
-
-@pytest.mark.slow
-def test_joints_of_every_robot_of_a_cell_bend_as_was_asked_for(place):
-    folder, out = place / "bending", place / "bending-out"
-    loads = ("--payload-kg", 0, "--payload-kg", 5)
-    some = ("--cell", "two-arms", "--no-images", "--views", 40, "--stiffness-knm", 12)
-    done("simulate", folder, *some, *loads)
-    done("calibrate", folder, "-o", out)
-    found = Calibration.load(out)
-    for robot in ("a", "b"):
-        springs = found.of("left", robot, f"plate_{robot}").elastic.joints
-        determined = [spring for spring in springs if spring.determined]
-        assert len(determined) >= 3
-        for joint_spring in determined:
-            # Four sigma: one joint in fifteen thousand.
-            most = 4.0 * joint_spring.sigma_rad_per_nm
-            assert joint_spring.compliance_rad_per_nm == pytest.approx(1.0 / 12e3, abs=most)
 
 
 @pytest.mark.parametrize("read", ["points", "probe"])
@@ -355,24 +307,6 @@ def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
     session = Session.load(place / "rolling")
     assert all(view.has_corners or view.reading_m is not None for view in session.views)
     assert sum(view.stamp_s is not None for view in session.views) > 10
-
-
-def test_a_sweep_comes_after_what_was_pushed(place):
-    (place / "later.toml").write_text(OWN + PUSHED + SWEPT)
-    cell = simulate(read_cell(str(place / "later.toml")))
-    (place / "before.toml").write_text(OWN + SWEPT)
-    still = simulate(read_cell(str(place / "before.toml")))
-    pushed, unmoved = (
-        {sight.stamp_s: sight.cam_from_target for sight in its.sights if sight.stamp_s is not None}
-        for its in (cell, still)
-    )
-    away = [
-        1e3 * np.linalg.norm((invert(unmoved[value]) @ pushed[value])[:3, 3])
-        for value in pushed.keys() & unmoved.keys()
-    ]
-    # By default a push is of 5 mm; the robot repeats to some hundredths.
-    np.testing.assert_allclose(away, 5.0, atol=0.3)
-    assert len(away) > 10
 
 
 def test_the_page_s_cell_can_be_made(tmp_path):

@@ -422,16 +422,6 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
     np.testing.assert_array_equal(truth.camera.distortion, SMALL.distortion)
 
 
-@pytest.mark.parametrize("target", [BOARDS["charuco"], BOARDS["checkerboard"]])
-def test_shipped_boards_are_named_and_say_the_same(tmp_path, target):
-    options = CellOptions(views=1, camera=SMALL, target=target, state_intrinsics=False)
-    session = Session.load(write_session(simulate(options), tmp_path / "cell"))
-    assert session.document["target"] == target.name
-    assert session.target == target
-    assert session.camera is None
-    assert session.resolution == SMALL.resolution
-
-
 def test_pose_pairs_are_exact_without_noise(tmp_path):
     cell = simulate(exact(CellOptions(views=3, mount="eye-to-hand")))
     session = Session.load(write_session(cell, tmp_path / "pairs", images=False))

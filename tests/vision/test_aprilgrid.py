@@ -131,15 +131,6 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount):
     assert error @ np.linalg.solve(result.joint_covariance, error) < 32.9
 
 
-def test_a_session_of_another_page_is_refused(tmp_path):
-    cell = simulate(CellOptions(target=BOARDS["aprilgrid"], views=4))
-    write_session(cell, tmp_path / "s")
-    path = tmp_path / "s" / "target.toml"
-    path.write_text(path.read_text().replace("spacing = 0.3", "spacing = 0.2"))
-    with pytest.raises(DataError, match=r"another board is seen: the tags are 0\.30 of their side"):
-        run(Session.load(tmp_path / "s"))
-
-
 def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     side, pitch = 0.03, 0.04
     tags = [(5 + 4 * row + column, column, 3 - row) for row in range(4) for column in range(4)]

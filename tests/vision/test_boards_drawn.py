@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from support.boards import charuco, checkerboard
+from support.boards import charuco
 
 from visioncal.core.types import Target
 from visioncal.present.recording.board import picture
@@ -87,9 +87,3 @@ def test_a_marker_is_drawn_by_its_bits() -> None:
     )
     assert ids.ravel().tolist() == [3]
     assert marker_cells("DICT_7X7_50", 3).shape == (9, 9)
-
-
-def test_a_checkerboards_picture_is_dark_outside_its_first_corner() -> None:
-    drawn = picture(checkerboard(30, 4))
-    assert drawn.shape[1] * 5 == drawn.shape[0] * 31
-    assert (drawn[0, 0], drawn[0, drawn.shape[0] // 5]) == (0, 255)

@@ -111,13 +111,6 @@ def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
     assert np.sqrt(np.mean(error**2)) < 0.015
 
 
-@pytest.mark.slow
-def test_large_circles_are_refined_in_a_smaller_image():
-    image, truth = photograph(EVEN, replace(SHOT, square_px=90), 1)
-    error = numbered(find_target(image, EVEN), truth) - truth
-    assert np.sqrt(np.mean(error**2)) < 0.01
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

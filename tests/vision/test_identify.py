@@ -113,15 +113,6 @@ def test_a_board_that_the_image_cuts_is_at_least_so_large():
     assert sideways.corners_seen < sideways.corners
 
 
-def test_two_rows_of_markers_do_not_tell_an_odd_number_of_columns_from_an_even_one():
-    page = printed(SHIPPED["charuco_9x6_30mm"], 100)
-    # Ids count along rows: 0 to 3 and 4 to 7 lie alike on boards of 8 and of 9 columns.
-    identity = identify(page[: 55 + 2 * 118 + 20, : 55 + 8 * 118])
-    assert not identity.whole
-    assert identity.columns in (8, 9)
-    assert any("show more of the board" in note for note in identity.notes)
-
-
 def test_a_marker_beside_a_board_is_told_of():
     page = printed(SHIPPED["charuco_7x5_36mm"], 100)
     tag = printed(SHIPPED["apriltag_36h11_id0_120mm"], 50)
@@ -182,15 +173,6 @@ def test_a_blurred_checkerboard_is_not_doubted(sigma_px):
     identity = identify(cv2.GaussianBlur(page, (0, 0), sigma_px))
     assert_named(identity, SHIPPED["checkerboard_9x6_25mm"])
     assert not any("ChArUco" in note for note in identity.notes)
-
-
-@pytest.mark.slow
-def test_a_large_picture_is_searched_reduced_too():
-    page = cv2.GaussianBlur(printed(SHIPPED["charuco_9x6_30mm"], 320), (0, 0), 3.0)
-    noise = 120.0 * np.random.default_rng(1).normal(size=page.shape)
-    identity = identify(np.clip(40 + 0.7 * page + noise, 0, 255).astype(np.uint8))
-    assert_named(identity, SHIPPED["charuco_9x6_30mm"])
-    assert "reduced to" in identity.notes[0]
 
 
 @pytest.mark.parametrize("sigma_px", [0.0, 3.0, 12.0])

@@ -229,14 +229,6 @@ def test_make_leaves_a_description_of_the_same_board_alone(tmp_path):
     assert (tmp_path / "mine.pdf").stat().st_size > 1000
 
 
-def test_a_name_is_printed_as_it_stands(tmp_path):
-    # Between dollars matplotlib would read a formula, and this one is none.
-    options = ("--kind", "marker", "--id", 1, "--name", "größe $b^$ c", "--dpi", 72)
-    done = run("make", *options, "-o", tmp_path)
-    assert done.exit_code == 0, done.exception
-    assert (tmp_path / "größe $b^$ c.pdf").is_file()
-
-
 CHARUCO = ("--kind", "charuco", "--columns", 9, "--rows", 6)
 
 
@@ -269,9 +261,3 @@ def test_make_refuses_and_writes_nothing(arguments, message, tmp_path):
     assert isinstance(done.exception, DataError)
     assert message in str(done.exception)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_no_file_system_takes_is_named(tmp_path):
-    done = run("make", "charuco_9x6_30mm", "-o", tmp_path / (300 * "x"))
-    assert isinstance(done.exception, DataError)
-    assert "File name too long" in str(done.exception)

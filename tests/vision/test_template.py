@@ -190,17 +190,6 @@ def searched(monkeypatch):
     return sizes
 
 
-def test_large_images_are_searched_in_a_small_copy(large, monkeypatch):
-    image, truth = large
-    sizes = searched(monkeypatch)
-    seen = find_target(image, CHARUCO)
-    assert sizes == [(500, 1150)]
-    assert len(seen.ids) == len(truth)
-    assert rms(seen.px - truth) < 0.01
-    find_target(image[:, 301:], CHARUCO)
-    assert sizes == [(500, 1150), (1000, 1999)]
-
-
 def test_what_the_small_copy_misses_is_searched_in_the_image_itself(large, monkeypatch):
     image, truth = large
     sizes = searched(monkeypatch)
