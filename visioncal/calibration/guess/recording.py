@@ -23,8 +23,8 @@ SCORE_FLOOR = 1e-4
 # and 1 degree of noise leave less, wrong readings ten times more.
 CLOSING_SCORE = 0.05
 # Ratio of the declared reading's score to that of a reading that replaces it. Where views turn
-# about two axes a sound reading is beaten by none, and a wrong one by ten times and more: see
-# tests/benchmarks/guess.py.
+# about two axes a sound reading is beaten by none, and a wrong one by ten times and more: the
+# worlds `guess` of tests/benchmarks/compare.py.
 STANDS_OUT = 3.0
 # Plausible distances between camera and board [m].
 _BOARD_DISTANCE_M = (0.02, 30.0)
