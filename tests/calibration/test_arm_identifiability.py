@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.arms import ERROR_RAD, NOISE, TOOL, arm_data, erring, problem_of
+from support.arms import ERROR_RAD, NOISE, arm_data, erring, problem_of
 from support.cells import arm_found, calibrated
 from support.edges import solved
 from support.wrong_arms import WRONG_LINKS
@@ -27,7 +27,7 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
-from visioncal.robot import Robot, convert_table, load_robot, robot_names, table_of
+from visioncal.robot import Robot, convert_table, load_robot, table_of
 from visioncal.robot.jacobians import number_jacobian, table_jacobian
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
@@ -51,6 +51,10 @@ for row in CRANE["joint"]:
         row |= {"lower_m": -0.4, "upper_m": 0.4}
 
 
+# Parallel axes, none of them, seven joints, and rails.
+ARMS = ("ur5e", "irb120", "panda", "crane")
+
+
 def robot_of(name):
     return Robot.from_document(CRANE) if name == "crane" else load_robot(name)
 
@@ -70,7 +74,7 @@ def rows_of(table):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("name", [*robot_names(), "crane"])
+@pytest.mark.parametrize("name", ARMS)
 def test_a_table_moves_as_its_derivatives_say(name, convention):
     robot, rng = robot_of(name), np.random.default_rng(0)
     like = convert_table(table_from_document(robot.document), convention)
@@ -120,7 +124,7 @@ def test_the_flange_moves_with_a_table_as_its_derivatives_say(name, convention):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("name", [*robot_names(), "crane"])
+@pytest.mark.parametrize("name", ARMS)
 def test_ranks_are_those_of_theory(name, mount):
     """Everett and Hsu (1988): 4 a revolute joint, 2 a prismatic one, and 6 for the frames."""
     robot = robot_of(name)
@@ -236,16 +240,6 @@ def test_the_indices_are_as_published():
     assert found.o5 == pytest.approx(1.0 / (1 / 8 + 1 / 4 + 1 / 2))
 
 
-def test_better_stops_have_better_indices():
-    robot = load_robot("ur5e")
-    q = postures(robot)[:60]
-    # Near one posture all slopes look alike.
-    near = q.mean(axis=0) + 0.3 * (q - q.mean(axis=0))
-    wide, narrow = (identify_arm(arm_data(robot, array)).indices for array in (q, near))
-    for name in ("o1", "o2", "o3", "o4", "o5"):
-        assert getattr(wide, name) > 1.5 * getattr(narrow, name)
-
-
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
     robot = load_robot("ur5e")
@@ -352,15 +346,6 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     counts = found["observability"]
     assert (counts["columns"], counts["identifiable"], counts["determined"]) == (48, 30, 30)
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
-
-
-def test_a_tool_on_the_flange_is_no_change_of_the_arm():
-    model = erring(load_robot("ur5e"))
-    assert np.abs(TOOL - np.eye(4)).max() > 0.05
-    numbers = identify_arm(arm_data(model.nominal, postures(model.nominal)[:40]))
-    assert (
-        max(abs(estimate.identified - estimate.nominal) for estimate in numbers.estimates) < 1e-12
-    )
 
 
 def test_an_unknown_convention_is_refused(rendered):

@@ -253,15 +253,6 @@ def turned(tilt_deg, stops=14, noise=1.0):
     return Session.assemble(document, list(rows[0]), cells, MemoryImages({}))
 
 
-def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
-    with pytest.raises(
-        DegenerateError, match="all 14 stops of robot b turn about base_b's z"
-    ) as caught:
-        calibrate(turned(0.0))
-    assert caught.value.culprits == ("base_b's offset along base_b's z",)
-    assert "add 3 or more stops in which flange_b is tilted" in caught.value.next_step
-
-
 def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
     with pytest.raises(
         DegenerateError, match="offset along the cell's z has a predicted"
@@ -277,33 +268,6 @@ def test_noise_refuses_nothing():
     assert verdict.status == "bad"
     assert any("Weakly determined by the motion" in reason for reason in verdict.reasons)
     assert sum("Left out of the fit, views disagree" in reason for reason in verdict.reasons) == 1
-
-
-def test_a_robot_in_millimetres_is_named_with_its_reading(session):
-    def in_millimetres(_, row):
-        if row["robot"] == "a" and row["x_m"]:
-            row.update({name: repr(1e3 * float(row[name])) for name in ("x_m", "y_m", "z_m")})
-
-    misread = rewritten(session, in_millimetres)
-    with pytest.raises(DegenerateError) as caught:
-        calibrate(misread)
-    assert caught.value.message.startswith("Robot a: With the robot's positions in mm, the chain")
-    assert "base_from_flange in metres" in caught.value.next_step
-    (found,) = [finding for finding in doctor(misread).findings if finding.kind == "misread_poses"]
-    assert found.words.startswith("Robot a: With the robot's positions in mm")
-
-
-def test_a_mirrored_camera_beside_the_robots_is_named(session):
-    mine = [view.number for view in session.views if view.text.get("camera") == "right"]
-    table = session.corner_table
-    width = session.declaration.cameras["right"].resolution[0]
-    px, mirrored = table.px.copy(), np.isin(table.views, mine)
-    px[mirrored, 0] = width - 1 - px[mirrored, 0]
-    turned = replace(session, corner_table=replace(table, px=px))
-    (found,) = [finding for finding in doctor(turned).findings if finding.kind == "misread_poses"]
-    assert found.words.startswith("Camera cam_right: With the images mirrored")
-    # There are no images to look at.
-    assert str(found.do).startswith("In corners.csv, u_px counts to the right")
 
 
 @pytest.mark.parametrize(

@@ -157,18 +157,6 @@ def test_another_sweep_verifies_the_camera(session):
     assert verify(knocked, known).named[0].name == "camera"
 
 
-def test_stamps_that_jitter_are_told_worse(moved):
-    noise_s = 3e-3 * np.random.default_rng(6).standard_normal(len(moved.sights))
-    sights = [
-        replace(sight, stamp_s=sight.stamp_s + late_s)
-        for sight, late_s in zip(moved.sights, noise_s, strict=True)
-    ]
-    timed = cell_session(replace(moved, sights=tuple(sights)), "jittered", seen="poses")
-    sigma_s = clocked_of(timed).clock.sigma_s
-    # 3 ms of noise at some 200 frames make 0.2 ms, give or take how evenly they tell it.
-    assert 1e-4 < sigma_s < 6e-4
-
-
 def test_images_are_placed_in_time_by_their_corners(moved):
     result = result_of(calibrated_sweep(moved))
     assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
@@ -334,14 +322,6 @@ def test_motion_that_repeats_itself_is_told_by_what_is_stated():
     clock = clocked_of(again).clock
     # A period off, which is for whoever stated it to know.
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
-
-
-def test_views_in_milliseconds_are_named(session):
-    rows = [{**view.numbers, "stamp_s": 1e3 * view.stamp_s} for view in session.views]
-    views = [replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True)]
-    with pytest.raises(DataError, match="times look like milliseconds") as caught:
-        calibrate(replace(session, views=tuple(views)))
-    assert "Divide the column stamp_s" in caught.value.next_step
 
 
 @pytest.mark.parametrize(("per_s", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])

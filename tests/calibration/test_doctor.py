@@ -27,18 +27,13 @@ from visioncal.vision.camera import project
 from visioncal.vision.finders.board import FINDERS
 from visioncal.vision.targets import load_target
 
-# Of each kind of finding one: what its first sentence is about, and the kind.
+# Where the finding comes from: poses, files, boards, images, motion. All others are kept answers.
 NAMED = {
     "quaternion with w first": "misread_poses",
     "one pose typed wrong": "wrong_views",
-    "two images missing": "missing_images",
-    "images named .jpg": "missing_images",
     "images in another folder": "missing_images",
-    "an image twice": "shared_image",
     "another dictionary": "other_board",
     "mirrored images": "mirrored_images",
-    "blurred images": "blurred_images",
-    "the lens of larger images": "other_lens",
     "no turns": "motion",
 }
 # Files that cannot be read as they stand are refused, with what to type.

@@ -236,40 +236,28 @@ def test_poses_that_are_written_otherwise_from_some_view_on_are_named(
     assert f"{said}{words}" in said_first(folder)
 
 
-@pytest.mark.parametrize("since", [7, 10, 14])
-def test_a_pose_that_is_missing_midway_is_named(tmp_path, since):
-    def lost(poses):
+@pytest.mark.parametrize(
+    ("late", "since"), [(False, 7), slow(False, 10), (False, 14), slow(True, 9), (True, 14)]
+)
+def test_a_pose_that_is_missing_or_repeated_midway_is_named(tmp_path, late, since):
+    def reported(poses):
+        if late:
+            return [*poses[:since], *poses[since - 1 : -1]]
         return [*poses[:since], *poses[since + 1 :], poses[0]]
 
-    folder = write(tmp_path / "lost", looks(20), STATED_LENS, reported=lost)
+    lens = "" if late else STATED_LENS
+    folder = write(tmp_path / "lost", looks(20), lens, reported=reported)
     first = visioncal.doctor(folder).findings[0]
     assert first.words.startswith(f"From view {since} on, the robot's poses are not those of")
-    assert "the robot's pose of a view one row before it" in first.words
+    side, way, step = ("after", "up", 1) if late else ("before", "down", -1)
+    assert f"the robot's pose of a view one row {side} it" in first.words
     assert first.words in said_first(folder)
-    assert f"In rows {since} to 19 of views.csv, move the poses down by one row" in first.do.words
+    assert f"In rows {since} to 19 of views.csv, move the poses {way} by one row" in first.do.words
     # As it says, with the row that is left without a pose deleted:
     header, *rows = (folder / "views.csv").read_text().splitlines()
     cells = [row.split(",", 1) for row in rows]
-    moved = [*cells[:since], *([cells[at][0], cells[at - 1][1]] for at in range(since + 1, 20))]
-    (folder / "views.csv").write_text("\n".join([header, *map(",".join, moved)]) + "\n")
-    assert visioncal.calibrate(folder).verdict.status == "good"
-
-
-@pytest.mark.parametrize("since", [slow(9), 14])
-def test_poses_that_are_a_row_late_from_some_view_on_are_named(tmp_path, since):
-    def repeated(poses):
-        return [*poses[:since], *poses[since - 1 : -1]]
-
-    folder = write(tmp_path / "late", looks(20), reported=repeated)
-    first = visioncal.doctor(folder).findings[0]
-    assert first.words.startswith(f"From view {since} on, the robot's poses are not those of")
-    assert "the robot's pose of a view one row after it" in first.words
-    assert first.words in said_first(folder)
-    assert f"In rows {since} to 19 of views.csv, move the poses up by one row" in first.do.words
-    # As it says:
-    header, *rows = (folder / "views.csv").read_text().splitlines()
-    cells = [row.split(",", 1) for row in rows]
-    moved = [*cells[:since], *([cells[at][0], cells[at + 1][1]] for at in range(since, 19))]
+    to = range(since, 19) if late else range(since + 1, 20)
+    moved = [*cells[:since], *([cells[at][0], cells[at + step][1]] for at in to)]
     (folder / "views.csv").write_text("\n".join([header, *map(",".join, moved)]) + "\n")
     assert visioncal.calibrate(folder).verdict.status == "good"
 

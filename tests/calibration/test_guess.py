@@ -10,22 +10,20 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-from support.cells import showing
 from support.commands import visioncal as visioncal_command
-from support.mistakes import MISTAKES, OTHER, guessed, is_named, measured, numbers, seen_in, sound
+from support.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
 
 import visioncal
 from visioncal.calibration.guess import guess_reading
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_poses_of,
     chain_poses,
-    guess_from_camera_poses,
     guess_session,
 )
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation
-from visioncal.core.types import MOUNTS, Corners, Target
+from visioncal.core.types import MOUNTS
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
@@ -114,16 +112,6 @@ def test_a_target_of_another_size_is_named_by_its_size(size, is_measured):
     assert guess.best.hypothesis.camera.scale == pytest.approx(size, rel=0.02)
     found = guess.best.hypothesis.camera_numbers(stated).poses()
     np.testing.assert_allclose(found, poses.camera.poses(), atol=0.02)
-
-
-def test_a_wrong_mount_and_a_wrong_size_are_both_named():
-    poses = cell_poses("eye-to-hand")
-    stated = replace(poses.camera, positions=3.0 * poses.camera.positions)
-    guess = guess_reading(poses.robot, stated, "eye-in-hand")
-    assert any(
-        difference.startswith("the target 0.33 times") for difference in guess.best.differences
-    )
-    assert "mounted eye-to-hand" in guess.sentence
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -248,18 +236,14 @@ def test_the_cameras_own_poses_may_be_inverse():
     assert any("mounted" in name for name in (guess.best.words, *guess.notes))
 
 
-def test_a_shift_of_four_rows_is_found():
-    poses = cell_poses("eye-in-hand")
-    few = sound(poses.true_robot[:4], poses.camera.poses()[:4], poses.mount)
-    planted = MISTAKES["rows shifted by one"](few, np.random.default_rng(0))
-    guess = guessed(planted)
-    assert is_named(guess, planted), guess.sentence
-
-
-def test_two_rows_of_six_are_found():
-    poses = cell_poses("eye-to-hand")
-    few = sound(poses.true_robot[:6], poses.camera.poses()[:6], poses.mount)
-    planted = MISTAKES["two rows exchanged"](few, np.random.default_rng(1))
+@pytest.mark.parametrize(
+    ("mistake", "rows", "mount"),
+    [("rows shifted by one", 4, "eye-in-hand"), ("two rows exchanged", 6, "eye-to-hand")],
+)
+def test_rows_that_are_mixed_up_are_found_among_few(mistake, rows, mount):
+    poses = cell_poses(mount)
+    few = sound(poses.true_robot[:rows], poses.camera.poses()[:rows], mount)
+    planted = MISTAKES[mistake](few, np.random.default_rng(MOUNTS.index(mount)))
     guess = guessed(planted)
     assert is_named(guess, planted), guess.sentence
 
@@ -327,13 +311,16 @@ def pairs_session(poses):
     return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
-@pytest.mark.parametrize("name", ["board's size in mm", "two rows exchanged"])
+@pytest.mark.parametrize(
+    "name", ["board's size in mm", "two rows exchanged", "inverse poses", "the other mount"]
+)
 def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
     planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))
     monkeypatch.chdir(tmp_path)
     pairs_session(planted).save(Path("my cell"))
     done = visioncal_command("calibrate", "my cell", "-o", "out")
-    assert done.status == 0, done.err
+    # Two exchanged rows are left out, and the rest is sound.
+    assert done.status == (0 if name == "two rows exchanged" else 3), done.err
     first = done.said.split("What to do next:")[1].splitlines()[2].strip()
     assert first == (
         "visioncal convert 'my cell' 'my cell-fixed' --guess --yes"
@@ -376,11 +363,6 @@ def test_positions_that_were_never_recorded_are_named(mount):
     assert "how the poses were recorded" in verdict.reasons[0]
 
 
-def test_a_sound_calibration_is_not_troubled_by_it():
-    verdict = visioncal.calibrate(pairs_session(cell_poses("eye-to-hand"))).verdict
-    assert not any("--guess" in reason for reason in verdict.reasons)
-
-
 def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
     session = Session.load(rendered)
     chain = chain_poses(session)
@@ -393,25 +375,6 @@ def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
     # The simulated robot reports the model's poses: what is given back is the chain.
     np.testing.assert_allclose(guess.best.hypothesis.robot_numbers(told).poses(), chain, atol=1e-6)
     assert not guess_session(session).stands_out
-
-
-def test_a_board_that_looks_the_same_turned_does_not_hide_sound_poses():
-    target = Target("even", "checkerboard", 8, 6, 0.025, 2.5e-5)
-    cell = simulate(CellOptions(views=12, seed=5, target=target))
-    seen = [
-        Corners(
-            view_corners.view,
-            view_corners.ids,
-            view_corners.px[::-1] if view_corners.view % 2 else view_corners.px,
-            view_corners.blur_px,
-        )
-        for view_corners in cell.corners
-    ]
-    known = measured(showing(cell, seen))
-    assert len(known.poses[0].cam_from_target) > 1
-    guess = guess_from_camera_poses(known, numbers(cell.robot.base_from_flange))
-    assert guess.best is guess.declared
-    assert guess.declared.closes
 
 
 def whole(poses):

@@ -244,11 +244,14 @@ def test_the_axis_has_its_name():
         solved(made_up(robot, x, z, mount="eye-to-hand"))
 
 
+@pytest.mark.parametrize("noise_rad", [0.0, 2e-4])
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_translation_alone_is_refused(mount):
+def test_translation_alone_is_refused(mount, noise_rad):
     for seed in range(6):
         x, z = some_edges(seed)
         robot = compose(np.tile(np.eye(3), (10, 1, 1)), some_motion(10, seed)[:, :3, 3])
+        turns = noise_rad * np.random.default_rng(seed).normal(size=(10, 3))
+        robot = robot @ exp(np.hstack([turns, np.zeros((10, 3))]))
         data = made_up(robot, x, z, seed=seed, mount=mount)
         with pytest.raises(DegenerateError, match="differ in position only") as caught:
             solved(data)

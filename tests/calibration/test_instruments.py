@@ -195,33 +195,6 @@ def test_wrong_rows_are_named_and_left_out():
     assert known.robot_arm.kinematics.level == "geometry"
 
 
-@pytest.mark.slow
-def test_exchanged_points_are_named():
-    shop = tracked(replace(POINTS, **WRONG))
-    rows = list(shop.rows)
-    rows[12], rows[14] = (4, 0, rows[14][2]), (4, 2, rows[12][2])
-    known = known_of(session_of(replace(shop, rows=tuple(rows))))
-    assert sorted(known.reasons) == [12, 14]
-    assert "the points a and c are exchanged at this stop" in known.reasons[12]
-    assert known.robot_arm.kinematics.level == "geometry"
-
-
-@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
-def test_an_instrument_that_sinks_is_told(options):
-    shop = tracked(options)
-    rows = []
-    for stop, point, read in shop.rows:
-        sunk = read.copy()
-        sunk[2, 3] -= 5e-4 * stop / 29
-        rows.append((stop, point, sunk))
-    known = known_of(session_of(replace(shop, rows=tuple(rows))), level="hand-eye")
-    told = [warning.words for warning in known.warnings if warning.kind == "moved_slowly"]
-    assert len(told) == 1
-    moved = float(told[0].split("moved by ")[1].split(" mm")[0])
-    # Told to some 15 %: the arm repeats to 0.03 mm.
-    assert moved == pytest.approx(0.5, rel=0.5)
-
-
 def test_measured_poses_of_a_target_come_before_readings():
     session = session_of(tracked(PROBE))
     views = tuple(

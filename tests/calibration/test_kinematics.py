@@ -11,15 +11,13 @@ from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.stages.kinematics import choose_level, findings
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
-from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.workspace import postures
-from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation import simulate
 
 
 @pytest.mark.slow
@@ -49,58 +47,6 @@ def test_offsets_alone_are_told_from_wrong_links():
     found = known.robot_arm.model.robot.chain.functions[1:5, 0]
     true = (cell.robot.true_arm.offset - cell.robot.arm.offset)[1:5]
     assert found == pytest.approx(true, abs=3e-4)
-
-
-def test_a_level_whose_fit_diverges_is_none_and_is_said():
-    """The largest errors that a number holds: their squares are none."""
-    known = calibrated(simulate(replace(WRONG_LINKS, views=14, seed=0)))
-    arm, fit = known.robot_arm, known.cell_fit.inlier_fit.fit
-    assert arm.joints_rad is not None
-    nominal = ArmModel.of(known.robot, arm.joints_rad, arm.reported)
-    bases = {
-        name: nominal.columns(name, arm.joints_rad, arm.loads)
-        for name in ("offsets", "links", "eccentricity")
-    }
-    problem = arm.without_errors(known.cell_fit.inlier_problem)
-    state = State(fit.state.edges, problem.start_values)
-    sound = choose_level(problem, state, ROBOT, bases, "auto")
-    assert (sound.level, sound.diverged) == ("geometry", ())
-    bases["offsets"] = 1e200 * bases["offsets"]
-    found = choose_level(problem, state, ROBOT, bases, "auto")
-    assert (found.level, found.diverged) == ("geometry", ("offsets",))
-    assert found.fits["geometry"].gain == sound.fits["geometry"].gain
-    assert any("offsets was not compared" in words for words in findings(found))
-
-
-def test_an_arm_that_errs_before_a_lens_that_is_not_as_stated():
-    """Errors that are found only once the lens is another one are in the fit they came from."""
-    options = CellOptions(
-        robot="generic-6r-1800", mount="eye-to-hand", views=12, branches=True, seed=101,
-        tilt_rad=(0.05, 0.68379), roll_rad=0.23155, pixel_sigma_px=0.024288,
-        robot_sigma_m=1.1221e-4, robot_sigma_rad=2.1074e-5, dh_sigma_m=7.47e-4,
-        dh_sigma_rad=4.3257e-5, lens_mismatch_px=4.8876,
-    )  # fmt: skip
-    cell = simulate(options)
-    known = calibrated(cell)
-    assert known.robot_arm.errors.is_estimated
-    squares = error_of(cell, known)[:6] ** 2 / np.diag(known.assessment.covariance)[:6]
-    # Of six values, each within four sigmas in all but one of two thousand cases.
-    assert squares.max() < 16.0
-
-
-def test_an_arm_that_is_no_longer_worth_calibrating_is_as_stated_again():
-    """Views that agree later have a say in the level: what an earlier one estimated goes."""
-    known = calibrated(simulate(replace(GOOD, offset_sigma_rad=1e-3, views=20, seed=1)))
-    agreed, arm = known.cell_fit_or_none.inlier_fit, known.robot_arm
-    assert arm.model is not None
-    few = np.flatnonzero(agreed.used)[:4]
-    stated = arm.without_errors(agreed.problem.subset(np.isin(np.arange(len(agreed.used)), few)))
-    start = State(agreed.fit.state.edges, stated.start_values)
-    again = arm.with_level(stated, start, "auto", few.tolist())
-    assert (again.kinematics.level, again.model) == ("nominal", None)
-    assert again.errors is None or not again.errors.is_estimated
-    np.testing.assert_array_equal(again.poses, arm.reported)
-    assert again.relinearised(again.applied_to(stated), start) == (again, 0.0)
 
 
 @pytest.mark.slow

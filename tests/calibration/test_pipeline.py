@@ -9,7 +9,6 @@ from support.marks import slow
 
 from visioncal.calibration.pipeline.running import view_evidence
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.cause_ranking import REFINE_LENS
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Camera, Target
 from visioncal.estimation.closed_form import SOLVERS
@@ -130,18 +129,6 @@ def test_a_matrix_without_a_prior_is_held_on_views_of_one_marker(table, is_refus
     refused = [finding for finding in known.verdict.findings if "was not done" in finding.words]
     assert len(refused) == is_refused
     assert all("matrix_sigma_px" in finding.do.words for finding in refused)
-
-
-def test_an_uncertain_result_of_a_held_lens_names_the_lens_and_not_the_board():
-    cell = simulate(replace(MARKER, pixel_sigma_px=0.2))
-    off_px = (9.0, -9.0, 9.0, 9.0)
-    session = with_camera(cell, off_px, matrix_sigma_px=9.0, intrinsics="hold")
-    known = calibrated(cell, session=session)
-    budget = known.accuracy_at_work.budget_mm
-    assert np.hypot(budget["intrinsics"], budget["held_values"]) > 0.8 * budget["total"]
-    (weak,) = (finding for finding in known.verdict.findings if finding.kind == "weak_motion")
-    assert "most of that is the lens's" in weak.words
-    assert weak.do is REFINE_LENS
 
 
 @pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])

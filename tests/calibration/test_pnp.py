@@ -7,7 +7,6 @@ import pytest
 
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.pnp import estimate_poses
-from visioncal.calibration.stages.pose_ambiguity import with_candidate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain
@@ -132,21 +131,6 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
         # Renumbered with their pose, the corners project onto themselves.
         away = project(cell.options.camera, points) - view.corners.px
         assert np.abs(away).max() < 1.0
-
-
-def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
-    target = replace(BOARDS["checkerboard"], name="symmetric", columns=9, rows=7)
-    cell = simulate(CellOptions(views=8, seed=9, target=target, pixel_sigma_px=0.1))
-    before = replace(target, columns=5, rows=4)
-    shifted = {
-        at: replace(corners_, ids=corners_.ids + 20) for at, corners_ in corners_of(cell).items()
-    }
-    alone = poses_of(cell).views
-    behind = estimate_poses(shifted, [before, target], cell.options.camera).views
-    for one, other in zip(alone, behind, strict=True):
-        pick = one.turns.index(1)
-        ids = with_candidate(one, pick, target).corners.ids
-        np.testing.assert_array_equal(with_candidate(other, pick, target).corners.ids, ids + 20)
 
 
 def test_a_turn_of_all_views_alike_is_only_a_change_of_the_targets_frame():

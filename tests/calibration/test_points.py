@@ -25,7 +25,6 @@ from support.rigs import (
 )
 
 from visioncal import calibrate
-from visioncal.calibration.pipeline import run
 from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
@@ -35,8 +34,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Target
 from visioncal.interchange.formats import load_for_rereading
-from visioncal.present.recording import board, write_recording
-from visioncal.present.report import write_report
+from visioncal.present.recording import write_recording
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session, corners
 from visioncal.simulation import CellOptions, simulate
@@ -490,19 +488,6 @@ def test_a_cell_of_two_cameras_is_aligned(tmp_path):
     assert found.cell.noise["cam_right"]["pixel_px"] == 0.4
 
 
-def test_report_and_recording_draw_what_no_image_shows(cube, tmp_path):
-    session = Session.load(cube)
-    done = run(session)
-    write_report(tmp_path / "report.html", done.calibration, session, done.evidence)
-    page = (tmp_path / "report.html").read_text()
-    assert page.count("Best used view") == 1
-    drawn = board.sheet(session.boards[""])
-    assert len(drawn.positions) == len(PLACES["cube"])
-    box = board.closed_outline(session.boards[""])
-    assert len(np.unique(box, axis=0)) == 8
-    assert np.ptp(box, axis=0) == pytest.approx([0.16] * 3)
-
-
 def test_commands_take_a_rig_or_say_why_not(cube, tmp_path):
     out = tmp_path / "out"
     assert visioncal("calibrate", cube, "-o", out).status == 0
@@ -648,26 +633,6 @@ def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn
     assert read.warnings[0].endswith(
         f"{wrong['square_m']:g} is read as {wrong['square_m']:g} {unit}."
     )
-
-
-def test_a_lens_that_cannot_be_the_cameras_is_not_used_and_comes_first(drawn):
-    """As where fx, cx, fy, cy are copied, in the order of a matrix by rows."""
-    sound = calibrate(drawn)
-    camera = Session.load(drawn).declaration.camera
-    numbers = [camera.matrix[name] for name in (0, 2, 1, 3)]
-    state(drawn, "matrix", numbers)
-    found = calibrate(drawn)
-    assert found.verdict.causes[0].kind == "other_lens"
-    assert found.verdict.status == "check"
-    assert "delete matrix and distortion" in found.verdict.next_steps[0].words
-    # The lens comes from the images: a third of a thousand of the focal length is noise.
-    assert found.camera.camera.matrix[:2] == pytest.approx(sound.camera.camera.matrix[:2], rel=3e-3)
-
-
-def test_corners_of_larger_images_than_stated_name_the_resolution(drawn):
-    state(drawn, "resolution", [320, 240])
-    with pytest.raises(DataError, match=r"resolution = \[320, 240\] is smaller than the images"):
-        calibrate(drawn)
 
 
 def test_tables_of_spreadsheets_with_decimal_commas_are_read(drawn):

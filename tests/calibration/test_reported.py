@@ -75,16 +75,6 @@ def test_one_row_whose_pose_and_joints_disagree_is_named():
     )
 
 
-def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
-    stated = session(CELL.robot.base_from_flange, CELL.robot.joints)
-    (sentence,) = (
-        warning.reason for warning in reported_poses(stated, load_robot("ur5e")).warnings
-    )
-    assert sentence.startswith("The joint angles were not used: they are misread.")
-    assert "With the arm a ur10e and not a ur5e" in sentence
-    assert 'In session.toml, write [robot] model = "ur10e".' in sentence
-
-
 def test_rows_in_millimetres_beside_others_in_metres_are_named():
     poses = CELL.robot.base_from_flange.copy()
     poses[[2, 5], :3, 3] *= 1e3

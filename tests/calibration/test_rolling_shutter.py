@@ -10,7 +10,6 @@ from support.swept_cells import HOW, cell_of, swept_session
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages import clock_sweep
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.corners import CornerStack
@@ -119,16 +118,6 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     assert distance(error, covariance) < 27.9
     assert known.pixel_px == pytest.approx(0.1, rel=0.05)
     assert known.verdict.status == "good"
-
-
-@pytest.mark.slow
-def test_a_readout_that_is_ignored_moves_the_camera(monkeypatch):
-    moved = swept(1)
-    covariance = calibrated_sweep(moved).assessment.covariance[:6, :6]
-    monkeypatch.setattr(clock_sweep, "find_delays", lambda *_: (None, ()))
-    away = x_error(moved, calibrated_sweep(moved))[3:]
-    # Five sigma of what is possible.
-    assert np.linalg.norm(away) > 5.0 * np.sqrt(np.trace(covariance[3:, 3:]))
 
 
 @pytest.mark.parametrize("seed", [3, slow(4)])

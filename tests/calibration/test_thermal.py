@@ -13,7 +13,6 @@ from support.warmed import CELL, drift_of, warmed
 
 from visioncal import Session
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.thermal import inputs_of
 from visioncal.calibration.verification import verify
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
@@ -327,18 +326,6 @@ def test_kelvin_is_no_celsius(learnt, tmp_path):
     path.write_text("\n".join([head, *kelvin]) + "\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"heat\.csv, column temp1_c: .*looks like kelvin"):
         Session.load(tmp_path / "warm")
-
-
-def test_samples_that_are_many_are_averaged():
-    stamps = np.arange(0.0, 2000.0, 0.1)
-    values = np.column_stack([stamps, np.tile([2.0], (len(stamps), 6))])
-    names = ("stamp_s", *(f"current{index}_a" for index in range(1, 7)))
-    session = still().with_streams({"fast": Stream(names, values)})
-    session = replace(session, streams={"fast": session.streams["fast"]})
-    found, _ = inputs_of(session, 6)
-    assert found.kind == "currents"
-    assert len(found.stamps_s) <= 8192
-    assert found.signal == pytest.approx(4.0)
 
 
 def test_report_and_recording_show_the_drift(learnt, tmp_path):

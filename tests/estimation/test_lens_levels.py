@@ -8,12 +8,10 @@ from support.cells import calibrated, known_of
 
 from visioncal.calibration.stages import refine
 from visioncal.core.errors import ConvergenceError
-from visioncal.core.transforms import exp
 from visioncal.estimation import lens_levels
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
 from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
-from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import LikelihoodValue, most_likely
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -84,27 +82,6 @@ def test_how_poses_follow_a_board_is_the_same_with_any_focus(corners):
     )
     # Poses that fit best by other weights are a little elsewhere, by less than 1 mm.
     np.testing.assert_allclose(zoomed, plain, atol=1e-3)
-
-
-def test_what_corners_say_of_lenses_does_not_hang_on_the_last_step_of_poses(corners):
-    """Their information is that of where they end, and not of a step before."""
-    problem, looks = corners
-    wide = LensLevels(field=20.0, length=0.07)
-    appearance = Appearance(looks.camera("cam"), looks.values[looks.boards])
-    rest = fit_poses(problem.stack, appearance.camera, looks.poses).cam_from_target
-    # Steps this short are taken, and no other follows.
-    started = (rest, rest @ exp(np.full((len(rest), 6), 9e-7)))
-    settled, moved = (
-        compress(problem.stack, problem.basis, appearance, poses, levels=wide).shared_information
-        for poses in started
-    )
-    kept = np.diag(settled) > 0.0
-    scale = 1.0 / np.sqrt(np.diag(settled)[kept])
-    places = np.ix_(kept, kept)
-    # Derivatives differ by no more than what separates the poses, and rounding.
-    apart = (moved - settled)[places] * np.outer(scale, scale)
-    assert np.abs(apart).max() < 1e-5
-    assert np.linalg.eigvalsh(moved[places] * np.outer(scale, scale))[0] > 0.0
 
 
 def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():

@@ -5,26 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import calibrated, error_of, reporting, showing
-from support.edges import inliers_of
 from support.marks import slow
 from support.problems import observed, world
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages import refine
-from visioncal.calibration.stages.residual_findings import residual_tests
 from visioncal.calibration.stages.turned_images import find_image_turn
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
-from visioncal.estimation.chain import chain
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.problem_parts import ROBOT, State
+from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import (
     covariance_of,
-    fit_problem,
 )
 from visioncal.estimation.variance import profile_interval
 from visioncal.session.columns import POSE
@@ -86,31 +82,6 @@ def test_a_bump_is_told_from_a_creep(mount):
         assert not any("drift with time" in warning.reason for warning in known.warnings)
 
 
-def test_what_a_block_of_stops_alone_determines_is_not_left_out():
-    cell = simulate(replace(FINE, views=24, seed=1))
-    measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
-    # The last block's stops are the only ones that see a second target.
-    targets = ("target_a",) * 22 + ("target_b",) * 2
-    edges = inliers_of(chain("eye-in-hand", cell.robot.base_from_flange, measured)).fit.state.edges
-    problem = chain("eye-in-hand", cell.robot.base_from_flange, measured, targets=targets)
-    fit = fit_problem(problem, State(edges[[0, 1, 1]], np.zeros(0)), None)
-    found = neighbours(problem, fit.state, fit.noise, ROBOT)
-    assert not found.is_significant
-    assert 0.2 < found.factor < 3.0  # of nine blocks, 54 directions
-
-
-def test_a_bump_among_measured_poses_is_found():
-    """Their noise is counted as one with the robot's: observations have none of their own."""
-    cell = simulate(replace(FINE, views=24, seed=1))
-    lifted = np.where(np.arange(24) < 12, 0.0, 2e-3)[:, None] * np.eye(6)[5]
-    measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
-    problem = chain("eye-in-hand", exp(lifted) @ cell.robot.base_from_flange, measured)
-    assert problem.is_combined
-    found = residual_tests(problem, inliers_of(problem).fit, {})[ROBOT]
-    assert found.drift is None
-    assert found.step.stop == 12
-
-
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_bump_is_in_the_covariance(mount):
     """The answer is between both places, and as far from each as it says."""
@@ -166,17 +137,6 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
     assert found.moved_m == pytest.approx(moved, abs=8e-5)
     # Its turn is known to some 0.1 mrad.
     assert found.moved_rad == pytest.approx(2e-3, abs=3e-4)
-
-
-@pytest.mark.parametrize(
-    "changes", [{"tilt_rad": (0.0, 0.3)}, {"state_intrinsics": False}], ids=str
-)
-def test_a_closed_form_is_not_taken_for_a_misfit(changes):
-    for seed in range(4):
-        known = calibrated(simulate(replace(FINE, seed=seed, **changes)), solver="park")
-        (found,) = known.assessment.residual_tests.values()
-        assert not found.neighbours.is_significant
-        assert found.drift is None
 
 
 @pytest.mark.slow

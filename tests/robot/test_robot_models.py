@@ -15,7 +15,6 @@ from visioncal.robot import (
     Robot,
     corrected_urdf,
     load_robot,
-    read_robot_document,
     robot_file,
     robot_names,
     small_urdf,
@@ -25,8 +24,6 @@ from visioncal.robot import (
     unexportable_functions,
     ur_kinematics_yaml,
 )
-
-DATA = Path(__file__).parents[3] / "shared" / "data"
 
 
 def robots() -> list[Robot]:
@@ -295,35 +292,3 @@ def test_the_generic_arm_reaches_as_far_as_its_name() -> None:
     q = np.array([0.0, np.pi / 2, -np.pi / 2 + elbow, 0.0, 0.0, 0.0])
     wrist = robot.link_frames(q)[4]
     assert np.hypot(*wrist[:2, 3]) == pytest.approx(1.8, abs=1e-12)
-
-
-@pytest.mark.skipif(
-    not DATA.is_dir(), reason="the real robots' descriptions are not beside the repository"
-)
-@pytest.mark.parametrize(
-    ("file", "tip"), [("talos.urdf", "gripper_left_base_link"), ("tiago_hey5.urdf", "arm_7_link")]
-)
-def test_real_urdfs_are_corrected_in_place(file: str, tip: str) -> None:
-    robot = load_robot(str(DATA / "figaroh_small" / file), tip)
-    placements, functions = some_changes(robot)
-    functions[:, 1:] = 0.0
-    placements[-1] = 0.0
-    corrected = robot.corrected(placements, functions)
-    text = corrected_urdf(robot, corrected)
-    again = Robot.from_document(
-        read_robot_document(str(DATA / "figaroh_small" / file), tip=tip) | {"urdf": text}
-    )
-    q = some_joints(robot)
-    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
-    before, after = str(robot.document["urdf"]), text
-    assert without_origins(before) == without_origins(after)
-    origins = [
-        [joint.find("origin") for joint in ElementTree.fromstring(urdf).iterfind("joint")]
-        for urdf in (before, after)
-    ]
-    changed = [
-        one
-        for one, other in zip(*origins, strict=True)
-        if (None if one is None else one.attrib) != (None if other is None else other.attrib)
-    ]
-    assert len(changed) == robot.joint_count

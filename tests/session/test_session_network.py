@@ -326,20 +326,6 @@ def test_robots_of_six_and_of_seven_joints_share_columns(tmp_path):
         Session.load(tmp_path)
 
 
-def test_of_a_robot_with_fewer_joints_no_other_columns_are_taken(tmp_path):
-    (tmp_path / "session.toml").write_text(
-        'schema = 1\nname = "two"\n[robots]\na = "ur5e"\nb = "panda"\n[cameras]\nhand = {}\n'
-        'top = {}\n[targets]\nfloor = "charuco_9x6_30mm"\nplate = "charuco_7x5_36mm"\n[frames]\n'
-        'cam_hand = "flange_a"\ncam_top = "cell"\ntarget_floor = "cell"\n'
-        'target_plate = "flange_b"\n'
-    )
-    header = "view,stop,camera,target,robot,image," + ",".join(f"q{at}_rad" for at in range(1, 8))
-    rows = "0,0,hand,floor,a,a.png,1,2,3,1,2,3,\n1,0,top,plate,b,b.png,1,2,3,1,2,3,1\n"
-    (tmp_path / "views.csv").write_text(f"{header}\n{rows}")
-    session = Session.load(tmp_path)
-    assert [len(session.of(camera=name).views[0].joints_rad) for name in ("hand", "top")] == [6, 7]
-
-
 def test_points_are_on_what_moves_while_they_are_read(tmp_path):
     (tmp_path / "session.toml").write_text(
         'schema = 1\nname = "two"\n[robots]\na = "ur5e"\nb = "ur5e"\n'

@@ -226,15 +226,6 @@ def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
         assert misfit(edge, edges[f"point_{robot}1"], among) < MOST
 
 
-def test_currents_stand_for_torques_by_gains_that_the_truth_has(place):
-    done("simulate", place / "motors", "--torques", "--currents")
-    content, _ = truth_of(place / "motors")
-    columns = Session.load(place / "motors").streams["excite"].columns
-    assert "current6_a" in columns
-    assert "tau6_nm" not in columns
-    assert content["options"]["senses"]["gains_nm_a"] == [10.0, 10.0, 9.0, 7.0, 7.0, 7.0]
-
-
 def test_a_file_of_ones_own_says_what_a_cell_is_made_of(place):
     (place / "own.toml").write_text(OWN + PUSHED)
     cell = simulate(read_cell(str(place / "own.toml")))

@@ -351,26 +351,6 @@ def test_pictures_show_the_corners_where_they_are(options):
     assert np.sqrt((errors**2).mean()) < 0.08  # What the detectors reach at this blur and noise.
 
 
-def test_print_is_opencvs_board():
-    # Seen straight and exactly, the print is the image that OpenCV would print.
-    target = BOARDS["charuco"]
-    cell = simulate(exact(CellOptions(views=1, camera=SMALL, vignetting=0.0)))
-    pose = cell.cam_from_target[0]
-    image = render(prepare_scene(cell), 0).astype(float)
-    board = charuco_board(target).generateImage((900, 600))
-    # Centres of a 6x6 grid in each square, where neither image has an edge within a module.
-    u, v = np.meshgrid(np.arange(2.5, 900, 5.0), np.arange(2.5, 600, 5.0))
-    flat = np.stack([u, v, 0 * u], axis=-1).reshape(-1, 3) * 0.030 / 100.0
-    px = cv_project(SMALL, flat @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-    seen = cv2.remap(image, px[:, 0], px[:, 1], cv2.INTER_LINEAR).ravel()
-    printed = board[v.astype(int), u.astype(int)].ravel()
-    white, black = seen[printed > 128], seen[printed < 128]
-    # Edges blur; a wrong or turned marker would put a tenth of all samples on the wrong side.
-    threshold = 0.5 * (np.median(white) + np.median(black))
-    assert (white > threshold).mean() > 0.97
-    assert (black < threshold).mean() > 0.97
-
-
 def test_noise_blur_and_vignetting_are_in_the_picture():
     plain = exact(CellOptions(views=1, camera=SMALL, vignetting=0.0, seed=1))
     clean = render(prepare_scene(simulate(plain)), 0).astype(float)
