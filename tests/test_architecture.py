@@ -35,7 +35,7 @@ HOMES = {
     "pinocchio": {"robot"},
     "matplotlib": {"vision.printing", "present.report"},
     "jinja2": {"present.report"},
-    "pydantic": {"session"},
+    "pydantic": {"core.arguments", "session"},
     "yaml": {"core.documents", "interchange.exports"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -349,5 +349,5 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
 
 
 def test_an_unknown_convention_is_refused(rendered):
-    with pytest.raises(DataError, match="'craig' is not one of standard, modified, hayati"):
+    with pytest.raises(DataError, match=r"'craig'.*'standard', 'modified' or 'hayati' is needed"):
         visioncal.calibrate(rendered, convention="craig")

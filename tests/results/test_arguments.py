@@ -129,8 +129,11 @@ def test_what_was_given_and_what_is_needed_is_said(bench):
         "visioncal.present.recording.read_calibration reads the result.": (
             lambda: visioncal.Calibration.load("out/recording.rrd")
         ),
-        "Session.from_arrays: mount 'eye-on-hand' is not one of eye-in-hand, eye-to-hand, "
-        "instrument. Did you mean eye-to-hand or eye-in-hand?": (
+        "batch: sessions[1] is of the type int; a path or text is needed.": (
+            lambda: visioncal.batch(["a", 3])
+        ),
+        "Session.from_arrays: mount is text ('eye-on-hand'); 'eye-in-hand', 'eye-to-hand' or "
+        "'instrument' is needed. Did you mean eye-to-hand or eye-in-hand?": (
             lambda: visioncal.Session.from_arrays(
                 [bench.image], bench.pose[None], BOARD, mount="eye-on-hand"
             )
