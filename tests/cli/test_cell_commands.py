@@ -13,7 +13,6 @@ from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, s
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
-from visioncal.present.advice import left_out
 from visioncal.results import Calibration, RobotResult
 from visioncal.results.compare import compare
 from visioncal.results.compensation import correct
@@ -197,18 +196,6 @@ def test_a_row_without_the_robots_pose_is_left_out_where_a_tool_is_placed(place)
     frame = seen_frame(shown, whole, "tool", camera="left", robot="b")
     (left,) = [observation for observation in frame.observations if not observation.used]
     assert "no pose of the robot" in left.reason
-
-
-def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
-    sight = Calibration.load(place / "out").views[0]
-    lost = [replace(sight, view=index, used=False, reason="not needed") for index in range(30)]
-    of = f"({sight.seer} of {sight.seen})"
-    named = ", ".join(map(str, range(12)))
-    assert [suspects.words for suspects in left_out([*lost, sight])] == [
-        f"30 views, as {named} {of}: not needed"
-    ]
-    alone = replace(lost[5], reason="blurred")
-    assert f"view 5 {of}: blurred" in [suspects.words for suspects in left_out([*lost[:5], alone])]
 
 
 def test_a_fixture_of_one_robot_is_known_in_the_base_of_the_other(cell, place, tmp_path):

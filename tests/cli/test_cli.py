@@ -77,19 +77,6 @@ def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
     assert json.loads(done.out) == json.loads((tmp_path / "out/calibration.json").read_text())
 
 
-@pytest.mark.slow
-def test_calibrating_the_recording_gives_the_same_numbers(rendered, tmp_path):
-    done = visioncal("calibrate", rendered, "-o", tmp_path / "a", "--need-mm", "0.5")
-    assert done.status == 0
-    again = visioncal("calibrate", tmp_path / "a/recording.rrd", "-o", tmp_path / "b")
-    assert again.status == 0, again.err
-    first, second = (
-        json.loads((tmp_path / name / "calibration.json").read_text()) for name in "ab"
-    )
-    assert first | {"created": ""} == second | {"created": ""}
-    assert first["need"]["mm"] == 0.5
-
-
 def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor, tmp_path):
     out = tmp_path / "out"
     out.mkdir()

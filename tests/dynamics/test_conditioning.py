@@ -34,14 +34,6 @@ def test_the_filter_passes_its_band_and_shifts_nothing():
         assert out == pytest.approx(wanted * np.cos(2.0 * np.pi * hz * at), abs=4e-3)
 
 
-def test_blocks_of_the_filter_are_a_convolution():
-    lowpass = LowPass.of(20.0, RATE_HZ)
-    values = np.random.default_rng(0).standard_normal((900, 2, 3))
-    plain = np.apply_along_axis(np.convolve, 0, values, lowpass.taps, "valid")[:: lowpass.step]
-    assert lowpass(values) == pytest.approx(plain, abs=1e-12)
-    assert len(plain) == lowpass.count(900)
-
-
 def test_the_filter_knows_what_it_leaves_of_white_noise():
     lowpass = LowPass.of(8.0, RATE_HZ)
     out = lowpass(np.random.default_rng(1).standard_normal(1_500_000))

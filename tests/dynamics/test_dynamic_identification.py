@@ -14,15 +14,13 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified, TorqueValidation
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.limits import MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
-from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.validate import fit_friction_to_known, predict, validate
 from visioncal.robot import load_robot
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import Exercise, Senses, multi_sine, record, slow_sweep
+from visioncal.simulation.exercise import Senses, multi_sine, record, slow_sweep
 
 PANDA = Path(__file__).parents[3] / "shared" / "data" / "dyn_franka_panda"
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)
@@ -126,30 +124,6 @@ def test_breaking_loose_is_found():
     # Chance exceeds 33 with 12 degrees of freedom once in a thousand.
     assert away @ np.linalg.solve(covariance, away) < 33.0
     assert np.sqrt(np.diag(covariance)[6:]).max() < 0.05
-
-
-@pytest.mark.slow
-def test_planned_sweeps_tell_friction():
-    """Joints move one at a time, and those at rest are held by what nothing foretells."""
-    rng = np.random.default_rng(3)
-    built = real_dynamics("ur5e", rng, stribeck=True)
-    plan = plan_sweeps(motion_limits(load_robot("ur5e"), MotionMargins()), SweepRequest(speeds=4))
-    swept = plan.sampled(500.0)
-    sweeps = record(built, Exercise(swept.times_s, swept.q, swept.dq, swept.ddq), rng)
-    resting = {f"tau{index}_nm": np.abs(swept.dq[:, index - 1]) < 1e-9 for index in range(1, 7)}
-
-    def hold(columns):
-        for joint, (name, rests) in enumerate(resting.items()):
-            columns[name][rests] += 0.8 * built.gears.coulomb[joint]
-
-    held = condition(read_recorded(changed(sweeps, hold), "streams/sweeps.csv", 6))
-    streams = [recorded(built, multi_sine(6, rng), rng), held]
-    result = identify(known_arm(), streams, replace(PLAIN, stribeck=True)).identified
-    names = [result.base.model.names[index] for index in result.base.independent]
-    friction = result.values[[names.index(f"Fv{index}") for index in range(1, 7)]]
-    # Four speeds there and back, each held for a second or so, at 3 % of noise.
-    assert friction == pytest.approx(built.gears.viscous, rel=0.03)
-    assert (result.streams[1].rms_nm < 0.02 * result.streams[1].torque_nm).all()
 
 
 def test_an_arm_without_humps_gets_none(worlds):

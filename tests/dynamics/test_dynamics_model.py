@@ -19,7 +19,6 @@ from visioncal.dynamics import (
     Measured,
     MomentumObserver,
     external_torques,
-    sign,
 )
 from visioncal.robot import (
     Inertias,
@@ -176,17 +175,6 @@ def test_base_parameters_are_those_that_are_kept():
     for wrong in (base.independent[1:], np.append(base.independent, len(model.names) - 1)):
         with pytest.raises(DataError, match="are no base parameters of it"):
             BaseModel.keeping(model, wrong)
-
-
-def test_names_keep_only_what_counts():
-    names = BaseModel.reduce(DynamicModel(load_robot("ur5e"), FrictionTerms())).names
-    assert {"Fc3", "m6*cx6"} <= set(names)
-    assert not any("e-" in word for word in names)
-
-
-def test_the_sense_of_a_motion_is_zero_at_rest():
-    found = sign(np.array([-1.0, -0.0025, 0.0, 0.0025, 0.01]))
-    assert found.tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]
 
 
 def test_friction_acts_on_its_own_joint():

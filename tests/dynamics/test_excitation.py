@@ -50,15 +50,6 @@ def test_speeds_and_accelerations_are_derivatives():
         assert np.abs(jacobian - rates[1:-1]).max() < 1e-5 * np.abs(rates).max()
 
 
-def test_a_shrunk_series_moves_less_about_the_same_middle():
-    series = some_series()
-    small = series.shrunk(0.3)
-    mean, sines, cosines = series.coefficients
-    for found, wanted in zip(small.coefficients, (mean, 0.3 * sines, 0.3 * cosines), strict=True):
-        assert np.abs(found - wanted).max() < 1e-12
-    assert np.abs(small.sampled(50.0).ddq[[0, -1]]).max() < 1e-12
-
-
 def test_the_smooth_condition_tends_to_the_condition_and_knows_its_jacobian():
     rows = np.random.default_rng(2).normal(size=(30, 5)) * [1.0, 40.0, 0.1, 3.0, 1.0]
     unit = rows / np.linalg.norm(rows, axis=0)

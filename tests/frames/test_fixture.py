@@ -168,14 +168,6 @@ def test_three_touches_say_what_their_sigma_rests_on():
     assert "noise_95_mm" not in assumed.details
 
 
-def test_features_that_were_touched_once_are_named():
-    rng = np.random.default_rng(4)
-    kinds = ("origin", "x", "x", "xy", "xy")
-    frame = touched_fixture(rows_of(touching(ON_FEATURES[:5], rng, NOISE_M), kinds), tool())
-    (reason,) = frame.verdict.reasons
-    assert reason.startswith("The origin was touched once only")
-
-
 @pytest.mark.parametrize(
     "chosen",
     [[0, 1, 3, 4], slow([0, 1, 3, 4, 6, 6])],

@@ -153,43 +153,6 @@ def test_more_images_do_not_make_the_common_part_smaller(cell):
     np.testing.assert_allclose(many.covariance, many.independent + many.common)
 
 
-def test_a_moved_target_and_a_wrong_pose_are_named(cell):
-    made, calibration = cell
-    parent = "base" if made.options.mount == IN_HAND else "flange"
-    rng = np.random.default_rng(4)
-    place = place_of(made, parent, rng)
-    sights = sights_of(made, parent, place, rng, count=7)
-    clean = place_seen(calibration, sights, BOARD, parent)
-    assert not clean.warnings
-    sights[2] = replace(sights[2], base_from_flange=made.robot.base_from_flange[8])
-    slipped = sights_of(made, parent, place @ exp(np.array([0, 0, 0.01, 0.002, 0, 0])), rng, 6)
-    sights[5] = slipped[5]
-    found = place_seen(calibration, sights, BOARD, parent)
-    assert list(np.flatnonzero(~found.inliers)) == [2, 5]
-    assert [warning.split()[1] for warning in found.warnings] == ["2", "5"]
-    assert "left out" in found.warnings[0]
-    # Two of seven images fewer: the mean stays within what it is known to.
-    away = log(invert(clean.matrix) @ found.matrix)
-    assert away @ np.linalg.solve(found.independent, away) < 6 * 4
-
-
-def test_one_image_is_checked_by_nothing_and_two_do_not_tell_which_is_right(cell):
-    made, calibration = cell
-    parent = "base" if made.options.mount == IN_HAND else "flange"
-    rng = np.random.default_rng(5)
-    place = place_of(made, parent, rng)
-    sights = sights_of(made, parent, place, rng, count=2)
-    alone = place_seen(calibration, sights[:1], BOARD, parent)
-    assert "nothing checks it" in alone.warnings[0]
-    assert alone.scatter == 1.0
-    wrong = sights_of(made, parent, place @ exp(np.array([0, 0, 0.02, 0.004, 0, 0])), rng, 2)
-    torn = place_seen(calibration, [sights[0], wrong[1]], BOARD, parent)
-    assert "it is not known which are right" in torn.warnings[0]
-    assert torn.inliers.all()
-    # The contradiction counts in the sigmas.
-    assert torn.scatter > 5.0
-
-
 def test_images_of_one_stop_share_the_robots_error(cell):
     made, calibration = cell
     parent = "base" if made.options.mount == IN_HAND else "flange"
@@ -247,19 +210,6 @@ def test_a_symmetric_board_may_be_turned(cell):
     assert any("the same when it is turned" in warning for warning in found.warnings)
     # The first image's numbering is kept.
     assert 1e3 * np.linalg.norm((invert(place) @ found.matrix)[:3, 3]) < 3.0
-
-
-def test_what_is_missing_is_named(cell):
-    made, calibration = cell
-    parent = "base" if made.options.mount == IN_HAND else "flange"
-    rng = np.random.default_rng(8)
-    sights = sights_of(made, parent, place_of(made, parent, rng), rng, count=2)
-    with pytest.raises(DataError, match=f"image 0: the robot stands between the {parent}"):
-        place_seen(calibration, [replace(sights[0], base_from_flange=None)], BOARD, parent)
-    with pytest.raises(DataError, match="at least one is needed"):
-        place_seen(calibration, [], BOARD, parent)
-    with pytest.raises(DataError, match="two images are called 'image 0'"):
-        place_seen(calibration, [sights[0], sights[0]], BOARD, parent)
 
 
 @pytest.fixture(scope="module")

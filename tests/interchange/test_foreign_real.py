@@ -95,27 +95,6 @@ def test_industrial_calibration(real_data, calibrated):
     assert away_mm(result, "base_from_cam", x_mm) < 0.3 * sigma_mm
 
 
-@pytest.mark.slow
-def test_visp_in_the_hand(real_data, calibrated):
-    result, _ = calibrated(
-        real_data / "visp_franka_hand_eye/data-eye-in-hand",
-        "--images",
-        real_data / "sessions/visp_franka_eye_in_hand/images",
-    )
-    # What both were told of the lens does not fit the images, so that it was refined.
-    assert result.camera.estimated
-    # The session that was made of the same data by hand states its squares to another sigma, which
-    # moves the camera by little of its own.
-    by_hand = visioncal.calibrate(real_data / "sessions/visp_franka_eye_in_hand")
-    x_mm = 1e3 * by_hand.transforms["flange_from_cam"].translation
-    assert (
-        away_mm(result, "flange_from_cam", x_mm) < 0.1 * by_hand.edges["flange_from_cam"].sigma_mm
-    )
-    assert result.rms.mm == pytest.approx(by_hand.rms.mm, rel=0.05)
-    sigma_mm = result.edges["flange_from_cam"].sigma_mm
-    assert away_mm(result, "flange_from_cam", [58.2, -34.2, -42.6]) < 3 * sigma_mm
-
-
 def test_visp_to_the_hand(real_data, calibrated):
     result, said = calibrated(
         real_data / "visp_franka_hand_eye/data-eye-to-hand",
@@ -196,24 +175,6 @@ def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     # all over the motion.
     assert np.median([value.residual_mm for value in used]) < 3.2
     assert np.median([value.residual_deg for value in used]) < 0.5
-
-
-@pytest.mark.slow
-def test_streams_read_the_wrong_way_round_do_not_close(real_data, calibrated):
-    folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
-    robot, camera = (
-        folder / f"robot_arm_complete_bag_color_and_ir_{name}.csv"
-        for name in ("base_link_sr300_hinge", "target_ir")
-    )
-    result, _ = calibrated(robot, "--camera-file", camera, "--mount", "eye-in-hand")
-    # 190 mm over all samples.
-    assert result.rms.mm > 50
-    assert result.verdict.status == "bad"
-    assert "With the camera's poses inverse, the chain closes" in result.verdict.reasons[0]
-    # How the poses are read does not matter to how both turn: a frame's fraction, as above.
-    clock = result.clock
-    assert clock.method == "turning"
-    assert clock.camera_minus_robot_s == pytest.approx(0.0170, abs=3e-3)
 
 
 def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):

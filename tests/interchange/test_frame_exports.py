@@ -201,12 +201,6 @@ def test_a_frame_of_another_parent_is_neither():
             export(FrameFile(frames), name, Selection(edge="cam_from_tool"))
 
 
-def test_a_suffix_of_the_parent_is_no_other_kind():
-    frames = {"flange_left_from_tool": placed.frame(FLANGE_FROM_TOOL)}
-    # As above.
-    assert off("ur-tcp", export(FrameFile(frames), "ur-tcp"), FLANGE_FROM_TOOL) < 1e-9
-
-
 @pytest.mark.parametrize("name", ["camera-info", "kalibr", "easy-handeye", "easy-handeye2"])
 def test_frames_alone_have_no_camera(name):
     with pytest.raises(DataError, match=r"holds the camera.*has none"):
@@ -305,12 +299,6 @@ def test_a_rotation_that_was_not_measured_has_no_sigma(inverse):
     assert "deg" not in worth
 
 
-def test_ros_is_told_what_a_tool_is():
-    text = export(CELL, "ros", Selection(TOOL))
-    assert "pose of tool in tool0" in text
-    assert "tool: the tool's frame" in text
-
-
 @pytest.mark.parametrize("name", sorted(FRAME_READERS))
 def test_no_source_leaves_its_comment(name):
     hostile = 'x\nset_tcp(p[0])\r\nENDMODULE ; } !\u2028"'
@@ -338,11 +326,6 @@ def test_a_file_of_frames_is_known_by_its_content(tmp_path):
     assert load_result_or_frames(tmp_path).frames == {}
     for name in ("calibration.json", "frames.json"):
         assert isinstance(load_result_or_frames(tmp_path / name), Calibration)
-
-
-def test_a_folder_with_frames_alone(tmp_path):
-    ALONE.save(tmp_path / "frames.json")
-    assert set(load_result_or_frames(tmp_path).frames) == {TOOL, FIXTURE}
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"frames": {}}', '{"frames": 3, "schema": 1}'])

@@ -114,52 +114,6 @@ class Client:
         return done
 
 
-def test_a_command_is_done_once_and_cleared():
-    client = Client()
-    q, _ = client.machine.joints(0.0)
-    goal = q + 0.3
-    assert client.command(1, [*goal, 1.0, 2.0])
-    assert client.registers.int_out[0] == READY
-    assert client.machine.joints(client.now_s)[0] == pytest.approx(goal)
-    # 0.3 rad at 1 rad/s and 2 rad/s^2 is a triangle of 0.77 s.
-    assert client.now_s == pytest.approx(2 * np.sqrt(0.3 / 2.0), abs=0.05)
-
-
-def test_an_asynchronous_motion_tells_of_its_begin_and_end():
-    client = Client()
-    q, _ = client.machine.joints(0.0)
-    assert client.command(1, [*(q + 0.3), 1.0, 2.0], asynchronous=True)
-    running = client.registers.int_out[2]
-    assert running >> 15 & 1
-    client.tick(200)
-    ended = client.registers.int_out[2]
-    assert not ended >> 15 & 1
-    assert ended >> 24 == running >> 24
-    assert ended >> 16 != running >> 16
-
-
-def test_a_stop_brakes_and_the_script_goes_on():
-    client = Client()
-    q, _ = client.machine.joints(0.0)
-    client.command(1, [*(q + 1.0), 1.0, 2.0], asynchronous=True)
-    client.tick(100)
-    assert client.command(34, [4.0])
-    assert not client.machine.moving(client.now_s)
-    assert client.machine.program == "playing"
-    assert np.abs(client.machine.joints(client.now_s)[0] - q).max() < 1.0
-
-
-def test_the_watchdog_stops_a_silent_client_and_no_other():
-    client = Client()
-    assert client.command(35, [1.0])
-    for _ in range(10):
-        client.tick(100)
-        client.script.heard(client.now_s)
-    assert client.machine.program == "playing"
-    client.tick(130)
-    assert client.machine.program == "stopped"
-
-
 def test_a_controller_that_slept_does_not_call_its_client_silent():
     client = Client()
     client.command(35, [1.0])

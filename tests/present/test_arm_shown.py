@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from support.arm_documents import NOT_TOLD, WORTH, calibrated, stays_stated, with_holdout
+from support.arm_documents import NOT_TOLD, calibrated, stays_stated, with_holdout
 from support.drawn import column
 from support.findings import with_findings
 from support.pages import Page, section
@@ -15,7 +15,6 @@ from support.samples import Sample, made_up
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, read_calibration, write_recording
 from visioncal.present.recording.accuracy import ArmPicture
-from visioncal.present.recording.markdown import plain
 from visioncal.present.report.page import render
 from visioncal.present.viewer import blueprint
 from visioncal.results import Calibration, to_document
@@ -65,18 +64,6 @@ def test_the_levels_are_compared_and_the_taken_one_says_why(page, rows):
     assert "a sigma of 0.071 mm (median; 95 % of the places: under 0.14 mm)" in words
 
 
-def test_an_arm_that_stays_as_stated_takes_one_sentence(sample):
-    html = render(with_arm(sample, stays_stated()), sample.session, sample.evidence)
-    page = Page(html)
-    # What was not taken stands folded, behind what was.
-    assert page.words.index("The arm No level") > page.words.index("Where the uncertainty comes")
-    words = section(page, "The arm No level", "How it was obtained")
-    assert words.strip() == (
-        "The arm No level was taken: none predicts stops that are left out of the fit better than "
-        "the arm as stated does, beyond chance."
-    )
-
-
 def test_parameters_have_their_change_with_the_digits_of_its_sigma(page, html, rows):
     assert "a 0 1.20 +1.20 \N{PLUS-MINUS SIGN} 0.10 mm" in rows
     alpha = "\N{GREEK SMALL LETTER ALPHA} 90 89.9885 -0.0115 \N{PLUS-MINUS SIGN} 0.0086"
@@ -93,19 +80,6 @@ def test_parameters_have_their_change_with_the_digits_of_its_sigma(page, html, r
 def test_no_key_of_the_document_stands_in_the_section(page):
     said = of_arm(page).replace(" ".join(NOT_TOLD.split()), "")
     assert re.findall(r"\w+_\w+", said) == []
-
-
-def test_what_the_stops_tell_and_what_not(page, rows):
-    words = of_arm(page)
-    assert "directions determined 29 of 30" in words
-    assert "condition 54" in words
-    assert NOT_TOLD in words
-    assert "O4 6e-05" in words
-    shown = [row for row in rows if re.fullmatch(r"view \d.* %", row)]
-    most, least = list(WORTH)[:5], list(WORTH)[-1]
-    assert [int(re.findall(r"\d+", row)[0]) for row in shown] == [*most, least]
-    assert shown[0] == "view 5 31 %"
-    assert shown[-1] == f"view {least}, the least 0.30 %"
 
 
 def test_the_workspace_is_drawn_from_the_side_and_from_above(html):
@@ -130,18 +104,6 @@ def test_the_pictures_have_words_for_those_who_do_not_see_them(html):
         assert "aria-label=" in picture or "aria-hidden" in picture
 
 
-def test_results_without_what_later_versions_add_are_shown_with_what_they_have(sample):
-    document = calibrated()
-    for name in ("workspace_map", "not_determined", "stops", "left_out", "convention"):
-        del document[name]
-    for value in document["parameters"]:
-        del value["sigma"]
-    words = of_arm(page_of(sample, document))
-    assert "Over the workspace" not in words
-    assert "beyond three sigma" not in words
-    assert "a 0 1.200 +1.200 mm" in words
-
-
 def test_a_session_without_joints_has_no_arm(sample):
     words = Page(render(sample.calibration, sample.session, sample.evidence)).words
     assert "The arm" not in words
@@ -160,12 +122,6 @@ def test_an_arm_that_cannot_be_read_is_named(sample, wrong, words):
     document = calibrated() | wrong if isinstance(wrong, dict) else wrong
     with pytest.raises(DataError, match=words):
         with_arm(sample, document)
-
-
-def test_five_stops_have_no_least_one(sample):
-    document = calibrated()
-    document["stops"] = document["stops"][:5]
-    assert "the least" not in " ".join(page_of(sample, document).rows)
 
 
 def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
@@ -222,19 +178,6 @@ def test_the_arm_is_drawn_as_calibrated_and_the_stated_one_off_it(sample, tmp_pa
     expected = [np.zeros(3), *(ours + factor * (stated - ours))]
     # Single precision; the sample's flange is the robot's own.
     np.testing.assert_allclose(strip, expected, atol=1e-5)
-
-
-def test_the_note_names_what_is_sure_and_what_is_not_told(sample):
-    text = notes.arms_markdown(with_arm(sample, calibrated()))
-    words = text.replace("\\", "")
-    assert "| **geometry of the links (taken)** | 36 | 0.073 |" in words
-    assert "| **shoulder pan joint** |  |" in words
-    assert "| **a** | 0 | 1.20 | +1.20 |" in words
-    assert "| **elbow joint** |" in words
-    assert "- directions determined: 29 of 30" in words
-    assert plain(NOT_TOLD) in text
-    assert "| view 5 | 31 % |" in words
-    assert not re.findall(r"(?<!\\)_", text)
 
 
 def test_a_stated_arm_has_no_tab_but_a_word(sample):

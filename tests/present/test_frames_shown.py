@@ -24,9 +24,7 @@ from support.samples import (
     with_frames,
 )
 
-from visioncal.present.details import details
 from visioncal.present.recording import (
-    notes,
     paths,
     read_calibration,
     read_evidence,
@@ -81,16 +79,6 @@ def test_frames_have_their_verdict_pose_and_origin(page):
     assert "observations 11 used of 12" in words
     assert "residual, rms 0.31 mm" in words
     assert "noise, per axis 0.21 mm" in words
-
-
-def test_details_of_the_method_are_told_with_their_units(page):
-    words = of_tool(page)
-    assert "cone 43.71 deg" in words
-    assert "point 0.61, -0.12, 0.034 m" in words
-    assert "refined no" in words
-    assert "bound: tip 0.052 mm" in words
-    # A matrix is for programs.
-    assert "weights" not in words
 
 
 def test_sigmas_are_along_the_axes_of_the_parent(sample):
@@ -154,15 +142,6 @@ def test_frames_without_observations_or_residuals_still_have_a_report(sample):
     )
     words = of_frames(Page(render(with_frame(sample, seen), None, ())))
     assert "off by [mm]" not in words
-
-
-def test_many_points_with_long_names_have_upright_labels():
-    one = tool_frame().observations[0]
-    many = [replace(one, name=f"a bore of the plate {number}") for number in range(60)]
-    plot = str(frame_plot("tool", replace(tool_frame(), observations=tuple(many))))
-    labels = re.findall(r">(a bore of t\S*)<", plot)
-    assert 10 < len(labels) <= 24
-    assert "rotate(-90" in plot
 
 
 def test_recordings_give_the_frames_back(sample, recorded):
@@ -233,45 +212,3 @@ def test_exact_frames_have_no_ellipsoid(sample, tmp_path):
     entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "cell.rrd").stream()}
     assert f"{paths.FRAMES}/fixture" in entities
     assert not [entity for entity in entities if entity.startswith(f"{paths.FRAMES}/fixture/")]
-
-
-def test_the_notes_tell_of_frames(sample):
-    text = notes.tools_markdown(sample.calibration).replace("\\", "")
-    assert text.startswith("# flange_from_tool: Check before use")
-    assert f"- **point {WRONG_TOUCH} not used**: {WRONG_REASON}" in text
-    assert f"| {WRONG_TOUCH} | point | 6.4 | left out |" in text
-    assert "- cone: 43.71 deg" in text
-    assert "| -620.00, -50.00, 20.00 | not measured | 0.15 mm |" in text
-    # The viewer would follow what looks like Markdown or HTML.
-    assert r"touches \<b\>1" in notes.tools_markdown(sample.calibration)
-    verdict = notes.verdict_markdown(sample.calibration).replace("\\", "")
-    assert "- flange_from_tool: Check before use, see Tools and fixtures." in verdict
-    assert "- base_from_fixture" not in verdict
-    assert "| flange_from_tool | 33.80, 1.00, 176.80 | 0.000, 22.918, 5.730 |" in verdict
-
-
-def test_details_are_in_words_and_their_points_by_name():
-    found = details(
-        {
-            "noise_95_mm": [0.08, 0.134],
-            "worst": {"offset": "its offset along x", "offset_sigma_mm": 0.052},
-            "points_m": {"corner_m": [0.1, 0.2, 0.3]},
-            "seen_in": {"17": 4},
-            "scale": {"value": 1.0002, "sigma": 1e-4},
-            "coplanar": True,
-            "spare_points": ["C", "D"],
-            "bound": {"tip_mm": 0.052},
-        }
-    )
-    assert list(found) == [
-        ("noise, 95 %", "0.08 to 0.13", "mm"),
-        ("least known offset", "its offset along x", ""),
-        ("its sigma", "0.052", "mm"),
-        ("corner_m, in the base", "0.1, 0.2, 0.3", "m"),
-        ("images that show 17", "4", ""),
-        ("scale of the drawing", "1.0002", ""),
-        ("its sigma", "0.0001", ""),
-        ("all points in one plane", "yes", ""),
-        ("drawn points that were not measured", "C, D", ""),
-        ("bound: tip", "0.052", "mm"),
-    ]

@@ -46,23 +46,6 @@ def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:
     assert "- its errors were: estimated along with the result" in text
 
 
-def test_a_healthy_cell_has_a_flat_board_and_no_word_of_its_arm(sample: Sample) -> None:
-    calibration = with_findings(sample, healthy())
-    text = figures(sample, calibration)
-    assert "- squares, found: as stated" in text
-    assert "- bend: none (flat within what is seen)" in text
-    assert "# Arm" not in text
-    verdict = notes.verdict_markdown(calibration).replace("\\", "")
-    assert "with a sigma of 0.10 mm; 95 % of such results are right to within 0.16 mm" in verdict
-    assert "comes from the robot; more stops would lower it" in verdict
-
-
-def test_older_calibrations_have_no_findings(sample: Sample) -> None:
-    text = figures(sample, sample.calibration)
-    assert "- robot translation: 0.051 mm\n" in text
-    assert not {"# Where", "# Board", "# Arm"} & set(text.split("\n"))
-
-
 @pytest.mark.parametrize(
     ("name", "document", "words"),
     [

@@ -1,8 +1,6 @@
 """What a recording shows: its layout, the cell and the charts, and how the viewer draws them."""
 
 import re
-import socket
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +11,6 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
-from rerun.experimental import ViewerClient
 from scipy.spatial.transform import RigidTransform, Rotation
 from support.samples import Sample, made_up, with_frames
 
@@ -22,14 +19,11 @@ from visioncal.present import coverage
 from visioncal.present.recording import arm, board, paths, write_recording
 from visioncal.present.recording.accuracy import SIGMAS_95, Uncertainty
 from visioncal.present.viewer import blueprint
-from visioncal.present.viewer.process import viewer_process
 from visioncal.results import Edge
 from visioncal.results.evidence import ExplainedImage, ViewEvidence
 from visioncal.results.sections import DenseResult
 from visioncal.vision.finders import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
-
-RASTERISERS = list(Path("/usr/share/vulkan/icd.d").glob("lvp*"))
 
 
 @pytest.fixture(autouse=True)
@@ -326,74 +320,3 @@ def test_axes_of_rotation_and_their_reverse_are_one_point():
     np.testing.assert_allclose(np.abs(points[1]), [[90.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(np.abs(points[2]), [[90.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(points[3], [[0.0, 0.0]], atol=1e-9)
-
-
-def free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
-
-
-def part(picture: np.ndarray, left: float, top: float, right: float, bottom: float) -> np.ndarray:
-    height, width = picture.shape[:2]
-    return picture[
-        round(top * height) : round(bottom * height), round(left * width) : round(right * width)
-    ]
-
-
-def colours(picture: np.ndarray) -> int:
-    return len(np.unique(picture.reshape(-1, 3), axis=0))
-
-
-def greens(picture: np.ndarray) -> int:
-    """Counts the pixels in the colour of detected corners."""
-    blue, green, red = (picture[:, :, channel].astype(int) for channel in range(3))
-    return int(np.sum((green > red + 60) & (green > blue + 60)))
-
-
-def drawn_view(client: ViewerClient, place: int, file: Path, patience_s: float = 120) -> np.ndarray:
-    """Goes to a view and takes pictures until two in a row are alike and not blank."""
-    end, last = time.monotonic() + patience_s, np.zeros((1, 1, 3), np.uint8)
-    while time.monotonic() < end:
-        time.sleep(0.3)
-        try:
-            client.set_time(paths.TIMELINE, sequence=place)
-        except ConnectionError:  # the recording is still being loaded
-            continue
-        client.save_screenshot(str(file))
-        new = cv2.imread(str(file))
-        if colours(new) > 500 and np.array_equal(new, last):
-            break
-        last = new
-    return last
-
-
-# Where the parts of the first tab lie in the window, as shares: left, top, right, bottom.
-CELL = (0.0, 0.1, 0.54, 0.73)
-PLOTS = (0.0, 0.78, 0.54, 0.96)
-VERDICT = (0.55, 0.1, 1.0, 0.36)
-IMAGE = (0.55, 0.42, 1.0, 0.79)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not RASTERISERS, reason="no software rasteriser (mesa-vulkan-drivers) here")
-def test_the_native_viewer_draws_it(recordings, tmp_path):
-    port = free_port()
-    options = ("--headless", "--bind", "127.0.0.1", "--port", str(port))
-    file = str(recordings["images and joints"])
-    with viewer_process(*options, "--window-size", "1400x850", file) as process:
-        for line in process.stdout:
-            if "Listening" in line:
-                break
-        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-
-        used, rejected = (drawn_view(client, place, tmp_path / "shot.png") for place in (2, 3))
-    for picture in (used, rejected):
-        # Empty panels have a background and little else; the robot is shaded.
-        assert colours(part(picture, *CELL)) > 1000
-        assert colours(part(picture, *VERDICT)) > 20
-        assert colours(part(picture, *PLOTS)) > 20
-        # The ground of the sample's images is grey 150.
-        assert np.mean(np.abs(part(picture, *IMAGE).astype(int) - 150) < 4) > 0.1
-    assert greens(part(used, *IMAGE)) > 100
-    assert greens(part(rejected, *IMAGE)) == 0

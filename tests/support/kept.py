@@ -2,14 +2,11 @@
 
 import datetime
 import json
-from pathlib import Path
 
 import numpy as np
 
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import MemoryImages, Session, Stream, View
-
-KEPT = Path(__file__).parents[1] / "data"
 
 
 def assert_same(one: Session, other: Session) -> None:

@@ -43,26 +43,6 @@ def with_moved_board(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
     return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": x, "target": moved})
 
 
-def with_moved_result(
-    calibration: Calibration, cell: SimulatedCell, twist: np.ndarray
-) -> Calibration:
-    """What calibrating `with_moved_camera(cell, twist)` gives, without calibrating again.
-
-    The chain closes with the moved camera at the moved stops exactly as it did before: each
-    estimate of the camera's edge moves as the truth does, and keeps its covariance.
-    """
-    name = next(iter(calibration.edges))
-    x, edge = cell.transforms[name], calibration.edges[name]
-    moved = x @ exp(twist) @ invert(x) @ edge.matrix
-    return replace(
-        calibration,
-        edges={
-            **calibration.edges,
-            name: replace(edge, matrix=moved),
-        },
-    )
-
-
 def calibration_of(known: RunState, name: str = "cell") -> Calibration:
     """A calibration with what a comparison looks at."""
     result = known.assessment
