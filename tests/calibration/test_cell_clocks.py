@@ -56,17 +56,6 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
     assert found.session_sha256 == session.digest()
 
 
-@pytest.mark.slow
-def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
-    _, session, corners = swept
-    document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}
-    found = calibrate(replace(session, document=document), corners=corners)
-    (doubt,) = [reason for reason in found.verdict.reasons if "is stated as +20.00 ms" in reason]
-    assert doubt.startswith(CLOCK)
-    assert found.cell.details.clocks[CLOCK].stated_s == 0.02
-    assert found.verdict.status == "check"
-
-
 def test_a_clock_of_no_camera_is_refused(swept):
     _, session, corners = swept
     document = {**session.document, "clocks": {"sied": {"camera_minus_robot_s": 0.02}}}

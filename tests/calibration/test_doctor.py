@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from support.boards import charuco, checkerboard, circles
-from support.broken_sessions import BROKEN, broken_session, edit, edit_rows, sound_session
+from support.broken_sessions import BROKEN, broken_session, edit, sound_session
 from support.commands import visioncal as command
 from support.rendered import Shot, photograph
 from support.typed_fixes import mended
@@ -178,21 +178,6 @@ def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     done = command("doctor", folder, "--json")
     assert done.status == 3
     assert json.loads(done.out) == to_document(found)
-
-
-def test_rows_in_another_unit_are_corrected_and_not_taken_again(tmp_path):
-    def in_mm(rows):
-        for row in rows[3:6]:
-            row.update({name: repr(1e3 * float(row[name])) for name in ("x_m", "y_m", "z_m")})
-        return rows
-
-    folder = sound_session(tmp_path / "session", BROKEN["an image twice"])
-    edit_rows(folder, in_mm)
-    (found,) = (
-        finding for finding in visioncal.doctor(folder).findings if finding.kind == "lost_views"
-    )
-    assert "divide its x_m, y_m, z_m by 1000" in found.words
-    assert found.do.words == "In views.csv, correct the rows that are named, or delete them."
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -66,20 +66,6 @@ def test_links_that_are_off_by_little_count_in_the_covariance():
 
 
 @pytest.mark.slow
-def test_an_eccentric_gear_is_told():
-    cell = simulate(replace(WRONG_LINKS, seed=2, views=40))
-    # The encoders of joints 2 and 3 tell what their axes do but for a wave of 1 mrad.
-    reported = cell.robot.joints.copy()
-    reported[:, 1:3] -= 1e-3 * np.sin(cell.robot.joints[:, 1:3])
-    robot = known_of(cell).robot
-    wavy = reporting(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
-    known = calibrated(wavy)
-    assert known.robot_arm.kinematics.level == "eccentricity"
-    # Told to a few tenths of a milliradian beside errors of all links.
-    assert known.robot_arm.model.robot.chain.functions[1:3, 2] == pytest.approx(1e-3, abs=5e-4)
-
-
-@pytest.mark.slow
 def test_a_wrong_gear_ratio_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40, branches=True))
     reported = cell.robot.joints.copy()

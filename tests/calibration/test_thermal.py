@@ -243,18 +243,6 @@ def test_advice_says_when_the_arm_is_warm():
     assert rate == pytest.approx(0.2, rel=0.05)
 
 
-def test_advice_by_temperatures_comes_from_how_they_level_out():
-    following = OnlineCompensator(model("temperatures", tau_s=120.0))
-    assert following.advice(Q[0], 0.5).rate_um_min is None
-    for stamp_s in np.arange(0.0, 3000.0, 20.0):
-        rise = 20.0 * (1.0 - np.exp(-stamp_s / 1800.0))
-        following.feed(stamp_s, temperatures_c=20.0 + rise * np.ones(6))
-    advice = following.advice(Q[0], 0.2)
-    wait_s = 1800.0 * np.log(advice.rate_um_min / 0.2)
-    # The rate is an average over ten minutes, and so is how it falls.
-    assert advice.wait_s == pytest.approx(wait_s, rel=0.1)
-
-
 def test_the_compensator_refuses_what_does_not_fit():
     following = OnlineCompensator(model())
     with pytest.raises(DataError, match="no sample"):

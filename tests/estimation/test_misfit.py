@@ -14,7 +14,7 @@ from visioncal.calibration.stages import refine
 from visioncal.calibration.stages.turned_images import find_image_turn
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
-from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
+from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.problem_parts import ROBOT
@@ -44,11 +44,6 @@ def answered(cell):
 
 def told(result):
     return result.problem, result.state, result.noise
-
-
-def sources(**shared):
-    columns = {name: 12 + places for name, places in shared.items()}
-    return Sources({"cam": "pixels"}, {ROBOT: "robot"}, columns)
 
 
 def of_fit(test, result):
@@ -139,19 +134,6 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
     assert found.moved_rad == pytest.approx(2e-3, abs=3e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_independent_noise_gives_neighbours_no_more_than_their_share(mount):
-    factors = []
-    for seed in range(12):
-        result, _ = answered(simulate(replace(FINE, mount=mount, seed=seed)))
-        found = of_fit(neighbours, result)
-        assert not found.is_significant
-        factors.append(found.factor)
-    # One on average; a single one scatters by 0.16.
-    assert np.mean(factors) == pytest.approx(1.0, abs=0.2)
-
-
 def test_stops_that_err_in_groups_are_noticed():
     rng = np.random.default_rng(0)
     cell = simulate(replace(FINE, views=30, seed=1))
@@ -212,21 +194,6 @@ def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
     assert more[0, arm.start] == pytest.approx(-5e-7)
     # Of the frame's variance, the part that the error makes up for.
     assert more[0, 0] == pytest.approx(2.5e-7)
-
-
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
-def test_the_budget_adds_up(given):
-    result, known = answered(simulate(replace(FINE, state_intrinsics=given, seed=2)))
-    rows = np.arange(len(result.state.values))
-    parts = covariance_by_source(*told(result), sources(shared=rows))
-    whole = covariance_of(result.problem, result.fit)[:12, :12]
-    # An identity; what is left is rounding of an inverse with a condition of 1e10.
-    np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
-    budget, covariance = known.accuracy_at_work.budget_mm, result.covariance[:6, :6]
-    at_work = point_covariance(result.state.edges[0], covariance, known.accuracy_at_work.point_cam)
-    assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
-    lens = known.cell_fit.linearised_corners.camera_parameters.lens_of("cam")
-    assert ("intrinsics" in budget) == np.isin(lens, known.cell_fit.linearised_corners.free).any()
 
 
 def test_a_point_is_as_uncertain_as_its_scatter():

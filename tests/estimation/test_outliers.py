@@ -11,7 +11,7 @@ from support.marks import slow
 from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances
-from visioncal.estimation.problem_parts import ROBOT, State
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -39,14 +39,6 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
         error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
         # Chi-square of 12 stays under 39 in all but one case of ten thousand.
         assert error @ np.linalg.solve(covariance, error) < 39.0
-
-
-@pytest.mark.slow
-def test_where_nothing_agrees_nothing_is_left_out():
-    known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
-    problem = known.assessment.problem.with_effects([])
-    mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
-    assert inliers_of(mixed).used.all()
 
 
 def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from visioncal.robot import (
     table_of,
 )
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base", "flange")
 KEYS = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")
 
@@ -161,19 +159,6 @@ def test_a_urdfs_table_is_the_published_one(name: str, convention: str) -> None:
         expected = replace(expected, d_m=d, flange=np.eye(4))
     # Angles written as roll, pitch and yaw and read again.
     assert_same_table(found, replace(expected, name=found.name), atol=1e-13)
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="real robots' descriptions are not in ../shared/data")
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize(
-    ("file", "tip"), [("talos.urdf", "gripper_left_base_link"), ("tiago_hey5.urdf", "arm_7_link")]
-)
-def test_any_urdf_has_a_table(file: str, tip: str, convention: str) -> None:
-    robot = load_robot(str(DATA / "figaroh_small" / file), tip)
-    found = table_of(robot, convention)
-    # Right angles written with 8 digits or so leave axes 1e-8 from parallel, or from meeting.
-    np.testing.assert_allclose(poses(found), poses(robot), rtol=0, atol=1e-7)
-    assert found.prismatic.tolist() == robot.chain.prismatic.tolist()
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -283,12 +283,3 @@ def test_abbs_arm_is_the_one_of_its_published_urdf() -> None:
             )
         chain = chain @ exp(np.array([0, np.pi / 2, 0, 0, 0, 0]))
         np.testing.assert_allclose(pose, chain, atol=1e-14)
-
-
-def test_the_generic_arm_reaches_as_far_as_its_name() -> None:
-    robot = load_robot("generic-6r-1800")
-    # Upper arm level, and the forearm's offset turned so that its wrist lies as far out as it can.
-    elbow = np.arctan2(0.18, 0.8)
-    q = np.array([0.0, np.pi / 2, -np.pi / 2 + elbow, 0.0, 0.0, 0.0])
-    wrist = robot.link_frames(q)[4]
-    assert np.hypot(*wrist[:2, 3]) == pytest.approx(1.8, abs=1e-12)

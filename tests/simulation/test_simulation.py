@@ -208,19 +208,6 @@ def test_given_postures_are_moved_to_in_the_same_cell():
     assert np.abs(away).max() < 4e-4
 
 
-def test_another_draw_is_of_the_same_cell():
-    first, again = (simulate(CellOptions(views=4, dh_sigma_m=1e-3, draw=name)) for name in (0, 1))
-    assert np.array_equal(first.robot.joints, again.robot.joints)
-    assert all(
-        np.array_equal(transform, other)
-        for transform, other in zip(
-            first.transforms.values(), again.transforms.values(), strict=True
-        )
-    )
-    assert not np.any(first.robot.true_arm.d == again.robot.true_arm.d)
-    assert not np.any(first.corners[0].px == again.corners[0].px)
-
-
 def test_repeatability_comes_out_as_asked():
     sigmas = {"robot_sigma_m": 2e-4, "robot_sigma_rad": 5e-4}
     cell = simulate(dataclasses.replace(exact(CellOptions(views=200)), **sigmas))
