@@ -345,7 +345,7 @@ def test_progress_tells_of_every_stage_and_image(rendered):
 
 
 def test_options_that_do_not_exist_are_refused(rendered):
-    with pytest.raises(DataError, match="solver 'best'"):
+    with pytest.raises(DataError, match=r"solver is text .'best'"):
         visioncal.calibrate(rendered, solver="best")
     with pytest.raises(DataError, match="level 'seven'"):
         visioncal.calibrate(rendered, level="seven")
