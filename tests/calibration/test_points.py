@@ -408,8 +408,8 @@ def test_corners_without_images_need_a_resolution(cube):
             "has 2 again as point of row 4",
         ),
         ("point,x_m,y_m,z_m\n0,0,0,0\n1,100,0,0\n2,0,100,0\n3,0,0,80\n", "looks like millimetres"),
-        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,nan,1\n", "has nan as y_m of row 4"),
-        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,b,1\n", "'b' is no number"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,nan,1\n", "line 5, column y_m: 'nan'"),
+        ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,0,1,0\n3,0,b,1\n", "line 5, column y_m: 'b'"),
         ("point,x_m,y_m\n0,0,0\n1,1,0\n2,0,1\n3,0,1\n", "point, x_m, y_m, z_m"),
         (
             "point,x_m,y_m,z_m,sigma_m\n0,0,0,0,1\n1,1,0,0,1\n2,0,1,0,1\n3,0,1,1,0\n",

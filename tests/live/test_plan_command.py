@@ -86,8 +86,8 @@ def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, d
 
 
 def test_the_table_opens_as_views_with_the_models_poses(planned, document):
-    columns, rows = parse_csv((planned / "stops.csv").read_text(encoding="utf-8"), "stops.csv")
-    views = read_views(columns, rows, "stops.csv")
+    table = parse_csv((planned / "stops.csv").read_text(encoding="utf-8"), "stops.csv")
+    views = read_views(table)
     robot = load_robot("ur5e")
     for view, stop in zip(views, document["stops"], strict=True):
         assert view.number == stop["view"]

@@ -390,13 +390,13 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
     assert "look like millimetres" in refused(good.replace(",0.", ",400."))
     assert "Write metres" in refused(good.replace("x_m,y_m,z_m", "x_mm,y_mm,z_mm"))
     assert "qw are missing" in refused(good.replace(",qw", ",q4"))
-    assert "z_m is ''" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,,0,0,0,1\n")
+    assert "column z_m: it is empty" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,,0,0,0,1\n")
     assert "norm is 1.41" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,0.2,0,0,1,1\n")
     joints = ",".join(JOINTS)
     header = f"x_m,y_m,z_m,qx,qy,qz,qw,{joints}"
     pose = "0.4,0.1,0.2,0,1,0,0"
     assert "look like degrees" in refused(f"{header}\n{pose},10,-80,90,-100,-90,0\n")
-    assert "q2_rad is ''" in refused(f"{header}\n{pose},0.1,,1,1,1,0\n")
+    assert "column q2_rad: it is empty" in refused(f"{header}\n{pose},0.1,,1,1,1,0\n")
     assert "its joints are q1_rad" in refused(f"x_m,y_m,z_m,qx,qy,qz,qw,q1_rad\n{pose},0.1\n")
     assert "does not exist" in run("correct", stored / "none.csv", "-c", stored).err
 

@@ -636,15 +636,15 @@ def test_a_header_without_rows_is_named(folder: Path) -> None:
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separator: str) -> None:
     digest = Session.load(folder).digest()
-    columns, rows = parse_csv((folder / "views.csv").read_text(), "views.csv")
+    table = parse_csv((folder / "views.csv").read_text(), "views.csv")
     lines = [
         separator.join(re.sub(r"^(-?\d+)\.(\d+)$", r"\1,\2", cell) for cell in cells)
-        for cells in (columns, *(row.cells for row in rows))
+        for cells in (table.columns, *table.rows)
     ]
     (folder / "views.csv").write_text("\n".join(lines))
     assert Session.load(folder).digest() == digest
     # Where cells at the right and below were filled once, empty ones are written.
-    margin = [*(line + 2 * separator for line in lines), separator * (len(columns) + 1)]
+    margin = [*(line + 2 * separator for line in lines), separator * (len(table.columns) + 1)]
     (folder / "views.csv").write_text("\n".join(margin))
     assert Session.load(folder).digest() == digest
 
@@ -795,7 +795,7 @@ def test_rotations_of_another_form_are_named(names, rotations, words):
     ]
     text = "\n".join([f"view,x_m,y_m,z_m,{names}", *rows])
     with pytest.raises(DataError) as caught:
-        read_views(*parse_csv(text, "views.csv"), "views.csv", with_corners=True)
+        read_views(parse_csv(text, "views.csv"), with_corners=True)
     assert re.match(f".*{words}", f"{caught.value}")
     assert len(caught.value.culprits) == 1
 

@@ -31,7 +31,7 @@ from visioncal.results.compensation.table import (
 )
 from visioncal.robot import Loads
 from visioncal.session.choosing import ARM, EYE
-from visioncal.session.columns import temperature_error
+from visioncal.session.columns import column_of
 
 _MOST_SHOWN = 10
 _MOST_DEG = 720.0
@@ -103,7 +103,7 @@ def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration
         return calibration
     form = ",".join(f"T{index + 1}" for index in range(calibration.drift.joint_count))
     temperatures = np.array(numbers_in(words, "--temperatures", form))
-    wrong = temperature_error(temperatures)
+    wrong = next(filter(None, map(column_of("ambient_c").fault, temperatures.tolist())), "")
     if wrong:
         raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
     return calibration.at_temperatures(temperatures)

@@ -60,7 +60,7 @@ def check_times(views: Sequence[View]) -> None:
         DataError: One is not; it names the view.
     """
     for view in views:
-        wrong = "" if view.stamp_s is None else cols.size_error("stamp_s", np.array([view.stamp_s]))
+        wrong = "" if view.stamp_s is None else cols.column_of("stamp_s").fault(view.stamp_s)
         if wrong:
             place = f"views.csv, view {view.number}, column stamp_s"
             raise DataError(f"{place}: {wrong}.", culprits=[place])

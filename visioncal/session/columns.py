@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.documents.columns import Column
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
@@ -73,7 +73,9 @@ _SIZES: Mapping[str, tuple[float, str]] = {
     "rad_s2": (1e8, "{0:g} rad/s^2 is no acceleration of a joint"),
     "nm": (1e6, "{0:g} Nm is no torque of a joint"),
     "a": (1e6, "{0:g} A is no current of a motor"),
+    "n": (25_000.0, "{0:g} N is no force on a robot's flange; write newtons"),
 }
+_HEAVIEST_KG = 2500.0
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 # Limit in other columns, so that squares and products do not overflow.
 _LARGEST = 1e60
@@ -90,27 +92,26 @@ def is_number(column: str) -> bool:
     return column in _PLAIN_NUMBERS or _NUMBERED.fullmatch(column) is not None
 
 
-def temperature_error(values: FloatArray) -> str:
-    """Message for implausible temperatures [deg C]; empty for none."""
-    beyond = values[(values < _COLDEST_C) | (values > _HOTTEST_C)]
-    if not len(beyond):
-        return ""
-    worst = float(beyond[np.argmax(np.abs(beyond))])
-    is_kelvin = _HOTTEST_C < worst < _HOTTEST_C + _ZERO_K
-    kelvin = f": it looks like kelvin, {worst - _ZERO_K:.1f} deg C" if is_kelvin else ""
+def column_of(name: str) -> Column:
+    """A column of views.csv or a stream with the plausible range of its numbers."""
+    if name == "payload_kg":
+        words = "{:g} kg is no payload; 0 to " + f"{_HEAVIEST_KG:g} kg are taken"
+        return Column(name, 0.0, _HEAVIEST_KG, words.format)
+    rate = _RATE.fullmatch(name)
+    unit = rate[1] if rate else name.rpartition("_")[2] if is_number(name) else ""
+    if unit == "c":
+        return Column(name, _COLDEST_C, _HOTTEST_C, _no_temperature)
+    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
+    return Column(name, -most, most, words.format)
+
+
+def _no_temperature(value: float) -> str:
+    is_kelvin = _HOTTEST_C < value < _HOTTEST_C + _ZERO_K
+    kelvin = f": it looks like kelvin, {value - _ZERO_K:.1f} deg C" if is_kelvin else ""
     return (
-        f"{worst:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
+        f"{value:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
         f"from {_COLDEST_C:g} to {_HOTTEST_C:g}"
     )
-
-
-def size_error(column: str, values: FloatArray) -> str:
-    """Message for an implausibly large number among a column's values (n,); empty for none."""
-    rate = _RATE.fullmatch(column)
-    unit = rate[1] if rate else column.rpartition("_")[2] if is_number(column) else ""
-    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
-    beyond = values[np.abs(values) > most]
-    return words.format(float(beyond[0])) if len(beyond) else ""
 
 
 def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.documents.tables import separator_of
+from visioncal.core.documents.columns import Column, TableProblem, TableReader, problems_error
+from visioncal.core.documents.tables import parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside, sha256
 from visioncal.core.number_format import did_you_mean
@@ -15,8 +16,7 @@ from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration
 from visioncal.session.kinds import name_of
-from visioncal.session.streams import numbered_rows
-from visioncal.session.table import TableProblem, View, problems_error, read_integer, read_number
+from visioncal.session.table import View
 from visioncal.vision.targets import point_numbers
 
 FILE = "corners.csv"
@@ -104,8 +104,9 @@ def parse_corners(text: str) -> CornerTable:
     Raises:
         DataError: A column is missing or a cell is wrong.
     """
-    rows = numbered_rows(text, FILE, 1, separator_of(text.partition("\n")[0]))
-    columns = [name.strip() for name in next(rows, (1, []))[1]]
+    step = "Take fewer views, or fewer points of each."
+    table = parse_table(text, FILE, _MOST_CORNERS, next_step=step)
+    columns = table.columns
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
     other = [column for column in columns if column not in known or columns.count(column) > 1]
@@ -118,75 +119,25 @@ def parse_corners(text: str) -> CornerTable:
             culprits=[f"{FILE}: {name}" for name in (*missing, *other)],
             next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",
         )
-    problems: list[TableProblem] = []
-    lines: list[_Line] = []
-    numbers: list[int] = []
-    for number, cells in rows:
-        # A program that writes "\r\n" as text on Windows leaves a blank line after each row.
-        if not any(cell.strip() for cell in cells):
-            continue
-        if len(lines) == _MOST_CORNERS:
-            raise DataError(
-                f"{FILE} has more than {_MOST_CORNERS:,} rows.",
-                culprits=[FILE],
-                next_step="Take fewer views, or fewer points of each.",
-            )
-        numbers.append(number)
-        lines.append(_line(columns, cells, f"{FILE}, line {number}", problems))
-    stated = [line.sigma_px is not None for line in lines]
-    if any(stated) and not all(stated) and not problems:
-        place = f"{lines[stated.index(False)].place}, column {_SIGMA}"
-        problems.append(TableProblem(place, "it is empty; all rows state it, or none"))
-    if problems:
-        raise problems_error(problems)
-    sigmas = [line.sigma_px for line in lines if line.sigma_px is not None]
-    return CornerTable(
-        np.array([line.view for line in lines], dtype=np.int64),
-        np.array([line.point for line in lines], dtype=np.int64),
-        np.array([line.px for line in lines], dtype=float).reshape(-1, 2),
-        tuple(line.target for line in lines),
-        np.array(sigmas, dtype=float) if sigmas else None,
-        lines=np.array(numbers, dtype=np.int64),
+    reader = TableReader(table)
+    views, points = (reader.whole(name) for name in _NEEDED[:2])
+    px = reader.numbers(*(Column(name, is_needed=True) for name in _NEEDED[2:]))
+    sigmas = None
+    if any(reader.texts(_SIGMA)):
+        sigmas = reader.numbers(Column(_SIGMA, _LEAST_PX, _MOST_PX, _no_sigma))[:, 0]
+        empty = np.flatnonzero(np.isnan(sigmas)).tolist()
+        if empty and reader.is_sound(empty[0]):
+            reader.report(empty[0], _SIGMA, "it is empty; all rows state it, or none")
+    reader.check()
+    lines = np.array(table.lines, dtype=np.int64)
+    return CornerTable(views, points, px, tuple(reader.texts(COLUMN)), sigmas, lines=lines)
+
+
+def _no_sigma(value: float) -> str:
+    return (
+        f"{value:g} px is no standard deviation of a corner, which lies between {_LEAST_PX:g} and "
+        f"{_MOST_PX:g} px; leave out the rows of corners that do not count"
     )
-
-
-@dataclass(frozen=True)
-class _Line:
-    place: str
-    view: int
-    point: int
-    px: tuple[float, float]
-    target: str
-    sigma_px: float | None
-
-
-def _line(
-    columns: Sequence[str], cells: Sequence[str], place: str, problems: list[TableProblem]
-) -> _Line:
-    """Reads one row; appends its problems to `problems`."""
-    row = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
-    numbers: dict[str, float] = {}
-    if len(cells) != len(columns):
-        words = f"it has {len(cells)} fields, but the header has {len(columns)} columns"
-        problems.append(TableProblem(place, words))
-        row = {}
-    for name in (*_NEEDED, _SIGMA):
-        cell = row.get(name, "")
-        if not row or (name == _SIGMA and not cell):
-            continue
-        try:
-            numbers[name] = (read_integer if name in _NEEDED[:2] else read_number)(cell)
-        except DataError as error:
-            problems.append(TableProblem(f"{place}, column {name}", error.message.rstrip(".")))
-    sigma_px = numbers.get(_SIGMA)
-    if sigma_px is not None and not _LEAST_PX <= sigma_px <= _MOST_PX:
-        words = (
-            f"{sigma_px:g} px is no standard deviation of a corner, which lies between "
-            f"{_LEAST_PX:g} and {_MOST_PX:g} px; leave out the rows of corners that do not count"
-        )
-        problems.append(TableProblem(f"{place}, column {_SIGMA}", words))
-    view, point, u_px, v_px = (numbers.get(name, 0.0) for name in _NEEDED)
-    return _Line(place, int(view), int(point), (u_px, v_px), row.get(COLUMN, ""), sigma_px)
 
 
 def write_corners(table: CornerTable) -> str:

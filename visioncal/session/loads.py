@@ -11,8 +11,6 @@ _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
 _FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
 # Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
-# Largest plausible payload and force [kg, N].
-_HEAVIEST_KG, _STRONGEST_N = 2500.0, 25000.0
 
 
 def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | None = None) -> Loads:
@@ -30,18 +28,14 @@ def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | No
     )
 
 
-def load_problems(numbers: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-    """Columns of a row with an invalid load, with messages."""
-    mass = numbers.get("payload_kg")
-    if mass is not None and not 0.0 <= mass <= _HEAVIEST_KG:
-        yield "payload_kg", f"{mass:g} kg is no payload; 0 to {_HEAVIEST_KG:g} kg are taken"
+def load_problems(numbers: Mapping[str, float], approach: str) -> Iterator[tuple[str, str]]:
+    """Columns of a row with an invalid load or approach, with messages."""
+    if approach not in SIDES:
+        yield "approach", f'{approach!r} is no side; "+", "-" or nothing is needed'
     placed = [name for name in _CENTRE if name in numbers]
-    if mass is None and placed:
+    if placed and "payload_kg" not in numbers:
         yield (
             placed[0],
             "it gives a payload's centre, and payload_kg, its mass, is missing; a row "
             "without a payload has payload_kg = 0 or leaves all of them empty",
         )
-    for name in _FORCE:
-        if abs(numbers.get(name, 0.0)) > _STRONGEST_N:
-            yield name, f"{numbers[name]:g} N is no force on a robot's flange; write newtons"

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import tomli_w
 
 from visioncal.core.arguments import typed
+from visioncal.core.documents.tables import TextTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, one_line, parse_toml, read_text_inside
 from visioncal.core.summaries import html_card, text_card
@@ -52,11 +53,10 @@ from visioncal.session.streams import (
     read_streams,
     write_stream,
 )
-from visioncal.session.table import TextRow, View, parse_csv, read_views, write_csv
+from visioncal.session.table import View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
 
-# Columns of a session without views.
-ALONE = ("view",)
+_NO_VIEWS = TextTable("", ("view",), (), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class Session:
         path: Path | str,
         *,
         target_document: Mapping[str, Any] | None = None,
-        table: tuple[tuple[str, ...], tuple[TextRow, ...]] | None = None,
+        table: TextTable | None = None,
     ) -> "Session":
         """Loads a session from a folder or an `.rrd` recording.
 
@@ -107,7 +107,7 @@ class Session:
         Args:
             path: The folder or the recording.
             target_document: Replaces the folder's target, or targets by name.
-            table: Columns and rows that replace the folder's views.csv.
+            table: Replaces the folder's views.csv.
 
         Raises:
             DataError: A file is missing, or a field, row or column of one is wrong.
@@ -156,17 +156,12 @@ class Session:
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
         )
         streams = read_streams(path)
-        columns: tuple[str, ...] = ALONE
-        rows: tuple[TextRow, ...] = ()
         # Streams are enough for identifying an arm's dynamics.
-        if table is not None:
-            columns, rows = table
-        elif not streams or (path / "views.csv").exists():
-            columns, rows = parse_csv(read_text_inside(path, "views.csv"), "views.csv")
+        if table is None and (not streams or (path / "views.csv").exists()):
+            table = parse_csv(read_text_inside(path, "views.csv"), "views.csv")
         session = _build(
             document,
-            columns,
-            rows,
+            _NO_VIEWS if table is None else table,
             FolderImages(path),
             folder=path,
             target_document=target_document,
@@ -182,7 +177,7 @@ class Session:
         Raises:
             DataError: A field or a column is wrong.
         """
-        return _build(document, ALONE, (), MemoryImages({})).with_streams(streams)
+        return _build(document, _NO_VIEWS, MemoryImages({})).with_streams(streams)
 
     @classmethod
     def assemble(
@@ -212,11 +207,10 @@ class Session:
         Raises:
             DataError: A field, row or column is wrong.
         """
-        rows = [TextRow(f"row {place}", tuple(row)) for place, row in enumerate(cells, start=1)]
+        rows = tuple(map(tuple, cells))
         return _build(
             document,
-            tuple(columns),
-            rows,
+            TextTable("", tuple(columns), rows, range(1, len(rows) + 1)),
             images,
             target_document=target_document,
             robot_document=robot_document,
@@ -563,8 +557,7 @@ class Session:
 
 def _build(
     document: Mapping[str, Any],
-    columns: tuple[str, ...],
-    rows: Sequence[TextRow],
+    table: TextTable,
     images: ImageStore,
     *,
     folder: Path | None = None,
@@ -573,8 +566,8 @@ def _build(
     corners: CornerTable | None = None,
 ) -> Session:
     """Builds a session from its content, with all checks."""
-    declaration = read_declaration(document, "session.toml", observed=bool(rows))
-    views = read_views(columns, rows, "views.csv", with_corners=corners is not None)
+    declaration = read_declaration(document, "session.toml", observed=bool(table.rows))
+    columns, views = table.columns, read_views(table, with_corners=corners is not None)
     targets, target_document = read_targets(declaration, folder, target_document)
     several = targets if len(targets) > 1 else {}
     if corners is not None:

@@ -1,6 +1,5 @@
 """streams/NAME.csv: time series beside the views."""
 
-import csv
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,21 +9,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.core.documents.tables import separator_of, with_points
+from visioncal.core.documents.columns import Column, NumberChecks, TableReader
+from visioncal.core.documents.tables import parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, write_atomically
-from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import columns as cols
-from visioncal.session.table import NUMBER
 
 FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
-# Rounding to four digits leaves a unit quaternion's norm within this of 1, as in views.csv.
-_NORM_TOLERANCE = 1e-3
 # Samples are missing where steps exceed this multiple of the median, and this time [s].
 _GAP_RATIO, _GAP_S = 2.5, 0.02
-_SHOWN_PROBLEMS = 10
 # Cells that stand for missing numbers in other programs' tables.
 _NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
 # Units that stamps may be in by mistake, per second.
@@ -114,16 +109,12 @@ def read_streams(folder: Path) -> dict[str, Stream]:
     for path in paths:
         text = read_text_inside(folder, f"{FOLDER}/{path.name}", bytes_left)
         bytes_left -= len(text)
-        streams[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
-        _check_sizes(streams[path.stem], f"{FOLDER}/{path.name}")
+        stream = streams[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
+        checks = _checks(stream, f"{FOLDER}/{path.name}")
+        for name in dict.fromkeys(stream.columns):
+            checks.within(cols.column_of(name))
+        checks.check()
     return streams
-
-
-def _check_sizes(stream: Stream, label: str) -> None:
-    for column in dict.fromkeys(stream.columns):
-        wrong = cols.size_error(column, stream[column])
-        if wrong:
-            raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
 
 
 def parse_stream(text: str, label: str) -> Stream:
@@ -133,12 +124,18 @@ def parse_stream(text: str, label: str) -> Stream:
         DataError: A cell is not a number.
     """
     head, _, body = text.partition("\n")
-    separator = separator_of(head)
-    _, names = next(numbered_rows(head, label, 1, separator), (1, []))
-    columns = tuple(name.strip() for name in names)
-    values, lines = (_read_fast(body, len(columns)) if separator == "," else None), None
+    columns = parse_table(head, label).columns
+    values, lines = None if {*";\t"} & {*head} else _read_fast(body, len(columns)), None
     if values is None:
-        values, lines = _read_cells(body, columns, label, separator)
+        table = parse_table(text, label)
+        columns, reader = table.columns, TableReader(table)
+        values, lines = reader.numbers(*map(Column, columns)), np.array(table.lines, np.int64)
+        missing = reader.unread and {cell.lower() for cell in reader.unread} <= _NONE
+        reader.check(
+            "Leave a cell empty where there is no number; its row then does not count."
+            if missing
+            else "A stream holds numbers alone; leave other columns out."
+        )
     values.setflags(write=False)
     return Stream(columns, values, lines)
 
@@ -153,69 +150,6 @@ def _read_fast(body: str, count: int) -> FloatArray | None:
     except ValueError:
         return None
     return values if values.shape[1] == count and np.isfinite(values).all() else None
-
-
-def _read_cells(
-    body: str, columns: Sequence[str], label: str, separator: str
-) -> tuple[FloatArray, IntArray]:
-    """Reads rows cell by cell, with their lines; raises an error for wrong ones."""
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    problems: list[str] = []
-    wrong: dict[str, list[tuple[int, str]]] = {}
-    for line, cells in numbered_rows(body, label, 2, separator):
-        if not any(cell.strip() for cell in cells):
-            continue
-        if len(problems) >= _SHOWN_PROBLEMS:
-            break
-        if len(cells) != len(columns):
-            problems.append(
-                f"{label}, line {line}: it has {len(cells)} fields, but the header has "
-                f"{len(columns)} columns"
-            )
-            continue
-        texts = [cell.strip() for cell in cells]
-        rows.append([float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in texts])
-        lines.append(line)
-        for name, cell, value in zip(columns, texts, rows[-1], strict=True):
-            if cell and not np.isfinite(value):
-                wrong.setdefault(name, []).append((line, cell))
-    if problems or wrong:
-        shown = [*problems, *_wrong_cells(wrong, label)][:_SHOWN_PROBLEMS]
-        missing = all(cell.lower() in _NONE for of in wrong.values() for _, cell in of)
-        raise DataError(
-            ".\n".join(shown) + ".",
-            culprits=[name.partition(": ")[0] for name in shown],
-            next_step="Leave a cell empty where there is no number; its row then does not count."
-            if wrong and missing
-            else "A stream holds numbers alone; leave other columns out.",
-        )
-    values = np.array(rows, dtype=float).reshape(len(rows), len(columns))
-    return values, np.array(lines, dtype=np.int64)
-
-
-def _wrong_cells(wrong: Mapping[str, Sequence[tuple[int, str]]], label: str) -> Iterator[str]:
-    """Message for each column with cells that are not numbers."""
-    for name, ((line, cell), *others) in wrong.items():
-        more = ""
-        if others:
-            verb = "is" if len(others) == 1 else "are"
-            more = f", nor {verb} {len(others)} more of the column, up to line {others[-1][0]}"
-        yield f"{label}, line {line}, column {name}: {cell!r} is no finite number{more}"
-
-
-def numbered_rows(
-    text: str, label: str, first: int, separator: str = ","
-) -> Iterator[tuple[int, list[str]]]:
-    """Rows with the number of the line in which they end, where the first line is `first`."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-    try:
-        for cells in reader:
-            read = cells if separator == "," else [*with_points(cells)]
-            yield reader.line_num + first - 1, read
-    except csv.Error as error:
-        place = f"{label}, line {reader.line_num + first - 1}"
-        raise DataError(f"{place}: {error}.", culprits=[place]) from error
 
 
 def write_stream(stream: Stream) -> str:
@@ -261,65 +195,26 @@ def check_stream(name: str, stream: Stream) -> None:
         )
     if not len(stream):
         raise DataError(f"{label} has a header row and no samples.", culprits=[label])
-    _check_times(stream, label)
-    for group in (*cols.WHOLE_GROUPS, cols.joint_columns(stream.columns)):
-        _check_whole(stream, group, label)
-    for column in (
-        column for column in stream.columns if column.endswith("_c") and cols.is_number(column)
-    ):
-        wrong = cols.temperature_error(stream[column])
-        if wrong:
-            raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
+    checks = _checks(stream, label)
+    for row in np.flatnonzero(~np.isfinite(stream.stamps_s)).tolist():
+        checks.report(row, STAMP, "it is empty; each row needs its time")
+    for row in (np.flatnonzero(np.diff(stream.stamps_s) <= 0) + 1).tolist():
+        words = "it does not ascend from the row before"
+        step = f"Sort the rows by {STAMP}, and leave out what was recorded twice."
+        checks.report(row, STAMP, words, step)
+    checks.complete(*cols.WHOLE_GROUPS, cols.joint_columns(stream.columns))
+    for name in stream.columns:
+        if name.endswith("_c") and cols.is_number(name):
+            checks.within(cols.column_of(name))
     for group in cols.QUATERNION_GROUPS:
-        rows = np.flatnonzero(_are_no_quaternions(stream, group))
-        if len(rows):
-            raise _wrong_rows(
-                stream, label, rows, f"{group[0]} ... {group[-1]} is no unit quaternion"
-            )
+        checks.unit(group)
+    checks.check()
 
 
-def _check_times(stream: Stream, label: str) -> None:
-    stamps_s = stream.stamps_s
-    missing = np.flatnonzero(~np.isfinite(stamps_s))
-    if len(missing):
-        raise _wrong_rows(stream, label, missing, f"{STAMP} is empty")
-    falls = np.flatnonzero(np.diff(stamps_s) <= 0) + 1
-    if len(falls):
-        raise _wrong_rows(
-            stream,
-            label,
-            falls,
-            f"{STAMP} does not ascend from the row before",
-            f"Sort the rows by {STAMP}, and leave out what was recorded twice.",
-        )
-
-
-def _check_whole(stream: Stream, group: Sequence[str], label: str) -> None:
-    if not group or group[0] not in stream:
-        return
-    filled = np.isfinite(np.stack([stream[name] for name in group], axis=1))
-    rows = np.flatnonzero(filled.any(axis=1) & ~filled.all(axis=1))
-    if len(rows):
-        raise _wrong_rows(stream, label, rows, f"{group[0]} ... {group[-1]} are filled in part")
-
-
-def _are_no_quaternions(stream: Stream, group: Sequence[str]) -> Mask:
-    if group[0] not in stream:
-        return np.zeros(len(stream), dtype=bool)
-    norms = np.linalg.norm(np.stack([stream[name] for name in group], axis=1), axis=1)
-    return np.asarray(np.abs(norms - 1.0) > _NORM_TOLERANCE)
-
-
-def _wrong_rows(
-    stream: Stream, label: str, rows: IntArray, words: str, next_step: str = ""
-) -> DataError:
-    lines = rows + 2 if stream.lines is None else stream.lines[rows]
-    named = [f"line {line}" for line in lines.tolist()]
-    return DataError(
-        f"{label}: {words} in {some_of(named, 3)}.",
-        culprits=[f"{label}, {name}" for name in named[:_SHOWN_PROBLEMS]],
-        next_step=next_step,
-    )
+def _checks(stream: Stream, label: str) -> NumberChecks:
+    lines = range(2, len(stream) + 2) if stream.lines is None else stream.lines.tolist()
+    values = {name: stream[name] for name in stream.columns}
+    return NumberChecks(len(stream), lambda row: f"{label}, line {lines[row]}", values)
 
 
 def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:

@@ -18,7 +18,8 @@ import numpy as np
 
 from visioncal.core import transforms
 from visioncal.core.arguments import typed
-from visioncal.core.documents.tables import TextTable, read_table
+from visioncal.core.documents.columns import Column, TableReader
+from visioncal.core.documents.tables import read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, find_described, is_inside, read_toml
 from visioncal.core.number_format import did_you_mean
@@ -133,23 +134,15 @@ def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
             "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
             culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
         )
-    return {name: _column(table, at) for at, name in enumerate(table.columns)}
-
-
-def _column(table: TextTable, index: int) -> list[Any]:
-    read = int if table.columns[index] in _WHOLE_NUMBERS else float
-    values = []
-    for row, cells in enumerate(table.rows):
-        try:
-            values.append(read(cells[index]))
-        except ValueError:
-            kind = "whole number" if read is int else "number"
-            place = table.place(row)
-            raise DataError(
-                f"{place}, column {table.columns[index]}: {cells[index]!r} is no {kind}.",
-                culprits=[place],
-            ) from None
-    return values
+    reader = TableReader(table)
+    read: dict[str, list[Any]] = {
+        name: reader.whole(name).tolist()
+        if name in _WHOLE_NUMBERS
+        else reader.numbers(Column(name, is_needed=True))[:, 0].tolist()
+        for name in table.columns
+    }
+    reader.check()
+    return read
 
 
 def rig_csv(points: Mapping[str, Sequence[float]]) -> str:

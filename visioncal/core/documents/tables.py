@@ -1,9 +1,14 @@
-"""Text tables: CSV, TSV or blank-separated, with or without header and comments."""
+"""Text tables: CSV, TSV or blank-separated, with or without header and comments.
+
+`parse_table` splits the tables of a session, `read_table` those of other programs; `columns.py`
+reads and checks their cells.
+"""
 
 import csv
 import io
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -32,22 +37,82 @@ class TextTable:
     """A table.
 
     Attributes:
-        path: Its file.
+        label: Its file's name, for messages; empty for a table in memory.
         columns: Names of the columns by the header, or `1`, `2`, ... without one.
+        rows: Cells of the rows.
+        lines: The line of each row in the file, or its number in memory.
         has_header: Whether the names come from the file.
-        rows: Cells of the rows, without surrounding blanks.
-        lines: The line of each row in the file.
     """
 
-    path: Path
+    label: str
     columns: tuple[str, ...]
-    has_header: bool
     rows: tuple[tuple[str, ...], ...]
-    lines: tuple[int, ...]
+    lines: Sequence[int]
+    has_header: bool = True
 
     def place(self, row: int) -> str:
         """Location of a row for messages: `poses.csv, line 3`."""
-        return f"{self.path.name}, line {self.lines[row]}"
+        line = self.lines[row]
+        return f"{self.label}, line {line}" if self.label else f"row {line}"
+
+
+def parse_table(
+    text: str,
+    label: str,
+    most_rows: int = sys.maxsize,
+    most_columns: int = sys.maxsize,
+    next_step: str = "",
+) -> TextTable:
+    """Splits a table with a header row; blank lines are skipped.
+
+    Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
+    commas are read as points, as many spreadsheets write them. Empty columns at the end are
+    dropped. Rows may differ in length; an empty text has no columns.
+
+    Args:
+        text: The text.
+        label: Its name, for messages.
+        most_rows: Largest number of rows.
+        most_columns: Largest number of columns.
+        next_step: Remedy for a larger table.
+
+    Raises:
+        DataError: It is too large, or its quotes do not close.
+    """
+    header = text.lstrip().partition("\n")[0]
+    separator = next((name for name in ";\t" if name in header and "," not in header), ",")
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    for line, cells in _split(text, label, separator):
+        if any(cell.strip() for cell in cells):
+            rows.append(tuple(cells) if separator == "," else _with_points(cells))
+            lines.append(line)
+            if len(rows) > most_rows + 1 or len(rows[0]) > most_columns:
+                raise DataError(
+                    f"{label} has more than {most_rows:,} rows"
+                    + (f" or {most_columns:,} columns." if most_columns < sys.maxsize else "."),
+                    culprits=[label],
+                    next_step=next_step,
+                )
+    names, *filled = _without_margin(rows) if rows else [()]
+    columns = tuple(name.strip() for name in names)
+    return TextTable(label, columns, tuple(filled), lines[1:])
+
+
+def _split(text: str, label: str, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """The line in which each row begins, and its cells."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
+    line = 1
+    try:
+        for cells in reader:
+            yield line, cells
+            line = reader.line_num + 1
+    except csv.Error as error:
+        raise DataError(
+            f"{label}, line {line}: {error}.",
+            culprits=[f"{label}, line {line}"],
+            next_step='A field that holds a comma or a "quote" is put in quotes, "" inside.',
+        ) from error
 
 
 def is_number(cell: str) -> bool:
@@ -90,7 +155,7 @@ def read_table(path: Path) -> TextTable:
         raise too_many(where)
     numbers = [at for at, _ in lines]
     cells = [_cells(line, separator, f"{where}, line {at}") for at, line in lines]
-    rows = without_margin(cells)
+    rows = _without_margin(cells)
     columns = rows[0] if not any(is_number(row) for row in rows[0]) else None
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
@@ -107,7 +172,7 @@ def read_table(path: Path) -> TextTable:
                 next_step="Where commas are decimal, separate the columns by semicolons or tabs.",
             )
     named = tuple(columns or (str(at) for at in range(1, width + 1)))
-    return TextTable(path, _unique(named, where), columns is not None, tuple(rows), tuple(numbers))
+    return TextTable(path.name, _unique(named, where), tuple(rows), numbers, columns is not None)
 
 
 def _without_brackets(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
@@ -125,33 +190,28 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
     except (csv.Error, ValueError) as error:
         raise DataError(f"{where}: {error}.", culprits=[where]) from error
     stripped = tuple(cell.strip() for cell in cells)
-    return with_points(stripped) if separator in ";\t" else stripped
+    return _with_points(stripped) if separator in ";\t" else stripped
 
 
-def without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+def _without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     """Rows without trailing columns of the first row that are empty in all rows.
 
     Spreadsheets write them for cells that were cleared. Cells beyond the first row's are kept.
     """
+    width = len(rows[0])
+    if width and rows[0][-1].strip():
+        return [*rows]
     filled = max(
         (at for row in rows for at, name in enumerate(row, start=1) if name.strip()), default=0
     )
-    return [row[:filled] + row[max(filled, len(rows[0])) :] for row in rows]
+    return [row[:filled] + row[max(filled, width) :] for row in rows]
 
 
-def with_points(cells: Sequence[str]) -> tuple[str, ...]:
+def _with_points(cells: Sequence[str]) -> tuple[str, ...]:
     """Cells with decimal commas replaced by points."""
     return tuple(
         cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
     )
-
-
-def separator_of(header: str) -> str:
-    """The separator of a header: a comma where it has any, else a semicolon or tab.
-
-    Spreadsheets in languages with a decimal comma write semicolons.
-    """
-    return next((name for name in ";\t" if name in header and "," not in header), ",")
 
 
 def _header_in_comments(

@@ -78,7 +78,7 @@ def read_fields(path: Path) -> Fields:
             culprits=[str(path)],
             next_step="Convert the folder.",
         )
-    return fields_of_table(table)
+    return fields_of_table(table, path)
 
 
 def read_document(path: Path) -> object:

@@ -133,13 +133,13 @@ class Fields:
         return some_of(words, _MOST_LISTED)
 
 
-def fields_of_table(table: TextTable) -> Fields:
+def fields_of_table(table: TextTable, path: Path) -> Fields:
     """Reads the columns of a table; a column of numbers in all filled cells becomes numeric.
 
     Stacked or adjacent 4 x 4 matrices give a row each, and so do alternating rows of robot and
     camera poses.
     """
-    if matrices := _stacked_matrices(table) or _alternating_rows(table):
+    if matrices := _stacked_matrices(table, path) or _alternating_rows(table, path):
         return matrices
     columns = list(zip(*table.rows, strict=True))
     texts = dict(zip(table.columns, columns, strict=True))
@@ -149,10 +149,10 @@ def fields_of_table(table: TextTable) -> Fields:
         if any(cells) and all(not cell or is_number(cell) for cell in cells)
     }
     places = tuple(table.place(index) for index in range(len(table.rows)))
-    return Fields(table.path.stem, table.path.parent, places, numbers, texts)
+    return Fields(path.stem, path.parent, places, numbers, texts)
 
 
-def _stacked_matrices(table: TextTable) -> Fields | None:
+def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     """Reads 4 x 4 matrices stacked below each other, or side by side in four rows."""
     height, width = len(table.rows), len(table.columns)
     count = height * width // 16
@@ -166,12 +166,12 @@ def _stacked_matrices(table: TextTable) -> Fields | None:
     )
     if not (matrices[:, 3] == [0, 0, 0, 1]).all():
         return None
-    places = tuple(f"{table.path.name}, matrix {at}" for at in range(1, count + 1))
+    places = tuple(f"{table.label}, matrix {at}" for at in range(1, count + 1))
     rows = {"matrix": matrices.reshape(count, 16)}
-    return Fields(table.path.stem, table.path.parent, places, rows)
+    return Fields(path.stem, path.parent, places, rows)
 
 
-def _alternating_rows(table: TextTable) -> Fields | None:
+def _alternating_rows(table: TextTable, path: Path) -> Fields | None:
     """Reads alternating rows whose first cell labels them as robot or camera."""
     labels = [row[0] for row in table.rows]
     cells = [row[1:] for row in table.rows]
@@ -187,7 +187,7 @@ def _alternating_rows(table: TextTable) -> Fields | None:
     }
     poses = {name: arrays[at::2] for name, at in offsets.items()}
     places = tuple(table.place(at) for at in range(0, len(labels), 2))
-    return Fields(table.path.stem, table.path.parent, places, poses)
+    return Fields(path.stem, path.parent, places, poses)
 
 
 def fields_of_records(

@@ -18,7 +18,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 )
 from visioncal.calibration.pipeline.misread_poses import session_is_mirrored
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
-from visioncal.core.documents.tables import is_number
+from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
@@ -35,7 +35,7 @@ from visioncal.session.columns import (
     position_columns,
 )
 from visioncal.session.corners import CornerTable
-from visioncal.session.table import TextRow, parse_csv
+from visioncal.session.table import parse_csv
 from visioncal.vision.targets import LARGEST_M
 
 # Least number and correlation of pose steps by which joints and poses are of one log.
@@ -189,7 +189,7 @@ class _PoseTable:
         robot: The poses as they are written.
     """
 
-    plain: tuple[tuple[str, ...], tuple[TextRow, ...]]
+    plain: TextTable
     robot: PoseNumbers
 
 
@@ -197,7 +197,8 @@ def _other_columns(folder: Path) -> _PoseTable | None:
     """Reads positions and rotations of other columns or forms; None where there are none."""
     if not (folder / "views.csv").is_file():
         return None
-    columns, rows = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
+    table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
+    columns = table.columns
     position_names = position_columns(columns) or POSITION
     exact_names = {name.lower(): name for name in columns}
     complete = (
@@ -208,7 +209,7 @@ def _other_columns(folder: Path) -> _PoseTable | None:
     rotation_names = QUATERNION if set(QUATERNION) <= set(columns) else next(complete, ())
     if not rotation_names or not {*position_names} <= {*columns}:
         return None
-    cells = [dict(zip(columns, row.cells, strict=False)) for row in rows]
+    cells = [dict(zip(columns, row, strict=False)) for row in table.rows]
     numbers = [
         [_number(row.get(name, "")) for name in (*position_names, *rotation_names)] for row in cells
     ]
@@ -225,12 +226,13 @@ def _other_columns(folder: Path) -> _PoseTable | None:
         form = "euler-xyz-deg" if largest > _LARGEST_RAD else "rotation-vector"
     kept = [name for name in columns if name not in {*position_names, *rotation_names}]
     plain = []
-    for row, row_cells, position in zip(rows, cells, positions, strict=True):
+    for row_cells, position in zip(cells, positions, strict=True):
         has_position = np.isfinite(position).all()
         pose = [*map(repr, position.tolist()), *_IDENTITY] if has_position else [""] * len(POSE)
-        plain.append(replace(row, cells=(*(row_cells.get(name, "") for name in kept), *pose)))
-    robot = PoseNumbers(positions, rotations, Reading(form), tuple(row.where for row in rows))
-    return _PoseTable(((*kept, *POSE), tuple(plain)), robot)
+        plain.append((*(row_cells.get(name, "") for name in kept), *pose))
+    places = tuple(map(table.place, range(len(table.rows))))
+    robot = PoseNumbers(positions, rotations, Reading(form), places)
+    return _PoseTable(replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot)
 
 
 def _number(cell: str) -> float:

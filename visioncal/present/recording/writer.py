@@ -7,6 +7,7 @@ from typing import Self
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.choices import ImagesKept
+from visioncal.core.documents.tables import TextTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, replacing_file, sha256
 from visioncal.present.recording import codec
@@ -17,7 +18,7 @@ from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.checks import check_images_can_be_used
-from visioncal.session.table import TextRow, View, read_views
+from visioncal.session.table import View, read_views
 
 
 class RecordingWriter:
@@ -157,8 +158,8 @@ class RecordingWriter:
     def _checked(self, cells: Sequence[str]) -> View:
         """Checks a row: it must be readable again."""
         where, corners = self._where, self._session.corner_table is not None
-        rows = [TextRow(where, tuple(cells))]
-        (view,) = read_views(self._session.columns, rows, "views.csv", with_corners=corners)
+        table = TextTable("", self._session.columns, (tuple(cells),), (len(self._numbers) + 1,))
+        (view,) = read_views(table, with_corners=corners)
         check_images_can_be_used(self._session.declaration, [view])
         if view.number in self._numbers:
             raise DataError(

@@ -2,27 +2,25 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.documents import TextTable, is_number, read_table
+from visioncal.core.documents import TextTable, read_table
+from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.results.compensation.correction import FAR_M, WIDE_RAD, Corrected
 from visioncal.robot import Robot
-from visioncal.session.columns import POSE, joint_columns
+from visioncal.session.columns import POSE, QUATERNION, joint_columns
 
 # Columns of a corrected table.
 ADDED = ("moved_mm", "moved_deg", "sigma_mm", "off_deg")
-# Rounding to four digits leaves a unit quaternion's norm within this of 1.
-_NORM_TOLERANCE = 1e-3
-_SHOWN = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +55,49 @@ def read_targets(path: Path, robot: Robot) -> Targets:
             and radians.
     """
     table = read_table(path)
-    _check_columns(table)
-    places = tuple(table.place(index) for index in range(len(table.rows)))
-    poses = _numbers(table, POSE, needed=True)
-    _check_poses(poses, places)
-    turns = Rotation.from_quat(poses[:, 3:]).as_matrix()
-    return Targets(table, places, compose(turns, poses[:, :3]), _seeds(table, places, robot))
+    _check_columns(table, robot)
+    reader = TableReader(table)
+    poses = reader.numbers(*(Column(name, is_needed=True) for name in POSE))
+    joints = joint_columns(table.columns)
+    seeds = np.full((len(poses), robot.joint_count), np.nan)
+    if joints:
+        seeds = reader.numbers(*map(Column, joints))
+        reader.complete(joints)
+    reader.check()
+    places = tuple(map(table.place, range(len(poses))))
+    distances = np.linalg.norm(poses[:, :3], axis=1)
+    turns = np.where(robot.chain.prismatic, 0.0, np.abs(np.nan_to_num(seeds))).max(axis=1)
+    for sizes, most, words, step in (
+        (
+            distances,
+            FAR_M,
+            f"its position is {{:.4g}} m from the base, and no arm reaches "
+            f"{FAR_M:g} m: these look like millimetres",
+            "Write metres.",
+        ),
+        (
+            turns,
+            WIDE_RAD,
+            "a joint stands at {:.4g} rad, more than two turns: these look like degrees",
+            "Write radians.",
+        ),
+    ):
+        beyond = np.flatnonzero(sizes > most).tolist()
+        if beyond:
+            raise DataError(
+                f"{places[beyond[0]]}: {words.format(sizes[beyond[0]])}.",
+                culprits=[places[row] for row in beyond],
+                next_step=step,
+            )
+    # After the units, since a table with exchanged columns has wrong norms as well.
+    reader.unit(QUATERNION)
+    reader.check()
+    rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    return Targets(table, places, compose(rotations, poses[:, :3]), seeds)
 
 
-def _check_columns(table: TextTable) -> None:
-    name, columns = table.path.name, table.columns
+def _check_columns(table: TextTable, robot: Robot) -> None:
+    name, columns = table.label, table.columns
     done = [name for name in ADDED if name in columns]
     if done:
         raise DataError(
@@ -86,78 +117,13 @@ def _check_columns(table: TextTable) -> None:
             if other
             else f"{hint} A header row names x_m, y_m, z_m [m] and qx, qy, qz, qw.".strip(),
         )
-
-
-def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatArray:
-    """(m, k) numbers of columns; a row may leave all of them empty unless they are needed."""
-    at = [table.columns.index(name) for name in names]
-    values = np.full((len(table.rows), len(names)), np.nan)
-    problems: list[tuple[str, str]] = []
-    for row, cells in enumerate(table.rows):
-        chosen = [cells[index] for index in at]
-        if not needed and not any(chosen):
-            continue
-        for column, cell in enumerate(chosen):
-            value = float(cell) if is_number(cell) else np.nan
-            values[row, column] = value
-            if not np.isfinite(value):
-                words = f"{table.place(row)}: {names[column]} is {cell[:40]!r}"
-                problems.append((table.place(row), words))
-    if problems:
-        more = len(problems) - _SHOWN
-        shown = [name for _, name in problems[:_SHOWN]] + ([f"and {more} more"] if more > 0 else [])
+    joints, wanted = joint_columns(columns), joint_names(robot)
+    if joints not in ((), wanted):
         raise DataError(
-            f"{'; '.join(shown)}: finite numbers are needed"
-            f"{'' if needed else ', or none at all in that row'}.",
-            culprits=[name for name, _ in problems],
-        )
-    return values
-
-
-def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
-    distances = np.linalg.norm(poses[:, :3], axis=1)
-    far = np.flatnonzero(distances > FAR_M).tolist()
-    if far:
-        raise DataError(
-            f"{places[far[0]]}: its position is {distances[far[0]]:.4g} m from the base, and no "
-            f"arm reaches {FAR_M:g} m: these look like millimetres.",
-            culprits=[places[index] for index in far],
-            next_step="Write metres.",
-        )
-    norms = np.linalg.norm(poses[:, 3:], axis=1)
-    off = np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist()
-    if off:
-        raise DataError(
-            f"{places[off[0]]}: the quaternion's norm is {norms[off[0]]:.6g}, but must be 1 to "
-            f"within {_NORM_TOLERANCE:g}.",
-            culprits=[places[index] for index in off],
-            next_step="qx, qy, qz, qw are a unit quaternion, w last.",
-        )
-
-
-def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
-    names = joint_columns(table.columns)
-    wanted = joint_names(robot)
-    if not names:
-        return np.full((len(places), len(wanted)), np.nan)
-    if names != wanted:
-        raise DataError(
-            f"{table.path.name}: its joints are {', '.join(names)}; {robot.name} has "
-            f"{', '.join(wanted)}.",
-            culprits=names,
+            f"{name}: its joints are {', '.join(joints)}; {robot.name} has {', '.join(wanted)}.",
+            culprits=joints,
             next_step="Name one for each joint, or none.",
         )
-    seeds = _numbers(table, names, needed=False)
-    turns = np.where(robot.chain.prismatic, 0.0, np.abs(np.nan_to_num(seeds))).max(axis=1)
-    wide = np.flatnonzero(turns > WIDE_RAD).tolist()
-    if wide:
-        raise DataError(
-            f"{places[wide[0]]}: a joint stands at {turns[wide[0]]:.4g} rad, more than two turns: "
-            "these look like degrees.",
-            culprits=[places[index] for index in wide],
-            next_step="Write radians.",
-        )
-    return seeds
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:

@@ -1,0 +1,288 @@
+"""Columns declared as data, read and checked with all problems of their table in one error."""
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from visioncal.core.documents.tables import TextTable
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.verdict import READ_AGAIN
+
+# Tolerance of a quaternion's norm, for four digits.
+_NORM_TOLERANCE = 1e-3
+# Smallest number of rows with wrong norms, and largest norm of them, from which they are taken for
+# another form of rotation; norms beyond the last are of angles in degrees.
+_FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
+_SHOWN_PROBLEMS = 10
+# Stricter than float(), which also accepts 1_000, nan, and digits of other scripts.
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+_DECIMAL = re.compile(r"[+-]?[0-9]*\.[0-9]+([eE][+-]?[0-9]+)?")
+# Quoted values and numbers, which differ between problems of one kind.
+_VALUES = re.compile(r"'[^']*'|[0-9.]+")
+_LINE = re.compile(r", line ([0-9]+)")
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers: its name, the range of its values, and the message for one beyond."""
+
+    name: str
+    least: float = -math.inf
+    most: float = math.inf
+    words: Callable[[float], str] = "{:g} is out of its range".format
+    is_needed: bool = False
+
+    def fault(self, value: float) -> str:
+        """Message for a value out of the range; empty for others."""
+        return self.words(value) if value < self.least or value > self.most else ""
+
+
+@dataclass(frozen=True)
+class TableProblem:
+    """Problem of a table, with its place."""
+
+    place: str
+    words: str
+    norm: float | None = None  # of a quaternion
+    step: str = ""  # remedy other than correcting the table
+
+
+class NumberChecks:
+    """Checks of numeric columns, (n,) each with NaN where empty, which collect their problems."""
+
+    def __init__(
+        self, count: int, place: Callable[[int], str], values: Mapping[str, FloatArray]
+    ) -> None:
+        self.count, self.place, self.values = count, place, dict(values)
+        self._problems: list[tuple[int, TableProblem]] = []
+        self._wrong: set[int] = set()
+
+    def report(
+        self, row: int, column: str, words: str, step: str = "", norm: float | None = None
+    ) -> None:
+        """Adds a problem of a row, by its index, and of a column; empty for the whole row."""
+        place = self.place(row) + (f", column {column}" if column else "")
+        self._problems.append((row, TableProblem(place, words, norm, step)))
+        self._wrong.add(row)
+
+    def is_sound(self, row: int) -> bool:
+        """Whether no problem of a row is known yet."""
+        return row not in self._wrong
+
+    def filled(self, row: int, name: str) -> bool:
+        """Whether a row has a number in a column."""
+        return name in self.values and not math.isnan(self.values[name][row])
+
+    def within(self, column: Column) -> None:
+        """Checks the range of a column."""
+        values = self.values[column.name]
+        for row in np.flatnonzero((values < column.least) | (values > column.most)).tolist():
+            self.report(row, column.name, column.words(float(values[row])))
+
+    def complete(self, *groups: Sequence[str], first_only: Sequence[str] = ()) -> None:
+        """Checks that sound rows fill all columns of each group or none.
+
+        Of the group `first_only`, its first columns alone are allowed.
+        """
+        wrong = np.isin(np.arange(self.count), list(self._wrong))
+        for group in (*groups, first_only):
+            names = [name for name in group if name in self.values]
+            if not names:
+                continue
+            there = np.isfinite([self.values[name] for name in names]).T
+            counts = there.sum(axis=1)
+            wanted = counts if group is first_only else np.where(counts > 0, len(names), 0)
+            short = ~there & (np.arange(len(names)) < wanted[:, None])
+            for row in np.flatnonzero(short.any(axis=1) & ~wrong).tolist():
+                other = names[0] if there[row, 0] else names[int(np.argmax(there[row]))]
+                self.report(
+                    row,
+                    names[int(np.argmax(short[row]))],
+                    f"it is empty while {other} is filled; a row fills all of "
+                    f"{names[0]} ... {names[-1]} or none",
+                )
+
+    def unit(self, names: Sequence[str]) -> None:
+        """Checks that quaternions, in four columns, are of unit length."""
+        if not all(name in self.values for name in names):
+            return
+        # hypot does not overflow.
+        norms = np.hypot.reduce([self.values[name] for name in names])
+        for row in np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist():
+            norm = float(norms[row])
+            self.report(
+                row,
+                f"{names[0]} ... {names[-1]}",
+                f"the quaternion's norm is {norm:.6g}, but must be 1 to within {_NORM_TOLERANCE:g}",
+                norm=norm,
+            )
+
+    def check(self, next_step: str = "") -> None:
+        """Raises one DataError for all problems, by rows, if there are any.
+
+        `next_step` replaces the general remedy, to correct the table.
+        """
+        if self._problems:
+            ordered = sorted(self._problems, key=lambda problem: problem[0])
+            raise problems_error([problem for _, problem in ordered], next_step)
+
+
+class TableReader(NumberChecks):
+    """Reader of a table's columns.
+
+    Rows with another number of cells than the header are problems, and are left out: row indices
+    and arrays are of the `count` others. `unread` has the cells that could not be converted.
+    """
+
+    def __init__(self, table: TextTable) -> None:
+        width = len(table.columns)
+        self._rows = [at for at, cells in enumerate(table.rows) if len(cells) == width]
+        super().__init__(len(self._rows), lambda row: table.place(self._rows[row]), {})
+        cells = list(zip(*(table.rows[at] for at in self._rows), strict=True)) or [()] * width
+        self.cells: Mapping[str, tuple[str, ...]] = dict(zip(table.columns, cells, strict=True))
+        self.unread: set[str] = set()
+        following = 0
+        for at, row in enumerate(table.rows):
+            following += len(row) == width
+            if len(row) != width:
+                words = f"it has {len(row)} fields, but the header has {width} columns"
+                step = ""
+                if len(row) > width and not any(_DECIMAL.fullmatch(cell.strip()) for cell in row):
+                    words += "; decimal commas may be the cause"
+                    step = (
+                        "Write decimal points; or separate the cells of all lines by semicolons, "
+                        "and decimal commas are read, too."
+                    )
+                # Before the problems of the next row that is read.
+                problem = TableProblem(table.place(at), words, step=step)
+                self._problems.append((following, problem))
+
+    def texts(self, name: str) -> list[str]:
+        """(count,) cells of a column, without surrounding blanks; empty where there is none."""
+        cells = self.cells.get(name)
+        return [""] * self.count if cells is None else [cell.strip() for cell in cells]
+
+    def read(self, name: str, convert: Callable[[str], _T], needed: str = "") -> list[_T | None]:
+        """(count,) converted cells; None where one is empty, or `convert` raises a DataError.
+
+        `needed` names what every row has to have; empty where rows may be without.
+        """
+        values: list[_T | None] = []
+        for row, cell in enumerate(self.texts(name)):
+            value = None
+            try:
+                value = convert(cell) if cell else None
+            except DataError as error:
+                self.report(row, name, error.message.rstrip("."), error.next_step)
+                self.unread.add(cell)
+            if not cell and needed:
+                self.report(row, name, f"it is empty; {needed} is needed")
+            values.append(value)
+        return values
+
+    def whole(self, name: str) -> IntArray:
+        """(count,) whole numbers of a column that every row fills; 0 where one is wrong."""
+        read = self.read(name, as_whole, "a whole number")
+        return np.array([value or 0 for value in read], dtype=np.int64)
+
+    def numbers(self, *columns: Column) -> FloatArray:
+        """(count, k) finite numbers of columns within their ranges; NaN where empty or wrong."""
+        for column in columns:
+            read = self.read(column.name, as_number, "a number" if column.is_needed else "")
+            self.values[column.name] = np.array(
+                [math.nan if value is None else value for value in read], dtype=float
+            )
+            self.within(column)
+        return np.array([self.values[column.name] for column in columns]).T.reshape(
+            self.count, len(columns)
+        )
+
+
+def as_number(cell: str) -> float:
+    """Reads a finite number.
+
+    Raises:
+        DataError: It is not one.
+    """
+    value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+    if not math.isfinite(value):
+        why = " (the decimal sign is a point)" if "," in cell else ""
+        if _THOUSANDS.fullmatch(cell):
+            why = " (write it without commas between thousands)"
+        elif "\u2212" in cell:
+            why = " (its minus sign is a typographic one; write -)"
+        raise DataError(f"{cell[:60]!r} is no finite number{why}")
+    return value
+
+
+def as_whole(cell: str) -> int:
+    """Reads a whole number, also as `3.0`, which some programs write.
+
+    Raises:
+        DataError: It is not one.
+    """
+    cell = cell.removesuffix(".0")
+    if not _INTEGER.fullmatch(cell) or len(cell) > 18:
+        raise DataError(f"{cell[:60]!r} is no whole number")
+    return int(cell)
+
+
+def problems_error(problems: Sequence[TableProblem], next_step: str = "") -> DataError:
+    """Error that lists the first ten problems of a table, or kinds of them."""
+    norms = [problem.norm for problem in problems if problem.norm is not None]
+    if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
+        degrees = max(norms) > _ANGLES_RAD
+        return DataError(
+            f"{problems[0].place} and {len(norms) - 1} more: these are no quaternions but, as it "
+            f"seems, {'Euler angles in degrees' if degrees else 'rotation vectors or Euler angles'}"
+            f": their norms are {min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
+            culprits=[problems[0].place],
+            next_step=f"The images show which. {READ_AGAIN}",
+        )
+    where = problems[0].place.partition(", column ")[0]
+    step = f"Correct it, or delete {where}."
+    if len(problems) > 1:
+        columns = dict.fromkeys(problem.place.partition(", column ")[2] for problem in problems)
+        step = ""
+        if len(columns) == 1 and "" not in columns:
+            step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
+    steps = {problem.step for problem in problems}
+    if len(steps) == 1:
+        step = steps.pop() or next_step or step
+    if len(problems) <= _SHOWN_PROBLEMS:
+        lines = [f"{problem.place}: {problem.words}." for problem in problems]
+        return DataError(
+            "\n".join(lines), culprits=[problem.place for problem in problems], next_step=step
+        )
+    kinds: dict[tuple[str, str], list[TableProblem]] = defaultdict(list)
+    for problem in problems:
+        column = problem.place.partition(", column ")[2]
+        kinds[column, _VALUES.sub("", problem.words)].append(problem)
+    shown = list(kinds.values())[:_SHOWN_PROBLEMS]
+    lines = []
+    for alike in shown:
+        last = alike[-1].place.partition(", column ")[0]
+        more = f" And {len(alike) - 1} more alike, up to {last}." if len(alike) > 1 else ""
+        lines.append(f"{alike[0].place}: {alike[0].words}.{more}")
+    if len(kinds) > len(shown):
+        lines.append(f"And {len(kinds) - len(shown)} more of other kinds.")
+    named = [alike[0] for alike in shown] if all(map(_are_consecutive, shown)) else problems
+    culprits = [problem.place for problem in named[:_SHOWN_PROBLEMS]]
+    return DataError("\n".join(lines), culprits=culprits, next_step=step)
+
+
+def _are_consecutive(alike: Sequence[TableProblem]) -> bool:
+    """Whether problems are in all lines from the first to the last."""
+    lines = [match for problem in alike if (match := _LINE.search(problem.place))]
+    numbers = [int(match[1]) for match in lines]
+    return len(numbers) == len(alike) and numbers[-1] - numbers[0] == len(alike) - 1
