@@ -19,7 +19,6 @@ from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports import document
 from visioncal.live.planning.information import stop_factors
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.results.compensation.correction import correct
 from visioncal.robot import Loads, load_robot
 from visioncal.simulation import CellOptions, Payload, simulate
 
@@ -79,18 +78,6 @@ def test_the_calibrated_arm_stands_where_the_real_one_does_under_any_load(carryi
     assert np.abs(moved - real[:, :3, 3]).max() < 0.03 * np.abs(real[:, :3, 3]).max()
     with pytest.raises(DataError, match="payload of -1 kg"):
         result.base_from_flange(q, payload_kg=-1.0)
-
-
-def test_corrected_targets_bring_the_bent_arm_to_its_place(carrying):
-    result = result_of(carrying[1])
-    q = postures(load_robot("ur10e"))[:5]
-    wanted = result.base_from_flange(q, payload_kg=6.0, payload_m=(0, 0, 0.1)).as_matrix()
-    loads = Loads.alike(len(q), 6.0, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
-    sent = correct(result, wanted, q, loads=loads)
-    assert sent.reached.all()
-    # Three looks at a bent cobot leave some tenths of a microradian.
-    assert sent.q == pytest.approx(q, abs=2e-6)
-    assert correct(result, wanted, q).q != pytest.approx(q, abs=1e-4)
 
 
 def test_files_of_others_say_that_they_hold_no_springs(carrying):

@@ -1,6 +1,5 @@
 """Arms whose joints err by functions of their angles: what is found of them, and how sure."""
 
-import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -20,11 +19,8 @@ from visioncal.calibration.verification.prediction import predict_detected
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
-from visioncal.interchange.exports import Selection, document
 from visioncal.results import Calibration
 from visioncal.results.arm import ArmResult
-from visioncal.robot import Robot
-from visioncal.robot.inverse import Inverse
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (
     InstrumentOptions,
@@ -169,46 +165,6 @@ def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
         # Stops reach to 2.5 rad; beyond, little more is known than beforehand.
         assert sigma[np.abs(angles) < 2.0].mean() < 0.5 * sigma[np.abs(angles) > 2.9].mean()
     assert 0.3 < np.mean(ratios) < 2.0
-
-
-def test_corrections_send_each_joint_to_where_it_is_wanted(known):
-    result = result_of(known)
-    written = document(result, "joint-corrections")
-    assert "Without it the flange of that arm is off by up to" in written.warnings[0]
-    lines = [line for line in written.text.splitlines() if not line.startswith("#")]
-    assert lines[0] == "joint,angle_deg,correction_deg,sigma_deg"
-    table = np.array([[float(part) for part in line.split(",")[1:]] for line in lines[1:]])
-    degrees, corrections, sigmas = table.reshape(6, 360, 3).transpose(2, 1, 0)
-    chain = result.arm.robot.chain
-    stood = chain.effective(np.deg2rad(degrees + corrections))
-    plain = chain.functions[:, 0] + np.deg2rad(degrees)
-    # Written to a millionth of a degree.
-    np.testing.assert_allclose(stood, plain, atol=2e-8)
-    assert (sigmas > 0.0).all()
-
-
-def test_targets_by_links_and_their_table_are_those_of_correct(known):
-    result, q = result_of(known), 0.9 * Q[:20]
-    wanted = known.robot.base_from_flange(q)
-    sent = correct(result, wanted, q).q
-    links = document(result, "robot-dh", Selection(with_corrections=True))
-    inverse = Inverse(Robot.from_document(tomllib.loads(links.text)))
-    angles = np.array([inverse.solve(*pair).positions for pair in zip(wanted, q, strict=True)])
-    text = document(result, "joint-corrections").text
-    rows = [line.split(",") for line in text.splitlines() if not line.startswith("#")][1:]
-    tables = [
-        np.array([row[1:3] for row in rows if row[0] == joint], dtype=float).T
-        for joint in result.robot.joint_names
-    ]
-    added = [
-        np.interp(np.rad2deg(column), *table)
-        for column, table in zip(angles.T, tables, strict=True)
-    ]
-    by_table = angles + np.deg2rad(np.column_stack(added))
-    apart = result.standing(sent) - result.standing(by_table)
-    # Between whole degrees a function of 0.25 rad departs from a line by 2e-7 rad; what the joints
-    # yield to the arm's own weight is in the links as far as they can hold it.
-    assert np.linalg.norm(apart[:, :3, 3], axis=1).max() < 5e-5
 
 
 def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):

@@ -82,14 +82,6 @@ def test_a_point_that_was_skipped_is_found_in_a_longer_drawing(drawn):
     assert found.words(NAMES[:drawn]) == "numbers are shifted by 1: P2 is P3, P3 is P4, P4 is P5"
 
 
-def test_points_that_were_measured_twice_are_no_other_order():
-    rng = np.random.default_rng(2)
-    nominal = np.repeat(some_drawing(rng, 4), 2, axis=0)
-    found = find_numbering(measured(nominal, np.arange(8), rng), nominal)
-    assert not len(found.moved)
-    assert found.is_unique
-
-
 def test_what_is_known_of_the_noise_counts_in_its_favour():
     rng = np.random.default_rng(3)
     # Nearly equal sides: exchanged, the triangle fits to 0.6 mm.

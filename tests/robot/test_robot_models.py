@@ -2,11 +2,10 @@
 
 import json
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from support.urdf_arm import URDF, of_urdf, some_changes, some_joints
+from support.urdf_arm import of_urdf, some_changes, some_joints
 
 from visioncal.core.documents import read_yaml
 from visioncal.core.errors import DataError
@@ -18,9 +17,6 @@ from visioncal.robot import (
     robot_file,
     robot_names,
     small_urdf,
-    table_from_document,
-    table_of,
-    table_toml,
     unexportable_functions,
     ur_kinematics_yaml,
 )
@@ -136,48 +132,6 @@ def test_a_wrong_chain_is_refused_by_field(field: str, value, words: str) -> Non
     assert "shoulder_lift_joint" in str(caught.value)
 
 
-@pytest.mark.parametrize("robot", robots())
-def test_a_small_urdf_is_the_same_arm(robot: Robot) -> None:
-    placements, functions = some_changes(robot)
-    functions[:, 1:] = 0.0
-    corrected = robot.corrected(placements, functions)
-    document = {"schema": 1, "name": "x", "tip": robot.tip, "urdf": small_urdf(corrected)}
-    again, q = Robot.from_document(document), some_joints(robot)
-    assert (again.joint_names, again.tip) == (robot.joint_names, robot.tip)
-    np.testing.assert_allclose(again.lower_rad, robot.lower_rad)
-    # Angles of a rotation, written and read again, over some eight joints.
-    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
-
-
-def without_origins(urdf: str) -> list[tuple[str, dict[str, str]]]:
-    """Elements in order, without the origins of joints."""
-    root = ElementTree.fromstring(urdf)
-    for joint in root.iterfind("joint"):
-        for origin in joint.findall("origin"):
-            joint.remove(origin)
-    return [(element.tag, element.attrib) for element in root.iter()]
-
-
-@pytest.mark.parametrize("tip", ["flange", "mount", "d", "bend"])
-def test_a_given_urdf_changes_in_its_origins_alone(tip: str) -> None:
-    robot = of_urdf(tip)
-    placements, functions = some_changes(robot)
-    functions[:, 1:] = 0.0
-    corrected = robot.corrected(placements, functions)
-    text = corrected_urdf(robot, corrected)
-    # A joint that moves cannot place the tip behind it.
-    held = tip if tip in ("flange", "mount") else f"{tip}_corrected"
-    again = Robot.from_document({"schema": 1, "name": "x", "tip": held, "urdf": text})
-    q = some_joints(robot)
-    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
-    kept, added = without_origins(URDF), without_origins(text)
-    rest = iter(added)
-    assert all(element in rest for element in kept)  # in their order
-    assert len(added) - len(kept) == (0 if held == tip else 4)
-    assert text.count("9 9 9") == text.count("kept: inside") == 1
-    assert without_origins(corrected_urdf(robot, robot)) == kept
-
-
 def test_what_a_urdf_cannot_hold_is_said() -> None:
     robot = of_urdf()
     corrected = other(robot)
@@ -191,17 +145,6 @@ def test_what_a_urdf_cannot_hold_is_said() -> None:
         Robot.from_document({"schema": 1, "name": "x", "tip": "flange", "urdf": text})
     with pytest.raises(DataError, match="a robot of a URDF"):
         corrected_urdf(load_robot("ur5"), load_robot("ur5"))
-
-
-def test_a_table_is_written_with_all_that_was_found(tmp_path: Path) -> None:
-    robot = load_robot("ur5e")
-    corrected = other(robot)
-    nominal = table_from_document(robot.document)
-    table = table_of(corrected, "hayati", like=nominal)
-    (tmp_path / "mine.toml").write_text(table_toml(table, "a calibration"))
-    again, q = load_robot("mine.toml", folder=tmp_path), some_joints(robot)
-    # Lengths of a metre through some twenty products.
-    np.testing.assert_allclose(again.base_from_flange(q), corrected.base_from_flange(q), atol=1e-13)
 
 
 # What ur_description's config/ur5e/default_kinematics.yaml holds, pi / 2 in full.
@@ -232,39 +175,6 @@ def test_the_kinematics_of_urs_driver_are_those_of_its_description(
     for link, numbers in UR5E_KINEMATICS.items():
         found = [content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")]
         np.testing.assert_allclose(found, numbers, atol=1e-12)  # rounding of half turns
-
-
-def test_the_kinematics_of_urs_driver_hold_a_corrected_arm(tmp_path: Path) -> None:
-    robot = load_robot("ur10e")
-    placements, functions = some_changes(robot)
-    functions[:, 1:] = 0.0
-    corrected = robot.corrected(placements, functions)
-    path = tmp_path / "kinematics.yaml"
-    text = ur_kinematics_yaml(corrected, calibration_hash="calib_1")
-    path.write_text(text)
-    content = read_yaml(path)["kinematics"]
-    chain, q = np.eye(4), some_joints(robot, 1)[0]
-    for link, angle in zip(UR5E_KINEMATICS, q, strict=True):
-        x, y, z, roll, pitch, yaw = (
-            content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")
-        )
-        about = [
-            exp(np.array(group)) for group in ([0, 0, yaw + 0.0, 0, 0, 0], [0, pitch, 0, 0, 0, 0])
-        ]
-        roll_only = exp(np.array([roll, 0, 0, 0, 0, 0]))
-        origin = about[0] @ about[1] @ roll_only
-        origin[:3, 3] = x, y, z
-        # Near the nominal frames, not at the common normals hundreds of metres off.
-        assert np.linalg.norm(origin[:3, 3]) < 0.7
-        chain = chain @ origin @ exp(np.array([0, 0, angle, 0, 0, 0]))
-    left_over = invert(chain) @ corrected.base_from_flange(q[None])[0]
-    # Off by the corrections of 2 mm and 2 mrad alone; the comment has the rest.
-    assert np.abs(left_over - np.eye(4)).max() < 0.02
-    assert text.startswith("# flange in wrist_3: xyz ")
-    said = np.array(text.splitlines()[0].partition("xyz ")[2].replace("rpy ", "").split(), float)
-    np.testing.assert_allclose(said[:3], left_over[:3, 3], atol=1e-12)
-    with pytest.raises(DataError, match="six revolute joints"):
-        ur_kinematics_yaml(load_robot("panda"), calibration_hash="")
 
 
 def test_abbs_arm_is_the_one_of_its_published_urdf() -> None:

@@ -6,7 +6,6 @@ import pytest
 from support.edited import changed
 
 from visioncal.core.errors import DataError
-from visioncal.present.recording import write_recording
 from visioncal.session import Session
 
 TOML = """schema = 1
@@ -59,17 +58,6 @@ def test_rows_say_which_board_they_show(folder):
     assert session.warnings == ()
 
 
-def test_every_storage_of_it_is_the_same_session(folder, tmp_path):
-    session = Session.load(folder)
-    session.save(tmp_path / "copy")
-    write_recording(tmp_path / "cell.rrd", session, None, (), None)
-    recorded = Session.load(tmp_path / "cell.rrd")
-    recorded.save(tmp_path / "back")
-    for again in (Session.load(tmp_path / "copy"), recorded, Session.load(tmp_path / "back")):
-        assert again.digest() == session.digest()
-        assert again.boards == session.boards
-
-
 def test_files_from_elsewhere_come_along(folder, tmp_path):
     (tmp_path / "floor.toml").write_text(BOARD)
     changed(folder, "session.toml", "boards/floor.toml", "../floor.toml")
@@ -77,14 +65,6 @@ def test_files_from_elsewhere_come_along(folder, tmp_path):
     session.save(tmp_path / "far" / "copy")
     assert (tmp_path / "far" / "copy" / "target_floor.toml").is_file()
     assert Session.load(tmp_path / "far" / "copy").digest() == session.digest()
-
-
-def test_the_digest_tells_boards_apart(folder):
-    before = Session.load(folder).digest()
-    changed(folder, "boards/floor.toml", "0.04", "0.041")
-    resized = Session.load(folder).digest()
-    changed(folder, "views.csv", "2,1,wall", "2,1,floor")
-    assert len({before, resized, Session.load(folder).digest()}) == 3
 
 
 def test_one_board_with_a_name_is_one_board(folder):
