@@ -87,6 +87,14 @@ def export_command(
             "joint-corrections; without it, those that leave the least alone.",
         ),
     ] = False,
+    lens: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The receiving program's own lens, as convert --intrinsics reads it: the "
+            "camera's transform is written for that.",
+        ),
+    ] = None,
     force: ForceBoth = False,
     _list: Annotated[
         bool,
@@ -115,6 +123,7 @@ def export_command(
         part.robot,
         part.target,
         with_corrections,
+        lens,
     )
     written = document(load_exportable(source), to, selection)
     bad = check_usable(written.verdict, "what is exported", force=force)

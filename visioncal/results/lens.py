@@ -34,6 +34,9 @@ _SEEN = 0.5
 # Relative singular value below which a combination of coefficients is undetermined.
 _DETERMINED = 1e-8
 
+# Places of p1 and p2 among Brown's intrinsics.
+_DECENTRING = (6, 7)
+
 # Steps of central differences [rad], whose truncation is their square.
 _STEP = 1e-5
 
@@ -237,8 +240,7 @@ def fit_coefficients(lens: CameraResult) -> RefittedLens:
     camera = lens.camera
     if lens.field is None or not len(lens.field.coefficients):
         return RefittedLens(camera)
-    axes = (np.linspace(0.0, at - 1.0, n) for at, n in zip(camera.resolution, _GRID, strict=True))
-    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    px = image_grid(camera)
     in_model = lens.in_model(px)
     rays, weights = normalise(camera, in_model), _determined_share(lens, px)
     seen = np.isfinite(rays).all(axis=1) & (weights > 0.0)
@@ -262,6 +264,78 @@ def fit_coefficients(lens: CameraResult) -> RefittedLens:
     observed = weights > min(_SEEN, 0.5 * weights.max())
     most_px = float(np.abs(remaining[observed]).max())
     return RefittedLens(fitted, _rms(remaining, weights), most_px)
+
+
+def image_grid(camera: Camera, share: float = 1.0) -> FloatArray:
+    """(n, 2) pixels of a grid over this share of the image's width and height, about its centre."""
+    centre = (np.array(camera.resolution) - 1.0) / 2.0
+    axes = (
+        middle + share * np.linspace(-middle, middle, count)
+        for middle, count in zip(centre, _GRID, strict=True)
+    )
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class SensorTilt:
+    """Tilt of the sensor that a lens's decentring stands for.
+
+    Attributes:
+        rad: Angle between the optical axes of the lens model and of one with a tilted sensor.
+        sigma_rad: Its standard deviation by that of the decentring; 0 for a given lens.
+    """
+
+    rad: float
+    sigma_rad: float
+
+
+def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
+    """The tilted sensor that would explain the decentring p1, p2 of a lens.
+
+    A pinhole camera whose sensor is tilted is one that is turned, with another principal point.
+    Only the centre of the radial distortion remains on the lens's axis. Seen from there, it is
+    displaced; its derivative by that displacement is Brown's decentring (Brown 1966). The tilt, and
+    the changes of all other intrinsics, are those that come nearest to the decentring over the
+    image.
+
+    Returns:
+        The tilt; None where the model has no decentring, or no tilt explains it.
+    """
+    if lens.camera.model != "brown":
+        return None
+    values = intrinsics(lens.camera)
+    decentring = values[[*_DECENTRING]]
+    values[[*_DECENTRING]] = 0.0
+    camera = with_intrinsics(lens.camera, values)
+    rays = normalise(camera, image_grid(camera))
+    points = np.column_stack([rays, np.ones(len(rays))])[np.isfinite(rays).all(axis=1)]
+    projected = project_with_jacobian(camera, points)
+    focal, centre = camera.matrix[:2], camera.matrix[2:]
+    shown = np.column_stack([(projected.px - centre) / focal, np.ones(len(points))])
+    # The camera is turned about x and y before the distortion, and turned back behind it.
+    turned = np.cross(np.eye(3)[:2], points[:, None])
+    back = np.cross(np.eye(3)[:2], shown[:, None])
+    by_tilt = np.swapaxes(
+        turned @ np.swapaxes(projected.jacobian_point, 1, 2)
+        - focal * (back[:, :, :2] - shown[:, None, :2] * back[:, :, 2:]),
+        1,
+        2,
+    )
+    others = np.delete(projected.jacobian_intrinsics, _DECENTRING, axis=2)
+    columns = np.concatenate([by_tilt, others], axis=2).reshape(-1, 2 + others.shape[2])
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    decentred = projected.jacobian_intrinsics[:, :, _DECENTRING].reshape(-1, 2)
+    fitted = np.linalg.lstsq(columns / scale, decentred, rcond=_DETERMINED)[0] / scale[:, None]
+    tilt = fitted[:2] @ decentring
+    rad = float(np.linalg.norm(tilt))
+    # An axis beside the image is no lens's: decentring with hardly any radial distortion.
+    if rad > np.hypot(*camera.resolution) / 2.0 / focal.min():
+        return None
+    if lens.covariance is None or rad == 0.0:
+        return SensorTilt(rad, 0.0)
+    along = tilt @ fitted[:2] / rad
+    return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)))
 
 
 def _fitted_count(camera: Camera) -> int:
@@ -321,11 +395,11 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
     if not np.isfinite(ray).all():
         return None
     turn = np.eye(4)
-    turn[:3, :3] = _to_ray(ray)
+    turn[:3, :3] = to_ray(ray)
     _, by_lens = lens.rays_by_lens(px[None], np.append(ray, 1.0)[None])
     by_ray = np.array(
         [
-            Rotation.from_matrix(_to_ray(ray - step).T @ _to_ray(ray + step)).as_rotvec()
+            Rotation.from_matrix(to_ray(ray - step).T @ to_ray(ray + step)).as_rotvec()
             for step in _STEP * np.eye(2)
         ]
     ).T / (2.0 * _STEP)
@@ -338,7 +412,7 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
     return RayFrame(name=f"{parent}_from_ray", px=px, cam_from_ray=turn, transform=placed)
 
 
-def _to_ray(ray: FloatArray) -> FloatArray:
+def to_ray(ray: FloatArray) -> FloatArray:
     """(3, 3) the smallest rotation of z into the ray of a point (2,) at unit depth."""
     tangent = float(np.hypot(*ray))
     axis = np.array([-ray[1], ray[0], 0.0]) / max(tangent, np.finfo(float).tiny)

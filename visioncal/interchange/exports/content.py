@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import yaml
@@ -15,12 +16,12 @@ from visioncal.results import CameraResult, Edge, Verdict
 from visioncal.results.conditions import Condition
 from visioncal.results.lens import RefittedLens, fit_coefficients
 
-_OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
+_OF_LENS = "it goes with the lens of that calibration: for other intrinsics, export it with --lens"
 # Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the
 # base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # Options that apply to formats: to all of transforms, and to some formats.
-OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child"]
+OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child", "lens"]
 Takes: TypeAlias = (
     OfTransforms | Literal["number", "load", "convention", "hash", "with-corrections"]
 )
@@ -55,6 +56,8 @@ class Selection:
         robot: Which robot of a cell: its part is exported as of one camera and robot.
         target: Which target of a cell; likewise.
         with_corrections: Whether the table of joint corrections is used with the arm.
+        lens: A file with the lens of the receiving program, for which the camera's transform is
+            written; None for the calibration's own.
     """
 
     edge: str | None = None
@@ -69,6 +72,7 @@ class Selection:
     robot: str | None = None
     target: str | None = None
     with_corrections: bool = False
+    lens: Path | None = None
 
     @property
     def given_options(self) -> tuple[Takes, ...]:
@@ -83,6 +87,7 @@ class Selection:
             "convention": self.convention,
             "hash": self.calibration_hash,
             "with-corrections": self.with_corrections,
+            "lens": self.lens,
         }
         return tuple(name for name, option in options.items() if option not in (None, False))
 
@@ -208,12 +213,14 @@ class ExportFormat(Format[Content]):
         frames: Its names of our frames; a frame that is missing keeps our name.
         counterpart: The maker's format of fixtures, for one of tools; and vice versa.
         write_all: Builds the document of all transforms of a cell; None where it holds one.
+        carries_lens: Whether the camera's own lens is written with its transform.
     """
 
     holds: Holds = "any edge"
     frames: Mapping[str, str] = field(default_factory=dict)
     counterpart: str = ""
     write_all: Callable[[Sequence[Content]], str] | None = None
+    carries_lens: bool = False
 
 
 def numbers(values: FloatArray) -> list[float]:

@@ -60,5 +60,6 @@ OPENCV = ExportFormat(
     "OpenCV's FileStorage: transform, R, t and any lens [m]",
     _write_opencv,
     warn=warn_of_field,
+    carries_lens=True,
 )
 ZIVID = ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid)

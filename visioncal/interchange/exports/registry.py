@@ -17,6 +17,7 @@ from visioncal.interchange.exports.content import Content, ExportFormat, OfTrans
 from visioncal.interchange.exports.controllers import CONTROLLERS
 from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
+from visioncal.interchange.exports.other_lens import with_lens
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import (
     EASY_HANDEYE,
@@ -114,7 +115,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         written = "" if form.write_all is None else form.write_all(contents)
         verdicts = {content.verdict.status: content.verdict for content in contents}
         worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
-        return Document(written, worst, _conditions(contents[0]))
+        return Document(written, worst, _conditions(*contents))
     content = select(source, selection, form)
     return Document(
         form.write(content), content.verdict, (*_conditions(content), *form.warn(content))
@@ -143,8 +144,9 @@ def _robot_part(
     return part, replace(selection, camera=None, robot=None, target=None)
 
 
-def _conditions(content: Content) -> tuple[str, ...]:
-    return tuple(condition.words for condition in content.conditions)
+def _conditions(*contents: Content) -> tuple[str, ...]:
+    said = (condition.words for content in contents for condition in content.conditions)
+    return tuple(dict.fromkeys(said))
 
 
 def _find(name: str) -> ExportFormat | ArmFormat:
@@ -169,7 +171,10 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     available = placements(source, selection.camera)
     _check_takes(form, selection)
     _check_camera(form, selection, available)
-    return _content(form, selection, available, _transform_name(form, selection, available))
+    name = _transform_name(form, selection, available)
+    if selection.lens is not None:
+        available = with_lens(source, available, name, selection.lens)
+    return _content(form, selection, available, name)
 
 
 def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
@@ -181,6 +186,8 @@ def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tup
         why = f"{form.name} holds one transform"
     elif selection.inverse or selection.parent is not None or selection.child is not None:
         why = "--inverse, --parent and --child are of one transform"
+    elif selection.lens is not None:
+        why = "--lens is of one camera's transform"
     elif available.cell is None:
         why = f"{available.words} is of no whole cell"
     if why:
@@ -199,6 +206,15 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     if selection.inverse:
         edge, frames = _inverted(edge), (frames[1], frames[0])
         name = f"inverse of {name}"
+    # The poses of tools, fixtures and targets depend on no convention of a lens.
+    by_lens = any(frame.startswith("cam") for frame in frames) and not (
+        form.carries_lens and available.lens is not None
+    )
+    conditions = tuple(
+        condition
+        for condition in placement.conditions
+        if form.holds != "lens" and (by_lens or condition.kind != "own-lens")
+    )
     parent, child = (
         _checked_frame(form.frames.get(frame, frame) if given is None else given)
         for frame, given in zip(frames, (selection.parent, selection.child), strict=True)
@@ -221,7 +237,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         else available.lens,
         placement.origin,
         placement.verdict,
-        () if form.holds == "lens" else placement.conditions,
+        conditions,
         rotation_of,
         selection.number,
         selection.load,
@@ -307,10 +323,11 @@ def _check_camera(form: ExportFormat, selection: Selection, available: Placement
 
 
 def _check_lens_alone(form: ExportFormat, selection: Selection) -> None:
-    if selection.inverse or selection.edge is not None or selection.parent is not None:
+    of_transform = (selection.edge, selection.parent, selection.lens)
+    if selection.inverse or any(option is not None for option in of_transform):
         raise DataError(
-            f"{form.name} holds the lens and no transform: --edge, --inverse and --parent do not "
-            "go with it.",
+            f"{form.name} holds the lens and no transform: --edge, --inverse, --parent and --lens "
+            "do not go with it.",
             culprits=[form.name],
             next_step="Leave them out; --child names the camera.",
         )

@@ -45,15 +45,21 @@ _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 # Largest skew relative to the focal length; more is another camera model.
 _MOST_SKEW = 1e-6
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
+# Numbers of coefficients of OpenCV's: those beyond eight are of thin prisms and tilted sensors.
+_BROWN_COUNTS = (5, 8, 12, 14)
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
 
 
-def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+def read_intrinsics(path: Path, most: int = 8) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics of a camera.
 
     Supports ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
     ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
     the usual names.
+
+    Args:
+        path: The file.
+        most: Most coefficients of Brown's model: 8 of the camera model here, up to 14 of OpenCV's.
 
     Returns:
         model, matrix, distortion, and resolution where the file has it; and notes on assumptions.
@@ -62,16 +68,16 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         DataError: It is none of these, or has an unknown lens model.
     """
     if path.suffix.lower() == ".npz":
-        return intrinsics_from(read_npz(path), str(path))
+        return intrinsics_from(read_npz(path), str(path), most)
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
         if root.find("camera") is not None:
             return _visp(root, str(path)), ()
-    return intrinsics_from(read_opencv(path), str(path))
+    return intrinsics_from(read_opencv(path), str(path), most)
 
 
 def intrinsics_from(
-    content: Mapping[str, Any], where: str
+    content: Mapping[str, Any], where: str, most: int = 8
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics from a document, as `read_intrinsics` does from a file.
 
@@ -82,7 +88,7 @@ def intrinsics_from(
         return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
     inner = content.get("intrinsics")
     if isinstance(inner, Mapping):
-        return intrinsics_from(inner, f"{where}: intrinsics")
+        return intrinsics_from(inner, f"{where}: intrinsics", most)
     if {"fx", "fy", "cx", "cy"} <= content.keys():
         values = [number(content[name], f"{where}: {name}") for name in ("fx", "fy", "cx", "cy")]
         return _lens("brown", values, [], content, where), ()
@@ -103,7 +109,8 @@ def intrinsics_from(
             "OpenCV's fisheye model has four as well.",
         )
     model = _model(str(content.get("distortion_model", "plumb_bob")), where)
-    lens = _lens(model, [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], list(flat), content, where)
+    matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+    lens = _lens(model, matrix, list(flat), content, where, most)
     return lens, notes
 
 
@@ -194,6 +201,7 @@ def _lens(
     coefficients: list[float],
     content: Mapping[str, Any],
     where: str,
+    most: int = 8,
 ) -> dict[str, Any]:
     if not (matrix[0] > 0 and matrix[1] > 0):
         raise DataError(
@@ -201,7 +209,8 @@ def _lens(
             "above 0.",
             culprits=[where],
         )
-    count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
+    counts = (4,) if model == "fisheye" else tuple(n for n in _BROWN_COUNTS if n <= most)
+    count = next((n for n in counts if len(coefficients) <= n), counts[-1])
     beyond = [coefficient for coefficient in coefficients[count:] if coefficient]
     values = np.array([*matrix, *coefficients])
     if not np.isfinite(values).all() or beyond:
