@@ -635,14 +635,6 @@ def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn
     )
 
 
-def test_tables_of_spreadsheets_with_decimal_commas_are_read(drawn):
-    sound = Session.load(drawn)
-    for name in ("views.csv", "corners.csv"):
-        file = drawn / name
-        file.write_text(file.read_text().replace(",", ";").replace(".", ","))
-    assert Session.load(drawn).digest() == sound.digest()
-
-
 @pytest.mark.parametrize(("size", "dh_sigma"), [(1.004, 0.0), (1.0, 3e-4)])
 @pytest.mark.parametrize("mount", [IN_HAND, TO_HAND])
 def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, dh_sigma):

@@ -1,6 +1,5 @@
 """Streams beside the views: read, checked, told, and kept in every storage of a session."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats import convert
 from visioncal.present.recording import codec, read_session, write_recording
 from visioncal.session import Session, Stream
-from visioncal.session.streams import check_stream, parse_stream, read_streams, write_stream
+from visioncal.session.streams import check_stream, parse_stream, read_streams
 
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
@@ -180,34 +179,6 @@ def test_a_stream_that_was_changed_is_named(
         write_recording(tmp_path / "session.rrd", session, None, (), None)
     with pytest.raises(DataError, match="the stream robot cannot be read or was changed"):
         read_session(tmp_path / "session.rrd")
-
-
-def test_a_long_stream_is_not_read_row_by_row() -> None:
-    # Seconds at 1 kHz of six joints with five figures each.
-    calls = [calls_of_reading(rows) for rows in (1000, 5000)]
-    assert calls[1] < calls[0] + 1000
-
-
-def calls_of_reading(rows: int) -> int:
-    """Counts Python's calls and returns, which a busy computer does not change."""
-    rng = np.random.default_rng(0)
-    names = [f"{name}" for joint in range(1, 7) for name in (
-        f"q{joint}_rad", f"dq{joint}_rad_s", f"tau{joint}_nm", f"current{joint}_a", f"temp{joint}_c"
-    )]  # fmt: skip
-    values = np.hstack([1e-3 * np.arange(rows)[:, None], rng.normal(size=(rows, len(names)))])
-    long = Stream(("stamp_s", *names), values)
-    text = write_stream(long)
-    calls = 0
-
-    def count(*_: object) -> None:
-        nonlocal calls
-        calls += 1
-
-    sys.setprofile(count)
-    again = parse_stream(text, "streams/robot.csv")
-    sys.setprofile(None)
-    np.testing.assert_array_equal(again.values, values)
-    return calls
 
 
 @pytest.mark.parametrize(
