@@ -1,7 +1,7 @@
 """The answers to sixty cells and to real recordings stay what they are, and so do messages."""
 
 import pytest
-from support.broken_sessions import BROKEN
+from support.fuzz.broken_sessions import BROKEN
 from support.kept_answers import (
     REAL,
     away_in_sigmas,

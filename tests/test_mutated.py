@@ -1,8 +1,8 @@
 """Broken inputs, a few of the thousands that `benchmarks/mutated.py` draws."""
 
 import pytest
+from support.fuzz.mutants import READINGS, missing_commands, unknown_inputs, walk
 from support.marks import slow
-from support.mutants import READINGS, missing_commands, unknown_inputs, walk
 
 # Inputs that are made within a second, and commands that end soon on them.
 QUICK = {

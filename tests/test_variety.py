@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.fuzz.varied_arms import built_in, built_in_names, placed, table_arm, urdf_arm
+from support.fuzz.varied_cells import cell, write
+from support.fuzz.varied_images import Lens, Light, Print, draw
+from support.fuzz.varied_walk import walk
 from support.marks import slow
-from support.varied_arms import built_in, built_in_names, placed, table_arm, urdf_arm
-from support.varied_cells import cell, write
-from support.varied_images import Lens, Light, Print, draw
-from support.varied_walk import walk
 
 from visioncal.robot import load_robot
 

@@ -17,8 +17,9 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
-from support import kept_answers, mistakes, touched, varied_cells, wrong_arms
+from support import kept_answers, touched, wrong_arms
 from support.commands import QUATERNIONS, visioncal, write_poses, write_table
+from support.fuzz import mistakes, varied_cells
 from support.paired import Outcome
 
 from visioncal.estimation.workspace import postures

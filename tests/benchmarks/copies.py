@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from results import few, first, wished, write_section
-from support.copied import copied, session_of_kind
+from support.fuzz.copied import copied, session_of_kind
 
 from visioncal import calibrate
 from visioncal.core.errors import VisioncalError

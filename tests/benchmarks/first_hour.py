@@ -1,7 +1,7 @@
 """Sessions that are broken in the usual ways: what is said first, and whether that mends them.
 
-Each mistake of `support.broken_sessions` is planted into the same sound session. `calibrate` runs
-on it; what it says first is looked up for the mistake's name; and what it says to do is typed.
+Each mistake of `support.fuzz.broken_sessions` is planted into the same sound session. `calibrate`
+runs on it; what it says first is looked up for the mistake's name; and what it says to do is typed.
 
     PYTHONPATH=tests python tests/benchmarks/first_hour.py [--quick]
 """
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from results import first, write_section
-from support.broken_sessions import BROKEN, Mistake, broken_session
 from support.commands import visioncal
-from support.typed_fixes import mended
+from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session
+from support.fuzz.typed_fixes import mended
 
 _COMMAND = "PYTHONPATH=tests python tests/benchmarks/first_hour.py"
 # A sentence that is longer is cut in the table.

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from results import write_section
-from support.mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
-from support.mutators import KINDS
+from support.fuzz.mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
+from support.fuzz.mutators import KINDS
 
 MUTANTS = 2000
 # With --quick one reading of so many is broken once: nineteen of the 21 commands.

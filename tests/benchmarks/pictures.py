@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from rerun.experimental import ViewerClient
 from results import QUICK
-from support.broken_sessions import BROKEN, broken_session
 from support.browser import CHROMIUM, Page, chromium
 from support.commands import visioncal
+from support.fuzz.broken_sessions import BROKEN, broken_session
 
 import visioncal as package
 from visioncal.present.recording import paths

@@ -24,7 +24,7 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 
 import numpy as np
 from results import write_section
-from support.varied_walk import Step, Walk, walk
+from support.fuzz.varied_walk import Step, Walk, walk
 
 CELLS, QUICK = 2000, 6
 # An error that is as unlikely as one of so many sigmas of a normal number.

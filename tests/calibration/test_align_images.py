@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.broken_sessions import edit_rows
 from support.commands import visioncal
 from support.drawn import column
+from support.fuzz.broken_sessions import edit_rows
 
 from visioncal.core.transforms import log
 from visioncal.present.recording import paths, read_evidence

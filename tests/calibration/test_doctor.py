@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from support.boards import charuco, checkerboard, circles
-from support.broken_sessions import BROKEN, broken_session, edit, sound_session
 from support.commands import visioncal as command
+from support.fuzz.broken_sessions import BROKEN, broken_session, edit, sound_session
+from support.fuzz.typed_fixes import mended
 from support.rendered import Shot, photograph
-from support.typed_fixes import mended
 
 import visioncal
 from visioncal.calibration.pipeline import checkup

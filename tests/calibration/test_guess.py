@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from support.commands import visioncal as visioncal_command
-from support.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
+from support.fuzz.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
 
 import visioncal
 from visioncal.calibration.guess import guess_reading

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.slips import (
+from support.fuzz.slips import (
     SLIPS,
     Identifiability,
     alarms,

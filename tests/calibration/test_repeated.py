@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.copied import copied, session_of_kind
+from support.fuzz.copied import copied, session_of_kind
 from support.marks import slow
 from support.whole_cells import misfit
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.advice import failures, printed_commands
-from support.broken_sessions import BROKEN, broken_session, edit_rows
 from support.commands import turned_poses, visioncal, write_poses
+from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
 from support.marks import slow
 from support.whole_cells import OPTIONS, recorded
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pypdfium2
 import pytest
 from support import browser
-from support.broken_sessions import BROKEN, sound_session
 from support.commands import visioncal
+from support.fuzz.broken_sessions import BROKEN, sound_session
 from support.pages import Page
 from support.samples import made_up
 from support.whole_cells import OPTIONS, recorded

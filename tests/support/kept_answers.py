@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
-from support.broken_sessions import BROKEN, broken_session
+from support.fuzz.broken_sessions import BROKEN, broken_session
 
 import visioncal
 from visioncal.session import Session

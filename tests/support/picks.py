@@ -4,7 +4,6 @@ The robot stands, once more, not quite where it reports to; the pixels are noisy
 seen comes from the simulation's own camera.
 """
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +35,6 @@ class Pick:
 
     truth: FloatArray
     located: Located
-    taken_s: float
 
 
 def calibration_of(cell: SimulatedCell, **changes) -> Calibration:
@@ -52,9 +50,8 @@ def pick_by_plane(cell: SimulatedCell, calibration: Calibration, rng: np.random.
     normal = normal / np.linalg.norm(normal)
     sigma_m = float(rng.choice([0.0, 2e-4]))
     declared = Plane.through(normal, place + sigma_m * rng.standard_normal() * normal, sigma_m)
-    started = time.perf_counter()
     (found,) = locate(calibration, px, declared, at.base_from_flange)
-    return Pick(place, found, time.perf_counter() - started)
+    return Pick(place, found)
 
 
 def pick_by_target(
@@ -67,11 +64,9 @@ def pick_by_target(
     scale = 1.0 + target.square_sigma_m / target.square_m * rng.standard_normal()
     corners = seen_corners(cell, cam_from_target, target, rng, scale)
     point = corner_positions(target).mean(axis=0) + np.array([0.01, -0.02, 0.005])
-    started = time.perf_counter()
     found = locate_target(calibration, corners, target, at.base_from_flange, point)
-    taken = time.perf_counter() - started
     base_from_target = at.base_from_cam @ cam_from_target
-    return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found, taken)
+    return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found)
 
 
 def stand(cell: SimulatedCell, rng: np.random.Generator) -> Stand:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.varied_arms import placed
-from support.varied_images import Lens, Light, Print, draw
+from support.fuzz.varied_arms import placed
+from support.fuzz.varied_images import Lens, Light, Print, draw
 
 from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError

@@ -9,7 +9,7 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
 
-BUILT_IN = Path(__file__).parents[2] / "visioncal" / "robot" / "models"
+BUILT_IN = Path(__file__).parents[3] / "visioncal" / "robot" / "models"
 ROUNDS, SETTLED = 40, 1e-10
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2, norm
 from support.commands import Done
 from support.commands import visioncal as run
-from support.varied_cells import Cell, cell, write
+from support.fuzz.varied_cells import Cell, cell, write
 
 import visioncal.cli.console
 from visioncal import Session

@@ -18,7 +18,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from support import foreign_damage as damage
+from support.fuzz import foreign_damage as damage
 
 Chance: TypeAlias = random.Random
 Bytes: TypeAlias = Callable[[bytes, Chance], bytes]

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tomli_w
-from support.broken_sessions import edit, edit_rows, scaled
 from support.commands import visioncal
+from support.fuzz.broken_sessions import edit, edit_rows, scaled
 
 _Found = re.Match[str]
 

@@ -26,8 +26,8 @@ from pathlib import Path
 from unittest.mock import patch
 
 from support.commands import every_command
-from support.mutators import mutate
-from support.sound_inputs import MAKERS, Inputs, typed
+from support.fuzz.mutators import mutate
+from support.fuzz.sound_inputs import MAKERS, Inputs, typed
 
 from visioncal.cli import console
 from visioncal.cli.app import main

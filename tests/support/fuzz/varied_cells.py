@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
-from support.varied_arms import Arm, built_in, built_in_names, placed, table_arm, urdf_arm
-from support.varied_images import Lens, Light, Print, background, draw, exposed
+from support.fuzz.varied_arms import Arm, built_in, built_in_names, placed, table_arm, urdf_arm
+from support.fuzz.varied_images import Lens, Light, Print, background, draw, exposed
 
-SHIPPED = Path(__file__).parents[2] / "targets"
+SHIPPED = Path(__file__).parents[3] / "targets"
 DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
 BOARDS = ("floor", "Wall_2", "x")
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
