@@ -10,12 +10,10 @@ from support.cells import arm_found, calibrated
 from support.edges import solved
 from support.wrong_arms import WRONG_LINKS
 
-import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arm_identifiability import identify_arm
 from visioncal.core.choices import CONVENTIONS
-from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.identifiability import Indices
@@ -346,8 +344,3 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     counts = found["observability"]
     assert (counts["columns"], counts["identifiable"], counts["determined"]) == (48, 30, 30)
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
-
-
-def test_an_unknown_convention_is_refused(rendered):
-    with pytest.raises(DataError, match=r"'craig'.*'standard', 'modified' or 'hayati' is needed"):
-        visioncal.calibrate(rendered, convention="craig")

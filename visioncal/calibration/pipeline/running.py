@@ -23,11 +23,10 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import with_misread, with_other_board
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.dense import Dense
-from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.validate import predict_corners
-from visioncal.core.choices import CONVENTIONS, Convention, SolverName
+from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, FloatArray, Progress
@@ -96,14 +95,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
     level, convention = asked.get("level", "auto"), asked.get("convention")
     if threads is not None and threads < 1:
         raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
-    if solver not in SOLVER_NAMES:
-        raise DataError(
-            f"solver {solver!r} is not one of {', '.join(SOLVER_NAMES)}.", culprits=["solver"]
-        )
     check_level(level)
-    if convention is not None and convention not in CONVENTIONS:
-        words = f"convention {convention!r} is not one of {', '.join(CONVENTIONS)}."
-        raise DataError(words, culprits=["convention"])
     loaded = session if isinstance(session, Session) else Session.load(session)
     state = RunState(
         loaded,

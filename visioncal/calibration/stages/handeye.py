@@ -1,19 +1,15 @@
 """Hand-eye calibration by closed forms, AX = XB and AX = ZB, for one robot and one camera."""
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 
-from visioncal.core.choices import SolverName
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import robot_part, scatter
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-
-SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 
 @dataclass(frozen=True, eq=False)
