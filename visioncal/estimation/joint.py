@@ -37,7 +37,7 @@ _FALSE_ALARM = 1e-4
 # Values that change by less than this share of their sigma have converged; maximum of iterations.
 _SETTLED, _ROUNDS = 0.02, 8
 # A step is halved while it increases the corner residuals by this factor; maximum of halvings.
-_FOLLOWS, _HALVINGS = 2.0, 12
+FOLLOWS, _HALVINGS = 2.0, 12
 # Standard deviations from which on a stated value counts as contradicted.
 _CONTRADICTION = 3.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
@@ -204,7 +204,7 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     """Linearises the corners at the fitted values, or after a shorter step if they fit worse."""
     # Far from the solution, as with a lens stated for another image size, the full step leads to
     # lenses that image nothing.
-    limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
+    limits = [FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
     optics, free, change = (
         fitted.linearised.camera_parameters,
         fitted.linearised.free,

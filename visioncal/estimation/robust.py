@@ -144,7 +144,7 @@ def widened(
             nearest half has less noise than all. Where None, all are candidates, within their
             limits at the noise of the used ones.
     """
-    fewest = int(used.sum()) if among is not None else 1
+    fewest, before = int(used.sum()) if among is not None else 1, used
     for _ in range(_ROUNDS):
         distances = search.distances(used, fit)
         directions = np.maximum(distances.directions, 1)
@@ -154,9 +154,12 @@ def widened(
         reached = (distances.squares < scale * limit) | (distances.directions < 1)
         if among is not None:
             reached &= among
-        if np.array_equal(reached, used) or reached.sum() < fewest:
+        # Units at the limit may come and go with the noise: two sets in turn end it, too.
+        if any(np.array_equal(reached, known) for known in (used, before)):
             break
-        used, fit = reached, search.fit(reached, fit)
+        if reached.sum() < fewest:
+            break
+        before, used, fit = used, reached, search.fit(reached, fit)
     return used, fit
 
 
@@ -175,10 +178,12 @@ def settled(
         suspect: Share of the limit from which a unit is tested again, with noise estimated without
             it.
     """
-    step = max(len(used) // 100, 1)
+    step, tried = max(len(used) // 100, 1), set[bytes]()
     for _ in range(2 * len(used)):
-        if used.sum() < fewest:
+        # Units at the limit may come and go with the noise.
+        if used.sum() < fewest or used.tobytes() in tried:
             break
+        tried.add(used.tobytes())
         beyond = search.distances(used, fit).beyond
         outside = np.flatnonzero(~used & (beyond < 1.0))
         if len(outside):

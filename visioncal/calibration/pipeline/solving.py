@@ -396,6 +396,10 @@ def initial_inliers(start: Start) -> tuple[InlierFit, Mapping[str, float]]:
     """
     cell, problem, state = start.cell, start.problem, start.state
     movable, observations = _movable_frames(cell, problem), problem.observations
+    stated_levels = len(starting_noise(problem).sensors)
+    # Before the lenses are fitted, cameras disagree about one stop by more than their corners say:
+    # a board shrunk to nothing would reconcile them, and all stops would be explained.
+    problem = _with_camera_levels(cell, start.poses, problem)
     if printed := _printed_targets(observations) if movable else []:
         # Otherwise all observations of a board of another size would be outliers.
         problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
@@ -405,10 +409,18 @@ def initial_inliers(start: Start) -> tuple[InlierFit, Mapping[str, float]]:
     else:
         loose = replace(problem, priors=with_loose_positions(cell.priors))
         inliers = _with_priors(cell, inliers_and_moves(loose, state, movable)).refitted()
-    # Sizes are estimated from the corners, with the lenses.
+    # Sizes are estimated from the corners, with the lenses, and the cameras' noise beside them.
     edges, sizes = inliers.fit.state.edges, inliers.fit.state.values.tolist()
-    fit = replace(inliers.fit, state=State(edges, np.zeros(0)))
-    inliers = replace(inliers, problem=inliers.problem.with_effects(()), fit=fit)
+    noise = inliers.fit.noise
+    noise = replace(noise, sensors=noise.sensors[:stated_levels])
+    fit = replace(inliers.fit, state=State(edges, np.zeros(0)), noise=noise)
+    observations = replace(inliers.problem.observations, sensors=observations.sensors)
+    problem = replace(
+        inliers.problem.with_effects(()),
+        observations=observations,
+        least_levels=start.problem.least_levels,
+    )
+    inliers = replace(inliers, problem=problem, fit=fit)
     return inliers, dict(zip(printed, sizes, strict=True))
 
 
@@ -423,27 +435,33 @@ def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:
 
 def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: InlierFit) -> InlierFit:
     """Estimates the noise level of cameras, too, now that outliers are removed."""
+    levelled = _with_camera_levels(cell, poses, inliers.problem)
+    if levelled is inliers.problem:
+        return inliers
+    # The calibration of the arms starts from this fit.
+    noise = inliers.fit.noise
+    unit_levels = np.ones(len(levelled.least_levels) - len(noise.sensors))
+    noise = replace(noise, sensors=np.concatenate([noise.sensors, unit_levels]))
+    return replace(inliers, problem=levelled, fit=replace(inliers.fit, noise=noise)).refitted()
+
+
+def _with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], problem: Problem) -> Problem:
+    """The problem with a noise level of each camera; itself where these cannot be told apart."""
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
     # once a stop, that is part of the robot's noise.
-    is_alone = cell.mount is not None and not inliers.problem.shared_units
-    if is_alone or inliers.problem.is_combined:
-        return inliers
+    is_alone = cell.mount is not None and not problem.shared_units
+    if is_alone or problem.is_combined:
+        return problem
     sensors = sensors_of(cell, poses)
     frames = tuple(dict.fromkeys((*sensors, *(row.seer for row in cell.rows))))
     indices = {frame: at for at, frame in enumerate(frames)}
-    problem = inliers.problem
-    observations = replace(
-        problem.observations,
-        sensors=np.array([indices[row.seer] for row in cell.rows], dtype=np.int64),
+    seers = np.array([indices[row.seer] for row in cell.rows], dtype=np.int64)
+    return replace(
+        problem,
+        observations=replace(problem.observations, sensors=seers),
+        least_levels=np.repeat([0.0, 1.0], [len(sensors), len(frames) - len(sensors)]),
     )
-    unit_levels = np.ones(len(frames) - len(sensors))
-    least_levels = np.concatenate([np.zeros(len(sensors)), unit_levels])
-    problem = replace(problem, observations=observations, least_levels=least_levels)
-    noise = inliers.fit.noise
-    noise = replace(noise, sensors=np.concatenate([noise.sensors, unit_levels]))
-    # The calibration of the arms starts from this fit.
-    return replace(inliers, problem=problem, fit=replace(inliers.fit, noise=noise)).refitted()
 
 
 def with_repeats(inliers: InlierFit) -> InlierFit:

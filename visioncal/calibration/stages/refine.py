@@ -1,7 +1,8 @@
 """Joint fit of lenses, boards and frames, and the selection of the values that it frees."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from visioncal.estimation.appearance import Appearance, Compressed, LensBoardPar
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (
+    FOLLOWS,
     ConvergedFit,
     FrameModel,
     MeasuredScale,
@@ -158,7 +160,7 @@ def _with_refined_matrices(side: FrameModel, fitted: ConvergedFit) -> ConvergedF
     """The fit without those stated priors of matrices that it contradicts by many sigmas."""
     problems = fitted.camera_parameters.problems.items()
     refined = [name for name, problem in problems if problem.is_refined_by_prior]
-    freed = _without_contradicted_priors(side, fitted, refined)
+    freed = _tried(fitted, partial(_without_contradicted_priors, side, fitted, refined))
     return freed if freed is fitted or _is_determined(freed, fitted) else fitted
 
 
@@ -170,7 +172,8 @@ def _with_measured_sizes(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit
         return fitted
     sizes = np.concatenate([optics.scale_of(index) for index in optics.printed])
     optics = optics.without_prior(sizes.tolist()).with_values(sizes, scales)
-    return refit_jointly(fitted, side, np.union1d(fitted.moving, sizes), optics)
+    moving = np.union1d(fitted.moving, sizes)
+    return _tried(fitted, partial(refit_jointly, fitted, side, moving, optics))
 
 
 def lens_levels(side: FrameModel, fitted: ConvergedFit) -> dict[str, LensLevels]:
@@ -342,8 +345,9 @@ def free_supported_values(side: CellFrameModel, fitted: ConvergedFit) -> Converg
     """
     best = fitted
     for moving in _shape_sets(side, fitted):
-        freed = _fit_freed(side, moving, fitted)
-        if _is_determined(freed, fitted) and not _predicts_worse(freed, fitted):
+        freed = _tried(fitted, partial(_fit_freed, side, moving, fitted))
+        is_other = freed is not fitted and _is_determined(freed, fitted)
+        if is_other and not _predicts_worse(freed, fitted):
             best = freed
             break
     resized = _with_freed_scales(side, _with_contested_lenses(side, best))
@@ -400,8 +404,8 @@ def _with_freed_scales(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedF
         size = _most_wrong_size(side, result)
         if size is None:
             break
-        resized = _with_scale(side, result, size)
-        if not _is_determined(resized, result):
+        resized = _tried(result, partial(_with_scale, side, result, size))
+        if resized is result or not _is_determined(resized, result):
             break
         result = resized
         sizes.append(size)
@@ -458,6 +462,19 @@ def _is_clear(
     scale, sigma = optics.values[place] * (1.0 + prior_information / information), information**-0.5
     tested = replace(size, scale=float(scale), sigma=max(float(sigma), size.sigma))
     return _is_wrong(side, tested)
+
+
+def _tried(fitted: ConvergedFit, refit: Callable[[], ConvergedFit]) -> ConvergedFit:
+    """A refit with more values free; the fit before, where it diverges."""
+    # Cameras that disagree about a stop agree once the board has shrunk to nothing, or the lenses
+    # image nothing: such a fit may converge, but no corner is where it was seen.
+    try:
+        freed = refit()
+    except ConvergenceError:
+        return fitted
+    sigmas = zip(freed.linearised.sigmas_px, fitted.linearised.sigmas_px, strict=True)
+    follows = all(sigma <= FOLLOWS * floored_sigma_px(before) for sigma, before in sigmas)
+    return freed if follows else fitted
 
 
 def _is_determined(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
