@@ -42,8 +42,6 @@ HOMES = {
     "depthai": {"live.drivers"},
     "rtde_control": {"live.drivers"},
     "rtde_receive": {"live.drivers"},
-    "torch": {"vision.dense"},
-    "kornia": {"vision.dense"},
     "dask": {"interchange.batch"},
     "distributed": {"interchange.batch"},
 }
@@ -114,7 +112,7 @@ def test_heavy_libraries_enter_in_one_place():
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
             "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded_cell",
-            {"depthai", "rtde_control", "rtde_receive", "torch", "kornia"},
+            {"depthai", "rtde_control", "rtde_receive"},
         ),
         # A result without a report waits for no plots.
         ("visioncal.calibration.pipeline, visioncal.interchange.outputs", {"matplotlib"}),

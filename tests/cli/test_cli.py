@@ -46,7 +46,6 @@ from visioncal.simulation import (
     truth_path,
     write_session,
 )
-from visioncal.vision.dense.library import DEVICES
 from visioncal.vision.targets import target_names
 
 
@@ -318,7 +317,7 @@ def test_help_has_every_word_within_the_terminal(columns):
 
 
 CHOICES = {
-    "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName), "device": DEVICES},
+    "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName)},
     "plan": {"purpose": PURPOSES, "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
     "simulate": {"robot": SIMULATED_ARMS},

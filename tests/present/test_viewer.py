@@ -20,8 +20,7 @@ from visioncal.present.recording import arm, board, paths, write_recording
 from visioncal.present.recording.accuracy import SIGMAS_95, Uncertainty
 from visioncal.present.viewer import blueprint
 from visioncal.results import Edge
-from visioncal.results.evidence import ExplainedImage, ViewEvidence
-from visioncal.results.sections import DenseResult
+from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.finders import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
 
@@ -46,19 +45,6 @@ def without_joints(sample: Sample) -> Sample:
     return replace(sample, session=replace(session, views=views, columns=columns))
 
 
-def with_explained(sample: Sample) -> Sample:
-    """All images but the second were looked at as `calibrate --dense` does."""
-    grey = cv2.imencode(".jpg", np.full((4, 6), 128, np.uint8))[1].tobytes()
-    evidence = tuple(
-        view
-        if view.view == 1
-        else replace(view, explained=ExplainedImage(grey, grey, "**Sharp.**"))
-        for view in sample.evidence
-    )
-    dense = DenseResult(kept=True, held_out={}, images=())
-    return replace(sample, calibration=replace(sample.calibration, dense=dense), evidence=evidence)
-
-
 @pytest.fixture(scope="module")
 def samples() -> dict[str, Sample]:
     return {
@@ -66,7 +52,6 @@ def samples() -> dict[str, Sample]:
         "poses alone": made_up(images=False),
         "no joints": without_joints(made_up()),
         "tools and fixtures": with_frames(made_up()),
-        "images explained": with_explained(made_up()),
     }
 
 
@@ -109,7 +94,7 @@ def column(path: Path, entity: str, component: str) -> dict[int, object]:
 
 @pytest.mark.parametrize(
     "name",
-    ["images and joints", "poses alone", "no joints", "tools and fixtures", "images explained"],
+    ["images and joints", "poses alone", "no joints", "tools and fixtures"],
 )
 def test_every_panel_shows_something(name, samples, recordings):
     layout = blueprint(samples[name].session, samples[name].calibration)
@@ -131,21 +116,8 @@ def test_panels_are_those_that_the_session_has_something_for(samples):
     assert "in the image" not in poses
     assert "over q1" in poses
     assert "over q1" not in str(tabs(samples["no joints"]))
-    assert "Images explained" not in everything
-    assert len(tabs(samples["images explained"])["Images explained"]) == 4
     assert "Tools and fixtures" not in str(everything)
     assert "Tools and fixtures" in tabs(samples["tools and fixtures"])[first]
-
-
-def test_an_image_that_was_not_explained_takes_the_last_one_back(recordings):
-    for entity in (paths.DRAWN, paths.REST):
-        shown = column(recordings["images explained"], entity, "EncodedImage:blob")
-        cleared = column(recordings["images explained"], entity, "Clear:is_recursive")
-        assert {place for place, blob in shown.items() if blob} == {0, *range(2, 9)}
-        assert {place for place, value in cleared.items() if value is not None} == {1}
-        assert entity not in {
-            str(chunk.entity_path) for chunk in RrdReader(recordings["images and joints"]).stream()
-        }
 
 
 def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):

@@ -1,7 +1,6 @@
 """`visioncal calibrate`."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,13 +68,10 @@ def calibrate_command(
         bool,
         typer.Option(
             "--dense",
-            help="Corners by all pixels around them, for images that are blurred, smeared by "
-            "motion or badly lit; needs torch and kornia (the extra dense).",
+            help="Fit the board to all pixels of images that are too blurred, by focus or motion, "
+            "for the corners to be found.",
         ),
     ] = False,
-    device: Annotated[
-        str, typer.Option(metavar="auto|cpu|cuda", help="Device for --dense.")
-    ] = "auto",
     as_json: AsJson = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Also show every solver's result.")
@@ -93,7 +89,7 @@ def calibrate_command(
     """
     # Imported late, so that --help stays fast.
 
-    from visioncal.calibration.pipeline import run, run_dense
+    from visioncal.calibration.pipeline import run
     from visioncal.calibration.pipeline.running import CalibrationOptions
     from visioncal.cli.console import exit_status, report_written, say, with_run_paths
     from visioncal.cli.parsing import views_in
@@ -116,11 +112,11 @@ def calibrate_command(
         level=level,
         convention=convention,
         threads=work.threads,
+        dense=dense,
     )
     left = frames_to_keep(out)
     with with_run_paths(session, out), shown_progress(quiet=as_json) as progress:
-        calibrated = partial(run_dense, device=device) if dense else run
-        result = calibrated(loaded, **(asked | {"progress": progress}))
+        result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
         result = result.with_paths(session, out)
         if left is not None:

@@ -12,7 +12,7 @@ WORDS = {
     "robot": "read the robot",
     "readings": "read the instruments",
     "detect": "detect the board",
-    "dense": "refine corners by all pixels",
+    "dense": "fit boards to blurred images",
     "intrinsics": "estimate the lens",
     "pnp": "locate the board in each view",
     "clock": "compare the clocks",

@@ -13,21 +13,6 @@ _SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class ExplainedImage:
-    """An image compared with its rendering by the calibration, with measured blur and light.
-
-    Attributes:
-        drawn: The image with the board rendered in its place, as JPEG.
-        rest: The magnified difference, about a middle grey, as JPEG.
-        words: Description of blur and difference, in Markdown.
-    """
-
-    drawn: bytes
-    rest: bytes
-    words: str
-
-
-@dataclass(frozen=True, eq=False)
 class ViewEvidence:
     """Observations and predictions of one view, for report and recording.
 
@@ -38,7 +23,6 @@ class ViewEvidence:
         base_from_flange: (4, 4) as reported by the controller, or by the calibrated arm where there
             is one.
         cam_from_target: (4, 4) as estimated from this view alone.
-        explained: Comparison of image and rendering, where computed; not read back.
     """
 
     view: int
@@ -46,7 +30,6 @@ class ViewEvidence:
     predicted_px: FloatArray | None = None
     base_from_flange: FloatArray | None = None
     cam_from_target: FloatArray | None = None
-    explained: ExplainedImage | None = None
 
 
 def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:

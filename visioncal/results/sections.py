@@ -278,48 +278,32 @@ class CellJointFit(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CornerResiduals:
-    """Residuals of left-out views [mm, px]; None where there are none."""
-
-    mm: float
-    px: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class ImageBlur:
     """Blur of an image.
 
     Attributes:
         view: The view's number.
-        sigma_px: Standard deviation of the lens's blur [px].
-        disc_px: Radius of the defocus disc [px].
+        sigma_px: Standard deviation of the blur of lens and defocus [px].
         motion_px: Length of the motion blur [px].
         motion_deg: Its direction, from the image's x [deg].
-        tone: Nonlinearity of its tones (see `vision.dense.fit`).
-        pixel_noise: Standard deviation of a pixel [grey levels].
+        pixel_noise: Standard deviation of a pixel, once the image is reduced [grey levels].
     """
 
     view: int
     sigma_px: float
-    disc_px: float
     motion_px: float
     motion_deg: float
-    tone: float
     pixel_noise: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class DenseResult(Section):
-    """Comparison of corners by dense image fits with template corners: `dense`.
+    """Views whose corners are by all pixels of their images: `dense`.
 
     Attributes:
-        kept: Whether the dense corners were used.
-        held_out: Residuals of left-out views, with corners by `template` and `dense`.
         images: Blur of each image.
     """
 
-    kept: bool
-    held_out: Mapping[str, CornerResiduals]
     images: tuple[ImageBlur, ...]
 
 
@@ -372,7 +356,7 @@ class CalibrationSections(ArmSections):
         uncertainty: Uncertainty of a point located where the views look.
         means: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
         joint_fit: Parameters of the fit and their covariance, for verification.
-        dense: Comparison of corners by dense image fits with template corners.
+        dense: Views whose corners are by all pixels of their images; None where not asked for.
         touch_test: Result of a touch test.
         further: Unknown sections, kept as they are.
     """

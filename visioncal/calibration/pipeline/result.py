@@ -44,7 +44,9 @@ from visioncal.results.sections import (
     CellDetails,
     CellJointFit,
     CellUncertainty,
+    DenseResult,
     FittedArm,
+    ImageBlur,
     InstrumentResult,
     Intervals,
     JointFit,
@@ -99,6 +101,7 @@ def result_of(run: RunState) -> Calibration:
         boards=boards,
         rigs=rigs,
         cell=cell,
+        dense=_dense(run),
         need=need_met(findings.need, findings.judged_picks, whole=cell is not None),
     )
     return calibration if cell is not None else _complete_pair(calibration, run, names)
@@ -129,6 +132,23 @@ def _complete_pair(
         means=_means_of(run),
         joint_fit=_joint_fit_of(run),
         **vars(_arm(run)),
+    )
+
+
+def _dense(run: RunState) -> DenseResult | None:
+    if run.dense is None:
+        return None
+    return DenseResult(
+        images=tuple(
+            ImageBlur(
+                view=view,
+                sigma_px=found.blur_px,
+                motion_px=float(np.hypot(*found.motion_px)),
+                motion_deg=float(np.rad2deg(np.arctan2(*found.motion_px[::-1])) % 180.0),
+                pixel_noise=found.noise,
+            )
+            for view, found in run.dense.items()
+        )
     )
 
 

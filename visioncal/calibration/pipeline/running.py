@@ -22,7 +22,6 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cause_ranking import with_misread, with_other_board
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.validate import predict_corners
@@ -50,13 +49,11 @@ class Run:
     Attributes:
         calibration: The result.
         evidence: One entry for each view of the session.
-        dense: The dense corner fit, where it was requested.
         left_out: Residual of each view, by a fit without its stop [m], [px].
     """
 
     calibration: Calibration
     evidence: tuple[ViewEvidence, ...]
-    dense: Dense | None = None
     left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     def with_paths(self, session: Path | str, out: Path | str) -> "Run":
@@ -73,20 +70,16 @@ class CalibrationOptions(TypedDict, total=False):
     convention: Convention | None
     progress: Progress | None
     threads: int | None
+    dense: bool
 
 
-def run(
-    session: Session | Path | str,
-    *,
-    dense: Dense | None = None,
-    **asked: Unpack[CalibrationOptions],
-) -> Run:
+def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    state = run_stages(replace(initial_state(session, **asked), dense=dense))
+    state = run_stages(initial_state(session, **asked))
     held_out = state.assessment.held_out
     residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
-    return Run(result_of(state), view_evidence(state), state.dense, left_out)
+    return Run(result_of(state), view_evidence(state), left_out)
 
 
 def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
@@ -101,6 +94,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
         loaded,
         asked.get("progress"),
         threads or 0,
+        dense={} if asked.get("dense") else None,
         solver=solver,
         level=level,
         convention=convention,

@@ -8,8 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.stages.dense import fit_densely
-from visioncal.calibration.stages.detect import Detections, detect
+from visioncal.calibration.stages.detect import Detections, detect, image_of
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
@@ -18,12 +17,15 @@ from visioncal.calibration.stages.repeats import listed, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.types import Camera, Corners
+from visioncal.core.types import Camera, Corners, FloatArray, Rejection
 from visioncal.core.verdict import EMPTY_IMAGE, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
 from visioncal.session.tables import CameraTable
+from visioncal.vision.dense import KINDS as DENSE_KINDS
+from visioncal.vision.dense import DenseCorners, find_densely
+from visioncal.vision.finders.template import refine
 from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
@@ -37,6 +39,8 @@ _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
 # [share], by more sigmas than a bent board causes, and the residual falls below this share.
 _DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
 _OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
+# Views that show how exact the template's corners are.
+_SAMPLE = 4
 # Advice for corners without images.
 COUNTED_BACKWARDS = (
     "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
@@ -69,14 +73,73 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                     among=views,
                     threads=seen.threads,
                 )
+            if seen.dense is not None:
+                seen, detections = _with_dense(seen, views, detections)
             corners, resolution = detections.corners, detections.resolution
             seen = seen.noting(detections.rejections, _other_size_findings(session, detections))
-            if seen.dense is not None:
-                corners, dense = fit_densely(session, views, corners, seen.dense, seen.progress)
-                seen = replace(seen, dense=dense)
         numbered = _numbered_through(session, views, corners)
         seen = seen.with_camera(frame, CameraObservations(table, numbered, resolution))
     return without_repeats(seen)
+
+
+def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple[T, Detections]:
+    """Brings in views whose images the template refuses, by all pixels of their boards."""
+    session, rows = seen.session, {view.number: view for view in views}
+    refused = [
+        view
+        for view in (rows[rejection.view] for rejection in detections.rejections)
+        if not view.has_corners
+        and view.number not in detections.other_sizes
+        and session.boards[session.board_of(view)].kind in DENSE_KINDS
+    ]
+
+    found: dict[int, DenseCorners] = {}
+    for count, view in enumerate(refused, start=1):
+        image = image_of(session, view)
+        dense = (
+            None
+            if isinstance(image, Rejection)
+            else find_densely(image, session.boards[session.board_of(view)])
+        )
+        if dense is not None:
+            found[view.number] = dense
+        if seen.progress is not None:
+            seen.progress("dense", count, len(refused))
+    if not found:
+        return seen, detections
+    # Weights are relative to corners of the template, where it has some.
+    sample = [rows[view] for view in list(detections.corners)[:_SAMPLE] if rows[view].image]
+    sigmas = [found[view].sigma_px for view in found]
+    if sample:
+        sigmas = [
+            _template_sigma_px(session, view, detections.corners[view.number]) for view in sample
+        ]
+    typical_px = float(np.nanmedian(np.concatenate(sigmas)))
+    corners = {
+        view: Corners(view, at.ids, at.px, at.width_px, typical_px / at.sigma_px)
+        for view, at in found.items()
+    } | dict(detections.corners)
+    widest = max(found, key=lambda view: found[view].width_px)
+    moved_px = float(np.hypot(*found[widest].motion_px))
+    note = (
+        f"The corners of {len(found)} view{'s' if len(found) > 1 else ''} are by all pixels of "
+        f"their images (--dense), as these are blurred: {listed(tuple(found))}; most in view "
+        f"{widest}, by edges of {found[widest].width_px:.1f} px and a motion of {moved_px:.1f} px."
+    )
+    dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
+    return dense_seen, replace(
+        detections,
+        corners={view.number: corners[view.number] for view in views if view.number in corners},
+        rejections=tuple(lost for lost in detections.rejections if lost.view not in found),
+    )
+
+
+def _template_sigma_px(session: Session, view: View, corners: Corners) -> FloatArray:
+    """(n,) standard deviations of a view's corners by the template; none where it has no image."""
+    image = image_of(session, view)
+    if isinstance(image, Rejection):
+        return np.zeros(0)
+    return refine(image, session.boards[session.board_of(view)], corners.ids, corners.px).sigma_px
 
 
 def estimate_lenses(seen: T) -> T:

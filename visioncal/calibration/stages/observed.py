@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Self
 
 from visioncal.calibration.stages.clock_sweep import ClockedViews, ClockPair
-from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.turned_images import ImageTurn
@@ -22,6 +21,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.images import FolderImages
 from visioncal.session.tables import CameraTable
+from visioncal.vision.dense import DenseCorners
 
 # Views of one reason that are listed.
 _LISTED = 40
@@ -62,7 +62,8 @@ class Observed:
         clocks: Relations of the clocks of cameras and robots, where robots' streams are used.
         warnings: Findings for the user.
         notes: Remarks that are no reason for doubt.
-        dense: How corners are fitted by all pixels around them; None for the template's.
+        dense: Corners by all pixels of images that the template refuses, by view; None where these
+            are not asked for.
         is_misread: Whether robots' poses are clearly misread, so that they determine nothing of
             lenses and boards.
         turned: How turned or mirrored images, which determine nothing of their lens, were turned,
@@ -80,7 +81,7 @@ class Observed:
     clocks: Mapping[ClockPair, ClockedViews] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
-    dense: Dense | None = None
+    dense: Mapping[int, DenseCorners] | None = None
     is_misread: bool = False
     turned: Mapping[int, ImageTurn] = field(default_factory=dict)
 

@@ -46,11 +46,6 @@ DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
-# Rendered images and their residuals.
-DRAWN = "/explained/board_as_it_should_look"
-REST = "/explained/not_explained"
-BLUR_NOTE = "/notes/blur"
-
 # The calibrated arm.
 WORKSPACE = "/arm/workspace"
 NOMINAL_ARM = "/arm/as_stated"

@@ -109,10 +109,6 @@ def _draw(
     seen = [evidence.get(view.number, ViewEvidence(view.number)) for view in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
-    if any(view.explained is not None for view in seen):
-        for row, view in enumerate(seen):
-            recorder.at(row)
-            _log_explained(stream, view)
     if calibration is not None:
         _log_views(stream, session, calibration, scene)
     recorder.keep()
@@ -248,18 +244,3 @@ def _damaged(path: Path) -> DataError:
         culprits=[str(path)],
         next_step="Calibrate the session in it again.",
     )
-
-
-def _log_explained(stream: rr.RecordingStream, seen: ViewEvidence) -> None:
-    """Logs a view's rendered images at the stream's current time, or clears the previous ones."""
-    explained = seen.explained
-    for entity, image in (
-        (paths.DRAWN, None if explained is None else explained.drawn),
-        (paths.REST, None if explained is None else explained.rest),
-    ):
-        if image is None:
-            stream.log(entity, rr.Clear(recursive=False))
-        else:
-            stream.log(entity, rr.EncodedImage(contents=image, media_type="image/jpeg"))
-    words = "This image was not looked at." if explained is None else explained.words
-    stream.log(paths.BLUR_NOTE, rr.TextDocument(words, media_type="text/markdown"))

@@ -64,8 +64,6 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     if contents.cell is not None:
         tabs.append(rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK))
     tabs += [] if calibration is None else _arms(calibration, eye)
-    if calibration is not None and calibration.dense is not None:
-        tabs.append(_explained())
     tabs.append(_residuals(contents))
     if contents.cell is None:
         tabs.append(_coverage(contents))
@@ -153,22 +151,6 @@ def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
         return None
     width, height = (float(max(pair)) for pair in zip(*sizes, strict=True))
     return rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
-
-
-def _explained() -> rrb.Container:
-    """The image, its rendering from the calibration, and their difference."""
-    images = rrb.Horizontal(
-        *(
-            rrb.Spatial2DView(name=name, origin=entity, contents=["$origin"])
-            for name, entity in (
-                ("Image", paths.IMAGE),
-                ("As calibration, blur and light have it", paths.DRAWN),
-                ("Not explained", paths.REST),
-            )
-        )
-    )
-    note = rrb.TextDocumentView(name="What blurs it", origin=paths.BLUR_NOTE)
-    return rrb.Vertical(images, note, name="Images explained", row_shares=[4, 1])
 
 
 def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:

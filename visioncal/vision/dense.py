@@ -1,0 +1,380 @@
+"""Corners of a board in a blurred image that the template refuses, by a fit to all its pixels.
+
+The image of a board is its print, seen through a homography and a radial lens, convolved with the
+image's point-spread function, times the light:
+
+    grey(p) = o(p) + g(p) (L * h)(p),   h^(w) = exp(-|w|^2 s^2 / 2) sinc(w . m / 2),
+
+with L the print, s the Gaussian of lens and defocus, m the motion during the exposure, and o and g
+linear over the image. Levenberg and Marquardt's method fits all unknowns. A corner's own position
+is its shift against that model, by the pixels half way to the next corners: patches share no pixel,
+so that corners are independent, and a lens bent in another way biases none. A convolution that is
+even, as one with the disc of defocus, moves no corner.
+
+Images are reduced until a square has about 16 px: a blur of such a share of a square leaves nothing
+finer. The start is the detector's corners where it has enough, or else a search for the grid in
+reduced copies, where even the markers of a ChArUco board are blurred to grey squares.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
+from visioncal.vision.finders import find_target
+from visioncal.vision.finders.result import DetectedCorners
+from visioncal.vision.print_shapes import dark_cells
+from visioncal.vision.targets import corner_positions
+
+KINDS = ("charuco", "checkerboard")
+# Side of a square that images are reduced to [px], and texels per square: a texel is half a pixel.
+_SQUARE_PX, _TEXELS = 16.0, 32
+# Blur of the print before it is sampled once a pixel; narrower edges would alias [px].
+_DRAWN_PX = 0.5
+# White paper around the print, and how much of it is fitted [squares].
+_PAPER, _RIM = 2, 0.25
+# Prior sigma of the relative radial distortion at the image's corner, which some views leave open.
+_BENDING = 0.3
+# Most steps of the fit, and the relative fall of the cost that ends it.
+_STEPS, _SETTLED = 40, 1e-5
+# Fewest corners that are worth a view, as for detected ones.
+_FEWEST = 6
+# Least share of the board's variance that the fit explains. A board shifted by a square, turned or
+# another one explains at most 0.8, as its markers or its rim differ.
+_LEAST_EXPLAINED = 0.9
+# A corner's contrast relative to the model's, its largest shift [squares], and the largest variance
+# of its pixels over the median: elsewhere, something else is in the image.
+_CONTRAST, _MOST_SHIFT, _MOST_VARIANCE = (0.5, 2.0), 0.15, 4.0
+# Searches for the grid: reduced side of the image, and sigma of the smoothing after it [px].
+_SEARCHES = ((320, 0.0), (320, 1.5), (640, 0.0), (640, 2.0), (640, 3.0), (640, 6.0))
+
+
+@dataclass(frozen=True, eq=False)
+class DenseCorners:
+    """Corners of one image, and what blurs it.
+
+    Attributes:
+        ids: (n,) corner ids, ascending.
+        px: (n, 2) positions [px].
+        sigma_px: (n,) standard deviation of a coordinate, from the residuals [px].
+        blur_px: Sigma of the Gaussian [px].
+        motion_px: (2,) motion along u and v during the exposure; its sign is arbitrary [px].
+        noise: Standard deviation of a pixel of the reduced image [grey levels].
+    """
+
+    ids: IntArray
+    px: FloatArray
+    sigma_px: FloatArray
+    blur_px: float
+    motion_px: FloatArray
+    noise: float
+
+    @property
+    def width_px(self) -> float:
+        """Edge width as a Gaussian's sigma, across the widest edges [px]."""
+        return float(np.sqrt(self.blur_px**2 + np.sum(self.motion_px**2) / 12))
+
+
+def find_densely(image: Image, target: Target) -> DenseCorners | None:
+    """Corners of a checkerboard or a ChArUco board, by all pixels of a (h, w) grey image.
+
+    Returns:
+        The corners; None where no start is found, or the board explains too little of the image.
+    """
+    for ids, px in _starts(image, target):
+        board = corner_positions(target)[ids, :2] / target.square_m
+        if all(np.linalg.matrix_rank(at - at.mean(axis=0)) == 2 for at in (board, px)):
+            with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+                found = _Fit.of(image, target, board, px).corners()
+                if found is not None:
+                    return found
+    return None
+
+
+def _starts(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Possible positions of corners, to a third of a square; the likeliest first."""
+    seen = find_target(image, target)
+    if isinstance(seen, DetectedCorners) and len(seen.ids) >= _FEWEST:
+        yield seen.ids, seen.px
+        return
+    ids = np.arange(len(corner_positions(target)))
+    columns = target.columns - (target.kind == "charuco")
+    for side_px, sigma_px in _SEARCHES:
+        factor = max(1, round(max(image.shape) / side_px))
+        small = cv2.resize(image, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        if sigma_px:
+            small = cv2.GaussianBlur(small, (0, 0), sigma_px)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, px = cv2.findChessboardCornersSB(small, (columns, len(ids) // columns), flags=flags)
+        if found:
+            px = factor * np.asarray(px, float).reshape(-1, 2) + (factor - 1) / 2
+            # The grid looks alike when turned by half a turn.
+            yield from ((ids, px), (ids, px[::-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A part of a reduced image, and the print that is fitted to it.
+
+    The parameters are the homography from normalised pixels to squares (8), the lens (1), s and m
+    (3), and o and g with their slopes (6).
+
+    Attributes:
+        target: The board.
+        factor: By how much the image is reduced.
+        image: (h, w) the part; NaN outside the image.
+        places: (h, w, 2) pixels relative to the middle of the image, in half its diagonal.
+        unit_px: (3,) middle and half the diagonal of the reduced image [px].
+        texture: The print, light being 1.
+        start: (8,) homography to start from.
+        side_px: Side of a square [px].
+    """
+
+    target: Target
+    factor: int
+    image: FloatArray
+    places: FloatArray
+    unit_px: FloatArray
+    texture: FloatArray
+    start: FloatArray
+    side_px: float
+
+    @classmethod
+    def of(cls, image: Image, target: Target, board: FloatArray, px: FloatArray) -> Self:
+        """Reduces an image about (n, 2) places of a board [squares] at (n, 2) pixels."""
+        flat = np.asarray(cv2.findHomography(board, px)[0], float)
+        ends = board.mean(axis=0) + np.array([[[0.0, 0], [1, 0], [0, 1]]])
+        ends = cv2.perspectiveTransform(ends, flat)[0]
+        side_px = float(np.sqrt(abs(np.linalg.det(ends[1:] - ends[0]))))
+        factor = max(1, round(side_px / _SQUARE_PX))
+        size = np.array(image.shape[::-1]) // factor
+        small = image[: factor * size[1], : factor * size[0]]
+        small = small.reshape(size[1], factor, size[0], factor).mean(axis=(1, 3))
+        outline = corner_positions(target)[:, :2] / target.square_m
+        # The print ends a square beyond its corners; half a square more of paper blurs into it.
+        ends = np.array([outline.min(axis=0) - 2.0, outline.max(axis=0) + 2.0])
+        edges = np.array([[ends[i, 0], ends[j, 1]] for i in (0, 1) for j in (0, 1)])
+        bounds = cv2.perspectiveTransform(edges[None], flat)[0] / factor
+        low = np.floor(np.clip(bounds.min(axis=0), -side_px, size)).astype(int)
+        high = np.ceil(np.clip(bounds.max(axis=0), 0, size + side_px)).astype(int)
+        u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+        inside = (u >= 0) & (v >= 0) & (u < size[0]) & (v < size[1])
+        part = small[v.clip(0, size[1] - 1), u.clip(0, size[0] - 1)]
+        unit = np.array([*(size - 1) / 2, np.linalg.norm(size) / 2])
+        px = ((px - (factor - 1) / 2) / factor - unit[:2]) / unit[2]
+        return cls(
+            target,
+            factor,
+            np.where(inside, part, np.nan),
+            (np.stack([u, v], axis=-1) - unit[:2]) / unit[2],
+            unit,
+            _texture(target, _DRAWN_PX * factor / side_px),
+            np.asarray(cv2.findHomography(px, board)[0], float).ravel()[:8],
+            side_px / factor,
+        )
+
+    def on_board(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(h, w, 2) places of all pixels on the board [squares]; (9, h, w, 2) derivatives."""
+        radii = np.sum(self.places**2, axis=-1, keepdims=True)
+        straight = self.places / (1 + values[8] * radii)
+        flat = np.append(values[:8], 1.0).reshape(3, 3)
+        terms = np.concatenate([straight, np.ones_like(radii)], axis=-1)
+        mapped = terms @ flat.T
+        at, depth = mapped[..., :2] / mapped[..., 2:], mapped[..., 2:]
+        derivatives = np.zeros((9, *at.shape))
+        for axis in (0, 1):
+            derivatives[3 * axis : 3 * axis + 3, ..., axis] = np.moveaxis(terms / depth, -1, 0)
+        derivatives[6:8] = -np.moveaxis(straight / depth, -1, 0)[..., None] * at
+        bending = -straight * radii / (1 + values[8] * radii)
+        slopes = bending @ flat[:, :2].T
+        derivatives[8] = (slopes[..., :2] - at * slopes[..., 2:]) / depth
+        return at, derivatives
+
+    def blurred(self, values: FloatArray, *, slopes: bool = False) -> FloatArray:
+        """(h, w) the blurred print; or (15, h, w) with its derivatives.
+
+        These are by the twelve parameters of place and blur, and by u and v [1/px].
+        """
+        at, by_place = self.on_board(values)
+        size = np.array(self.texture.shape[::-1])
+        texels = np.clip(_TEXELS * (at + 1 + _PAPER) - 0.5, 0.0, size - 1.001)
+        first = texels.astype(int)
+        x, y = np.moveaxis(texels - first, -1, 0)
+        i, j = np.moveaxis(first, -1, 0)
+        near, right = self.texture[j, i], self.texture[j, i + 1]
+        below, across = self.texture[j + 1, i], self.texture[j + 1, i + 1]
+        drawn = (1 - y) * ((1 - x) * near + x * right) + y * ((1 - x) * below + x * across) - 1.0
+        height, width = drawn.shape
+        wu = 2 * np.pi * fft.rfftfreq(width)
+        wv = 2 * np.pi * fft.fftfreq(height)[:, None]
+        square, half = wu**2 + wv**2, 0.5 * (wu * values[10] + wv * values[11])
+        gauss, line = np.exp(-0.5 * square * values[9] ** 2), np.sinc(half / np.pi)
+        spectrum = fft.rfft2(drawn) * gauss
+        if not slopes:
+            return np.asarray(fft.irfft2(spectrum * line, s=drawn.shape) + 1.0)
+        by_x = _TEXELS * ((1 - y) * (right - near) + y * (across - below))
+        by_y = _TEXELS * ((1 - x) * (below - near) + x * (across - right))
+        moved = fft.rfft2(by_x * by_place[..., 0] + by_y * by_place[..., 1]) * gauss * line
+        safe = np.where(np.abs(half) < 1e-4, 1.0, half)
+        by_half = np.where(np.abs(half) < 1e-4, -half / 3, (np.cos(half) - line) / safe)
+        others = np.stack([
+            -values[9] * square * line, 0.5 * wu * by_half, 0.5 * wv * by_half,
+            1j * wu * line, 1j * wv * line,
+        ])  # fmt: skip
+        parts = np.concatenate([(spectrum * line)[None], moved, spectrum * others])
+        images = fft.irfft2(parts, s=drawn.shape)
+        images[0] += 1.0
+        return np.asarray(images)
+
+    @cached_property
+    def light(self) -> FloatArray:
+        """(h, w, 3) terms of the light."""
+        return np.concatenate([np.ones_like(self.places[..., :1]), self.places], axis=-1)
+
+    def residuals(self, values: FloatArray, used: Mask) -> FloatArray:
+        """(n,) model less image, at the used pixels [grey levels]."""
+        gain, offset = self.light @ values[15:18], self.light @ values[12:15]
+        return np.asarray((offset + gain * self.blurred(values) - self.image)[used])
+
+    def used(self, values: FloatArray) -> Mask:
+        """(h, w) mask of pixels of the board and a rim around it."""
+        at = self.on_board(values)[0]
+        low = np.full(2, -1.0 if self.target.kind == "checkerboard" else 0.0)
+        high = low + _squares(self.target)
+        on_board = np.all((at > low - _RIM) & (at < high + _RIM), axis=-1)
+        return np.asarray(on_board & np.isfinite(self.image))
+
+    def starts(self, used: Mask) -> Iterator[tuple[float, FloatArray]]:
+        """Parameters with blurs to begin from, and the best light for each, with their costs."""
+        angles = np.pi / 6 * np.arange(6)
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        # Without motion its derivatives are zero.
+        blurs = [(0.15, 0.1 * directions[0])]
+        blurs += [(0.05, length * along) for length in (0.25, 0.5, 0.9) for along in directions]
+        light = self.light[used]
+        for sigma, motion in blurs:
+            values = np.concatenate([self.start, [0.0], self.side_px * np.array([sigma, *motion])])
+            terms = np.concatenate([light, light * self.blurred(values)[used][:, None]], axis=1)
+            solved = np.linalg.lstsq(terms, self.image[used])[0]
+            rest = self.image[used] - terms @ solved
+            # Where dark is light, the board is turned or shifted by a square.
+            yield float(rest @ rest) if solved[3] > 0.0 else np.inf, np.append(values, solved)
+
+    def solved(self) -> tuple[FloatArray, float]:
+        """The parameters that fit best, and the explained share of the board's variance."""
+        used = self.used(np.append(self.start, np.zeros(10)))
+        if used.sum() < _FEWEST * _SQUARE_PX**2 / 4:
+            return self.start, 0.0
+        cost, values = min(self.starts(used), key=lambda at: at[0])
+        if not np.isfinite(cost):
+            return values, 0.0
+        damping = 1e-3
+        for _ in range(_STEPS):
+            images = self.blurred(values, slopes=True)[:, used]
+            light = self.light[used].T
+            jacobian = np.concatenate(
+                [(values[15:18] @ light) * images[1:13], light, light * images[0]]
+            )
+            rest = self.residuals(values, used)
+            normal, gradient = jacobian @ jacobian.T, jacobian @ rest
+            weight = cost / len(rest) / _BENDING**2
+            normal[8, 8] += weight
+            gradient[8] += weight * values[8]
+            before = cost
+            while damping < 1e6:
+                damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
+                trial = values - np.linalg.solve(damped, gradient)
+                trial_cost = float(np.sum(self.residuals(trial, used) ** 2))
+                damping *= 0.2 if trial_cost < cost else 5.0
+                if trial_cost < cost:
+                    values, cost = trial, trial_cost
+                    break
+            if not cost < (1.0 - _SETTLED) * before:
+                break
+        return values, 1.0 - cost / float(np.var(self.image[used]) * used.sum())
+
+    def corners(self) -> DenseCorners | None:
+        """The corners; None where the board explains too little of the image."""
+        values, explained = self.solved()
+        if explained < _LEAST_EXPLAINED:
+            return None
+        gain, board = self.light @ values[15:18], self.on_board(values)[0]
+        images = self.blurred(values, slopes=True)[[0, 13, 14]]
+        terms = np.concatenate([np.ones_like(gain)[None], gain * images])
+        grey = self.image - self.light @ values[12:15]
+        places = corner_positions(self.target)[:, :2] / self.target.square_m
+        px = self._in_image(values, places)
+        rows: list[tuple[int, FloatArray, float, float]] = []
+        for number, (place, at) in enumerate(zip(places, px, strict=True)):
+            patch = (np.abs(board - place) < 0.5).all(axis=-1)
+            inside = patch & np.isfinite(grey)
+            # A patch cut off by the image's edge is even about the corner no longer.
+            if inside.sum() < max(30.0, 0.9 * patch.sum()):
+                continue
+            columns = terms[:, inside].T
+            inverse = np.linalg.pinv(columns.T @ columns)
+            solution = inverse @ (columns.T @ grey[inside])
+            variance = np.mean((grey[inside] - columns @ solution) ** 2)
+            variance *= len(columns) / (len(columns) - 4)
+            contrast, shift = solution[1], -solution[2:] / solution[1]
+            if (
+                _CONTRAST[0] < contrast < _CONTRAST[1]
+                and np.linalg.norm(shift) < _MOST_SHIFT * self.side_px
+            ):
+                sigma = np.sqrt(variance * np.trace(inverse[2:, 2:]) / 2) / contrast
+                rows.append((number, at + shift, float(sigma), float(variance)))
+        typical = np.median([row[3] for row in rows]) if rows else np.inf
+        rows = [row for row in rows if row[3] < _MOST_VARIANCE * typical]
+        if len(rows) < _FEWEST:
+            return None
+        ids, positions, sigmas, _ = (np.array(column) for column in zip(*rows, strict=True))
+        sigma_px = np.sqrt(float(values[9]) ** 2 + _DRAWN_PX**2 - (1 - self.factor**-2) / 12)
+        return DenseCorners(
+            ids,
+            self.factor * positions + (self.factor - 1) / 2,
+            self.factor * sigmas,
+            self.factor * float(sigma_px),
+            self.factor * values[10:12],
+            float(np.sqrt(typical)),
+        )
+
+    def _in_image(self, values: FloatArray, places: FloatArray) -> FloatArray:
+        """(n, 2) pixels of the reduced image where (n, 2) places on the board are seen."""
+        flat = np.linalg.inv(np.append(values[:8], 1.0).reshape(3, 3))
+        straight = cv2.perspectiveTransform(places[None], flat)[0]
+        bent = straight
+        # A fixed point: distortion in the image is slight.
+        for _ in range(50):
+            bent = straight * (1 + values[8] * np.sum(bent**2, axis=1, keepdims=True))
+        return np.asarray(self.unit_px[:2] + self.unit_px[2] * bent)
+
+
+def _squares(target: Target) -> tuple[int, int]:
+    """Squares along x and y of a print."""
+    more = target.kind == "checkerboard"
+    return target.columns + more, target.rows + more
+
+
+def _texture(target: Target, blur: float) -> FloatArray:
+    """The print with paper around it, light being 1; blurred by a share of a square."""
+    columns, rows = (_TEXELS * (count + 2 * (1 + _PAPER)) for count in _squares(target))
+    texture = np.ones((rows, columns))
+    for cells in dark_cells(target):
+        shares = []
+        for axis, size in ((0, columns), (1, rows)):
+            cell = _TEXELS * cells.cell_m / target.square_m
+            first = _TEXELS * (cells.corner_m[axis] / target.square_m + 1 + _PAPER)
+            edges = first + cell * np.arange(cells.dark.shape[1 - axis] + 1)
+            texels = np.arange(size)[:, None]
+            shares.append(
+                np.clip(np.minimum(texels + 1, edges[1:]) - np.maximum(texels, edges[:-1]), 0, 1)
+            )
+        texture -= shares[1] @ cells.dark @ shares[0].T
+    # Dark squares of a ChArUco board and its markers share no area.
+    return np.asarray(cv2.GaussianBlur(texture, (0, 0), _TEXELS * blur), float)

@@ -1,1 +1,0 @@
-"""Dense corner fitting in blurred, moving and badly lit images, with torch and kornia."""
