@@ -57,17 +57,11 @@ Judge = Callable[[Mapping[str, Any], Path, Ask], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Made:
-    """A session on disk, and how what a checkout makes of it is judged.
+    """A session on disk, and how what a checkout makes of it is judged."""
 
-    Attributes:
-        session: What is calibrated.
-        judge: What is measured of calibration.json, as fields of `Outcome`.
-        cause: What the first cause is to look like, of a world that has a fault.
-    """
-
-    session: Path
-    judge: Judge = lambda *_: {}
-    cause: str = ""
+    session: Path  # What is calibrated.
+    judge: Judge = lambda *_: {}  # What is measured of calibration.json, as fields of `Outcome`.
+    cause: str = ""  # What the first cause is to look like, of a world that has a fault.
 
     def run(self, ask: Ask, out: Path) -> Outcome:
         """Has a checkout calibrate, and judges."""

@@ -81,27 +81,18 @@ def shots(kind: str) -> Iterator[tuple[str, Shot]]:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the tables.
-
-    Attributes:
-        corners: How many were found in all pictures.
-        peer_px: Rms of a coordinate, of the best of the peers.
-        core_px: That of the template.
-        bias_px: Rms of what the corners of a picture share, of peer and template.
-        outliers: Shares farther off than `OUTLIER_PX`, of peer and template.
-        left: Share of corners that the template does not fit.
-        nees: Mean squared error of the template over its variance.
-    """
+    """One row of the tables."""
 
     words: str
     shot: Shot
-    corners: int
-    peer_px: float
-    core_px: float
+    corners: int  # How many were found in all pictures.
+    peer_px: float  # Rms of a coordinate, of the best of the peers.
+    core_px: float  # That of the template.
+    # Rms of what the corners of a picture share, of peer and template.
     bias_px: tuple[float, float]
-    outliers: tuple[float, float]
-    left: float
-    nees: float
+    outliers: tuple[float, float]  # Shares farther off than `OUTLIER_PX`, of peer and template.
+    left: float  # Share of corners that the template does not fit.
+    nees: float  # Mean squared error of the template over its variance.
 
     @property
     def ratio(self) -> float:

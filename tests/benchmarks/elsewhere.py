@@ -48,33 +48,24 @@ BEYOND = float(chi2.isf(2.0 * norm.sf(3.0), 6)) / 6
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What is wrong with a cell, beside noise.
+    """What is wrong with a cell, beside noise."""
 
-    Attributes:
-        views: How many stops.
-        pixel_px: Noise of a corner's coordinate, an axis [px].
-        robot_m: Noise of the flange's place, an axis [m].
-        robot_rad: And of its rotation [rad].
-        shift: (n, 2) pixels to (n, 2) displacements, drawn by a seed: a lens beyond its model.
-        focus: By distance over the mean one, and by view: factors of the focal length.
-        board: (c, 3) corners to where they really are, drawn by a seed.
-        robot: (m, 4, 4) poses to what is reported of them, drawn by a seed, before noise.
-        lift: By what a share of the session, from -0.5 to 0.5, gives the robot's base has risen.
-        off_px: Standard deviation of what given fx, fy, cx, cy are off by [px].
-        is_said: Whether the session says so.
-    """
-
-    views: int = 22
-    pixel_px: float = 0.05
-    robot_m: float = 5e-5
-    robot_rad: float = 1e-4
+    views: int = 22  # How many stops.
+    pixel_px: float = 0.05  # Noise of a corner's coordinate, an axis [px].
+    robot_m: float = 5e-5  # Noise of the flange's place, an axis [m].
+    robot_rad: float = 1e-4  # And of its rotation [rad].
+    # (n, 2) pixels to (n, 2) displacements, drawn by a seed: a lens beyond its model.
     shift: Callable[[np.random.Generator], Callable[[np.ndarray], np.ndarray]] | None = None
+    # By distance over the mean one, and by view: factors of the focal length.
     focus: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    # (c, 3) corners to where they really are, drawn by a seed.
     board: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    # (m, 4, 4) poses to what is reported of them, drawn by a seed, before noise.
     robot: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None
+    # By what a share of the session, from -0.5 to 0.5, gives the robot's base has risen.
     lift: Callable[[np.ndarray], np.ndarray] | None = None
-    off_px: float = 0.0
-    is_said: bool = False
+    off_px: float = 0.0  # Standard deviation of what given fx, fy, cx, cy are off by [px].
+    is_said: bool = False  # Whether the session says so.
     noise: Callable[[tuple[int, int], np.random.Generator], np.ndarray] = field(
         default=lambda shape, rng: rng.normal(size=shape)
     )
@@ -545,19 +536,12 @@ def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dic
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """One more image, of a point that is to be picked.
+    """One more image, of a point that is to be picked."""
 
-    Attributes:
-        px: (2,) its pixel.
-        point: (3,) where it is in the base of which the robot reports.
-        normal: (3,) of the plane that it lies in: across the camera's axis.
-        reported: (4, 4) where the robot says that it was.
-    """
-
-    px: np.ndarray
-    point: np.ndarray
-    normal: np.ndarray
-    reported: np.ndarray
+    px: np.ndarray  # (2,) its pixel.
+    point: np.ndarray  # (3,) where it is in the base of which the robot reports.
+    normal: np.ndarray  # (3,) of the plane that it lies in: across the camera's axis.
+    reported: np.ndarray  # (4, 4) where the robot says that it was.
 
 
 def looks_of(case: Case, seed: int) -> list[Look]:

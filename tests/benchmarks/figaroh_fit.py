@@ -30,30 +30,20 @@ _POSE = ("x1", "y1", "z1", "phix1", "phiy1", "phiz1")
 
 @dataclass(frozen=True)
 class Settings:
-    """What figaroh is told.
+    """What figaroh is told."""
 
-    Attributes:
-        weights: Of a residual of position [1/m] and of rotation [1/rad].
-        estimation: Its table `estimation`: the method, and priors where it takes them.
-    """
-
-    weights: tuple[float, float]
-    estimation: dict
+    weights: tuple[float, float]  # Of a residual of position [1/m] and of rotation [1/rad].
+    estimation: dict  # Its table `estimation`: the method, and priors where it takes them.
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What came out.
+    """What came out."""
 
-    Attributes:
-        predict: World_from_marker (k, 4, 4) [m] for (k, n) joint angles [rad].
-        parameters: How many were estimated.
-        seconds: Processor time of `initialize` and `solve`.
-    """
-
+    # World_from_marker (k, 4, 4) [m] for (k, n) joint angles [rad].
     predict: Callable[[FloatArray], FloatArray]
-    parameters: int
-    seconds: float
+    parameters: int  # How many were estimated.
+    seconds: float  # Processor time of `initialize` and `solve`.
 
 
 class _Weighted(BaseCalibration):

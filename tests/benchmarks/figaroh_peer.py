@@ -60,15 +60,10 @@ Found: TypeAlias = tuple[Predict, float]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A cell with the poses of its target that both are given.
+    """A cell with the poses of its target that both are given."""
 
-    Attributes:
-        cell: The cell.
-        poses: (m, 4, 4) `cam_from_target` as measured.
-    """
-
-    cell: SimulatedCell
-    poses: FloatArray
+    cell: SimulatedCell  # The cell.
+    poses: FloatArray  # (m, 4, 4) `cam_from_target` as measured.
 
     @property
     def in_hand(self) -> bool:

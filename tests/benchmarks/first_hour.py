@@ -24,23 +24,14 @@ _LONGEST = 230
 
 @dataclass(frozen=True)
 class Walked:
-    """What became of a broken session.
+    """What became of a broken session."""
 
-    Attributes:
-        status: The exit status of calibrate.
-        sentence: What it said first.
-        seconds: How long it took.
-        is_named: Whether that names the mistake, or there was nothing to say.
-        after: The verdict once the fix was typed; empty where nothing can be typed.
-        found_s: How long doctor took [s].
-    """
-
-    status: int
-    sentence: str
-    seconds: float
-    is_named: bool
-    after: str
-    found_s: float
+    status: int  # The exit status of calibrate.
+    sentence: str  # What it said first.
+    seconds: float  # How long it took.
+    is_named: bool  # Whether that names the mistake, or there was nothing to say.
+    after: str  # The verdict once the fix was typed; empty where nothing can be typed.
+    found_s: float  # How long doctor took [s].
 
 
 def walked(mistake: Mistake, folder: Path) -> Walked:

@@ -157,18 +157,13 @@ def seen_by(
 
 @dataclass(frozen=True)
 class ArmOutcome:
-    """One cell with an arm that was calibrated: its mount and level, and picks of both kinds.
-
-    Attributes:
-        stated_mm: Within which 95 % of them are to land: by the controller's poses, corrected.
-        within_mm: Within which 95 % land.
-        landed: Share that lands within what is stated.
-    """
+    """One cell with an arm that was calibrated: its mount and level, and picks of both kinds."""
 
     kind: tuple[str, str]
+    # Within which 95 % of them are to land: by the controller's poses, corrected.
     stated_mm: tuple[float, float]
-    within_mm: tuple[float, float]
-    landed: tuple[float, float]
+    within_mm: tuple[float, float]  # Within which 95 % land.
+    landed: tuple[float, float]  # Share that lands within what is stated.
 
 
 def of_one_arm(seed: int) -> ArmOutcome | None:

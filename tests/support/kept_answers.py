@@ -64,20 +64,15 @@ _FIGURE = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.]*\w)")
 
 @dataclass(frozen=True)
 class Answer:
-    """What is kept of one cell.
+    """What is kept of one cell."""
 
-    Attributes:
-        status: The verdict, or "refused".
-        message: Kind and figures of the likeliest cause, or class and figures of a refusal; none
-            of a result without causes.
-        edges: Of each edge the upper rows (3, 4) of its matrix, and its sigmas (6,).
-        sizes: Standard deviations of noise, by name.
-    """
-
-    status: str
+    status: str  # The verdict, or "refused".
+    # Kind and figures of the likeliest cause, or class and figures of a refusal; none of a result
+    # without causes.
     message: Message | None
+    # Of each edge the upper rows (3, 4) of its matrix, and its sigmas (6,).
     edges: Mapping[str, Mapping[str, list[Any]]]
-    sizes: Mapping[str, float]
+    sizes: Mapping[str, float]  # Standard deviations of noise, by name.
 
 
 def message(kind: str, words: str) -> Message:

@@ -109,10 +109,15 @@ def _array(kind: str, shape: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _words(cls: type) -> dict[str, str]:
-    """What the docstrings of a dataclass and its bases say of its fields."""
+    """What the comments at the fields of a dataclass and its bases say: behind them, or above."""
     found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        text = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
-        for name, words in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE):
-            found[name] = " ".join(words.split())
-    return found
+    for base in filter(is_dataclass, reversed(cls.__mro__)):
+        above: list[str] = []
+        for line in inspect.getsource(base).splitlines():
+            if comment := re.fullmatch(r"    # (.*)", line):
+                above.append(comment[1])
+                continue
+            if field := re.match(r"    (\w+): [^#]*(?:# (.*))?$", line):
+                found[field[1]] = field[2] or " ".join(above)
+            above = []
+    return {name: words for name, words in found.items() if words}

@@ -38,24 +38,15 @@ def number_of(image: Image) -> int:
 
 @dataclass(eq=False)
 class NetworkCamera:
-    """What a camera sends to whoever asks, and what may befall it.
+    """What a camera sends to whoever asks, and what may befall it."""
 
-    Attributes:
-        draw: Draws what the camera sees, (h, w) grey.
-        period_s: From one picture to the next [s].
-        password: `user:password` that it asks for; empty for none.
-        cut: Numbers of pictures that it sends half.
-        stalls_at: The picture from which on it sends nothing.
-        ends_at: The picture from which on it is closed.
-        drawn_s: When each picture was drawn, by its number, on the monotonic clock [s].
-    """
-
-    draw: Callable[[], Image]
-    period_s: float = 0.02
-    password: str = ""
-    cut: tuple[int, ...] = ()
-    stalls_at: int = 1 << _BITS
-    ends_at: int = 1 << _BITS
+    draw: Callable[[], Image]  # Draws what the camera sees, (h, w) grey.
+    period_s: float = 0.02  # From one picture to the next [s].
+    password: str = ""  # `user:password` that it asks for; empty for none.
+    cut: tuple[int, ...] = ()  # Numbers of pictures that it sends half.
+    stalls_at: int = 1 << _BITS  # The picture from which on it sends nothing.
+    ends_at: int = 1 << _BITS  # The picture from which on it is closed.
+    # When each picture was drawn, by its number, on the monotonic clock [s].
     drawn_s: list[float] = field(default_factory=list)
     ended: threading.Event = field(default_factory=threading.Event)
 

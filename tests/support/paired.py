@@ -22,27 +22,18 @@ ALL = "all worlds"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one checkout made of one session.
+    """What one checkout made of one session."""
 
-    Attributes:
-        status: The verdict, or "refused", "bug" or "late".
-        cause: The likeliest cause, or the class of a refusal; empty where there is none.
-        seconds: Processor time.
-        errors: Errors by their unit; smaller is better, and only ratios count.
-        nees: Squared error over covariance per degree of freedom.
-        beyond: Whether the error is as unlikely as three sigma.
-        is_right: Whether the fault that the world has is named, or none where it has none.
-        off: Squared difference of a stated probability and what came true.
-    """
-
-    status: str
-    cause: str = ""
-    seconds: float = float("nan")
+    status: str  # The verdict, or "refused", "bug" or "late".
+    cause: str = ""  # The likeliest cause, or the class of a refusal; empty where there is none.
+    seconds: float = float("nan")  # Processor time.
+    # Errors by their unit; smaller is better, and only ratios count.
     errors: Mapping[str, float] = field(default_factory=dict)
-    nees: float | None = None
-    beyond: bool = False
+    nees: float | None = None  # Squared error over covariance per degree of freedom.
+    beyond: bool = False  # Whether the error is as unlikely as three sigma.
+    # Whether the fault that the world has is named, or none where it has none.
     is_right: bool | None = None
-    off: float | None = None
+    off: float | None = None  # Squared difference of a stated probability and what came true.
 
 
 @dataclass(frozen=True)

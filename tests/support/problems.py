@@ -35,19 +35,12 @@ def moved(matrix, twist):
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A cell and what is seen of it.
+    """A cell and what is seen of it."""
 
-    Attributes:
-        truth: (4, 4) `parent_from_frame` of every frame but the flanges.
-        parents: What each frame hangs on.
-        flanges: (s, 4, 4) true `base_from_flange` by robot.
-        pairs: Which camera sees which board, at which stops.
-    """
-
-    truth: dict
-    parents: dict
-    flanges: dict
-    pairs: list
+    truth: dict  # (4, 4) `parent_from_frame` of every frame but the flanges.
+    parents: dict  # What each frame hangs on.
+    flanges: dict  # (s, 4, 4) true `base_from_flange` by robot.
+    pairs: list  # Which camera sees which board, at which stops.
     robot_sigmas: dict = field(default_factory=lambda: dict(ROBOT_SIGMAS))
 
     def place(self, frame, stop, changed=None):

@@ -110,19 +110,13 @@ def looks(kind: str, count: int, rng: np.random.Generator) -> list[RigidTransfor
 
 @dataclass(frozen=True)
 class Shot:
-    """One row of views.csv.
+    """One row of views.csv."""
 
-    Attributes:
-        flange: `base_from_flange`, as it was.
-        seen: The kind of each target and `cam_from_target`, by the target's name.
-        cells: Other columns.
-        sigma_px: Noise of the corners; every other one's is `uneven` times that.
-    """
-
-    flange: RigidTransform
+    flange: RigidTransform  # `base_from_flange`, as it was.
+    # The kind of each target and `cam_from_target`, by the target's name.
     seen: Mapping[str, tuple[str, RigidTransform]]
-    cells: Mapping[str, str] = field(default_factory=dict)
-    sigma_px: float = NOISE_PX
+    cells: Mapping[str, str] = field(default_factory=dict)  # Other columns.
+    sigma_px: float = NOISE_PX  # Noise of the corners; every other one's is `uneven` times that.
     uneven: float = 1.0
 
 
@@ -183,27 +177,17 @@ def pixels(kind: str, cam_from_target: RigidTransform) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Rig:
-    """A session of one target and one camera.
+    """A session of one target and one camera."""
 
-    Attributes:
-        kind: Of the target, among `PLACES`.
-        mount: Where the camera is.
-        seed: Of all that is random.
-        views: How many.
-        uneven: By how much more every other corner errs.
-        stated: By how much the column sigma_px is off the truth; None for none.
-        lens: What session.toml says of the lens, beside its resolution.
-        sigma_m: How well a rig's points are known.
-    """
-
-    kind: str = "cube"
-    mount: str = "eye-in-hand"
-    seed: int = 0
-    views: int = 15
-    uneven: float = 1.0
-    stated: float | None = None
+    kind: str = "cube"  # Of the target, among `PLACES`.
+    mount: str = "eye-in-hand"  # Where the camera is.
+    seed: int = 0  # Of all that is random.
+    views: int = 15  # How many.
+    uneven: float = 1.0  # By how much more every other corner errs.
+    stated: float | None = None  # By how much the column sigma_px is off the truth; None for none.
+    # What session.toml says of the lens, beside its resolution.
     lens: str = f'{LENS}intrinsics = "hold"\n'
-    sigma_m: float = 0.0
+    sigma_m: float = 0.0  # How well a rig's points are known.
 
 
 def write_rig(folder: Path, rig: Rig) -> Path:

@@ -17,23 +17,14 @@ EXACT = Noise.of_robot(0.0, 0.0)
 
 @dataclass(frozen=True)
 class Job:
-    """What is touched: as the figures of a simulation.
+    """What is touched: as the figures of a simulation."""
 
-    Attributes:
-        tips: Touches of kind `point`, of each point.
-        axes: Touches of kind `z`, and as many of kind `xz`.
-        points: How many points.
-        cone_deg: Largest tilt of the flange.
-        contact_m: Noise of a contact, per axis.
-        noise: Of the flange.
-    """
-
-    tips: int = 10
-    axes: int = 0
-    points: int = 1
-    cone_deg: float = 45.0
-    contact_m: float = 1e-4
-    noise: Noise = EXACT
+    tips: int = 10  # Touches of kind `point`, of each point.
+    axes: int = 0  # Touches of kind `z`, and as many of kind `xz`.
+    points: int = 1  # How many points.
+    cone_deg: float = 45.0  # Largest tilt of the flange.
+    contact_m: float = 1e-4  # Noise of a contact, per axis.
+    noise: Noise = EXACT  # Of the flange.
 
 
 @dataclass(frozen=True, eq=False)

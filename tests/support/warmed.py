@@ -31,23 +31,14 @@ CELL = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, branches=True, roll
 
 @dataclass(frozen=True, eq=False)
 class Warmed:
-    """A calibration from the warm-up of an arm.
+    """A calibration from the warm-up of an arm."""
 
-    Attributes:
-        truth: What really was.
-        heat: What heats the arm.
-        warming: Its temperatures, all through.
-        session: What was recorded of it.
-        calibration: What was made of that.
-        whole: What heats the arm, until the end.
-    """
-
-    truth: SimulatedCell
-    heat: Heat
-    warming: Warming
-    session: Session
-    calibration: Calibration
-    whole: Inputs
+    truth: SimulatedCell  # What really was.
+    heat: Heat  # What heats the arm.
+    warming: Warming  # Its temperatures, all through.
+    session: Session  # What was recorded of it.
+    calibration: Calibration  # What was made of that.
+    whole: Inputs  # What heats the arm, until the end.
 
 
 def warmed(
@@ -65,17 +56,11 @@ def warmed(
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Drift since the cold at k places and times, between the training and the fifth hour [m].
+    """Drift since the cold at k places and times, between the training and the fifth hour [m]."""
 
-    Attributes:
-        true: (k,) how far the flange really moved.
-        left: (k,) what is left of it when the prediction is taken off.
-        sigma: (k,) how much that is expected to be.
-    """
-
-    true: FloatArray
-    left: FloatArray
-    sigma: FloatArray
+    true: FloatArray  # (k,) how far the flange really moved.
+    left: FloatArray  # (k,) what is left of it when the prediction is taken off.
+    sigma: FloatArray  # (k,) how much that is expected to be.
 
     @property
     def share(self) -> float:

@@ -19,35 +19,22 @@ BOTH_AT_ONCE = ("shah", "li")
 
 @dataclass(frozen=True)
 class World:
-    """What a set of views is drawn from.
+    """What a set of views is drawn from."""
 
-    Attributes:
-        views: How many.
-        tilt_deg: The largest angle between the optical axis and the board's normal.
-        roll_deg: The largest rotation about the optical axis.
-        distance_m: The nearest and the farthest camera.
-        robot_mm: Noise of the reported robot pose, a standard deviation for each axis.
-        robot_mrad: The same for its rotation.
-        camera_mm: Noise of the board's centre across the optical axis.
-        camera_mrad: Noise of the board's orientation.
-        depth_ratio: Noise along the optical axis over the noise across it.
-        corner_px: Where positive, the camera's poses come from corners with this noise instead.
-        x_turn: Rotation vector of X [rad]; drawn for each seed where it is absent.
-        mount: What holds the camera.
-    """
-
-    views: int = 20
-    tilt_deg: float = 40.0
-    roll_deg: float = 40.0
-    distance_m: tuple[float, float] = (0.4, 0.8)
-    robot_mm: float = 0.0
-    robot_mrad: float = 0.0
-    camera_mm: float = 0.0
-    camera_mrad: float = 0.0
-    depth_ratio: float = 1.0
+    views: int = 20  # How many.
+    tilt_deg: float = 40.0  # The largest angle between the optical axis and the board's normal.
+    roll_deg: float = 40.0  # The largest rotation about the optical axis.
+    distance_m: tuple[float, float] = (0.4, 0.8)  # The nearest and the farthest camera.
+    robot_mm: float = 0.0  # Noise of the reported robot pose, a standard deviation for each axis.
+    robot_mrad: float = 0.0  # The same for its rotation.
+    camera_mm: float = 0.0  # Noise of the board's centre across the optical axis.
+    camera_mrad: float = 0.0  # Noise of the board's orientation.
+    depth_ratio: float = 1.0  # Noise along the optical axis over the noise across it.
+    # Where positive, the camera's poses come from corners with this noise instead.
     corner_px: float = 0.0
+    # Rotation vector of X [rad]; drawn for each seed where it is absent.
     x_turn: tuple[float, float, float] | None = None
-    mount: Mount = "eye-in-hand"
+    mount: Mount = "eye-in-hand"  # What holds the camera.
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,20 +99,14 @@ class TouchOptions(RobotPoseOptions):
 
 @dataclass(frozen=True)
 class FrameLocation:
-    """Destination of a frame.
-
-    Attributes:
-        calibration: The result of the camera and robot in question; None where none is named.
-        result: The result from which it was extracted, of a cell or itself.
-        folder: The output folder that the frame joins; None where it does not.
-        file: The file of frames that it joins; None where it does not.
-    """
+    """Destination of a frame."""
 
     name: str
+    # The result of the camera and robot in question; None where none is named.
     calibration: "Calibration | None"
-    result: "Calibration | None"
-    folder: Path | None
-    file: Path | None
+    result: "Calibration | None"  # The result from which it was extracted, of a cell or itself.
+    folder: Path | None  # The output folder that the frame joins; None where it does not.
+    file: Path | None  # The file of frames that it joins; None where it does not.
 
     @classmethod
     def of(
@@ -300,20 +294,15 @@ def _report_before(place: FrameLocation, frame: "Frame") -> None:
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """Request of `tcp` or `fixture`.
-
-    Attributes:
-        source: Touches, as a table or a session, or a session of images; None to remove a frame.
-        written: Convention of the touches.
-        point_mm: For images: the frame's origin in the target's frame, as typed.
-    """
+    """Request of `tcp` or `fixture`."""
 
     kind: FrameKind
+    # Touches, as a table or a session, or a session of images; None to remove a frame.
     source: Path | None
     goes: FrameOptions
-    written: TouchOptions
+    written: TouchOptions  # Convention of the touches.
     part: PartOptions
-    point_mm: str | None
+    point_mm: str | None  # For images: the frame's origin in the target's frame, as typed.
     as_json: bool
 
 

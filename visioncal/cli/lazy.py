@@ -99,16 +99,12 @@ def _written_since(path: Path, since_s: float) -> Iterator[Path]:
 
 
 class LazyGroup(TyperGroup):
-    """A group that lists its commands without imports, and imports a command on demand.
+    """A group that lists its commands without imports, and imports a command on demand."""
 
-    Attributes:
-        listed: First paragraphs of the commands' help, by name.
-        prefix: Prefix of module names: the command `plan` of prefix `dynamics_` is the function
-            `dynamics_plan_command` of the module `dynamics_plan`; a group is the `target_app` of
-            `target`.
-    """
-
-    listed: ClassVar[Mapping[str, str]]
+    listed: ClassVar[Mapping[str, str]]  # First paragraphs of the commands' help, by name.
+    # Prefix of module names: the command `plan` of prefix `dynamics_` is the function
+    # `dynamics_plan_command` of the module `dynamics_plan`; a group is the `target_app` of
+    # `target`.
     prefix: ClassVar[str] = ""
 
     def __init__(self, **attributes: Any) -> None:  # noqa: ANN401 - typer's

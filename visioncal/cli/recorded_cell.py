@@ -74,17 +74,12 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSetup:
-    """Setup of a recording.
-
-    Attributes:
-        robot: The arm's model; None where unknown.
-        plan: The stops; None without a plan.
-    """
+    """Setup of a recording."""
 
     mount: Mount
     target: Target
-    robot: Robot | None
-    plan: PlanFile | None
+    robot: Robot | None  # The arm's model; None where unknown.
+    plan: PlanFile | None  # The stops; None without a plan.
 
     @property
     def planned(self) -> PlanFile:

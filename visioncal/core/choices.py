@@ -63,19 +63,13 @@ UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "i
 
 @dataclass(frozen=True)
 class PoseForm:
-    """Pose notation of a robot manufacturer or a library.
-
-    Attributes:
-        unit: Length unit.
-        rotation: Rotation form, a name among `conventions.ROTATION_FORMS`.
-        models: Pattern of the beginning of its robots' names; empty for a library.
-    """
+    """Pose notation of a robot manufacturer or a library."""
 
     name: str
     words: str
-    unit: str
-    rotation: str
-    models: str = ""
+    unit: str  # Length unit.
+    rotation: str  # Rotation form, a name among `conventions.ROTATION_FORMS`.
+    models: str = ""  # Pattern of the beginning of its robots' names; empty for a library.
 
 
 # Universal Robots, "Script manual": p[x, y, z, rx, ry, rz]. KUKA, "System variables": FRAME X, Y,

@@ -54,30 +54,20 @@ class Key:
 
 @dataclass(frozen=True)
 class Array:
-    """Shape and check of an array.
+    """Shape and check of an array."""
 
-    Attributes:
-        shape: Its sizes; negative for any size.
-        fault: Message on other faults of an array; empty for none.
-    """
-
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # Its sizes; negative for any size.
+    # Message on other faults of an array; empty for none.
     fault: Callable[[FloatArray], str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class WrittenForm:
-    """Custom conversion of a value to JSON, or to a dataclass that is written in its place.
+    """Custom conversion of a value to JSON, or to a dataclass that is written in its place."""
 
-    Attributes:
-        write: Converts the value to JSON, or to `form`.
-        read: Converts it back; takes the path for messages.
-        form: The dataclass that is written; None for plain JSON.
-    """
-
-    write: Callable[[Any], Any]
-    read: Callable[[Any, str], Any]
-    form: type | None = None
+    write: Callable[[Any], Any]  # Converts the value to JSON, or to `form`.
+    read: Callable[[Any, str], Any]  # Converts it back; takes the path for messages.
+    form: type | None = None  # The dataclass that is written; None for plain JSON.
 
 
 # Marks of fields: INLINE puts the keys among those of the owner, REST collects all unknown keys.
@@ -91,12 +81,9 @@ Matrix = Annotated[FloatArray, Array((-1, -1))]
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """Base of the sections of a result.
+    """Base of the sections of a result."""
 
-    Attributes:
-        further: Unknown keys of a file, unchanged.
-    """
-
+    # Unknown keys of a file, unchanged.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict, repr=False)
 
 

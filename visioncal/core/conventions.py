@@ -25,21 +25,14 @@ _NORM_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class RotationForm:
-    """A representation of rotations as numbers.
+    """A representation of rotations as numbers."""
 
-    Attributes:
-        name: Name on the command line.
-        words: Description for messages.
-        size: Number of values.
-        read: (n, size) numbers to (n, 3, 3) rotations; NaN where they are invalid.
-        write: (n, 3, 3) rotations to (n, size) numbers.
-    """
-
-    name: str
-    words: str
-    size: int
+    name: str  # Name on the command line.
+    words: str  # Description for messages.
+    size: int  # Number of values.
+    # (n, size) numbers to (n, 3, 3) rotations; NaN where they are invalid.
     read: Callable[[FloatArray], FloatArray]
-    write: Callable[[FloatArray], FloatArray]
+    write: Callable[[FloatArray], FloatArray]  # (n, 3, 3) rotations to (n, size) numbers.
 
 
 def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
@@ -155,17 +148,11 @@ ROTATION_FORMS: Mapping[str, RotationForm] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """Interpretation of poses that are given as numbers.
+    """Interpretation of poses that are given as numbers."""
 
-    Attributes:
-        rotation: A name among `ROTATION_FORMS`.
-        unit: A name among `UNITS_M`.
-        inverse: Whether the numbers give the inverse of the wanted pose.
-    """
-
-    rotation: str = "quaternion-xyzw"
-    unit: str = "m"
-    inverse: bool = False
+    rotation: str = "quaternion-xyzw"  # A name among `ROTATION_FORMS`.
+    unit: str = "m"  # A name among `UNITS_M`.
+    inverse: bool = False  # Whether the numbers give the inverse of the wanted pose.
 
     @property
     def words(self) -> str:
@@ -176,19 +163,12 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class PoseNumbers:
-    """Poses as uninterpreted numbers with their assumed reading.
+    """Poses as uninterpreted numbers with their assumed reading."""
 
-    Attributes:
-        positions: (n, 3) in the reading's unit; NaN in a row without a pose.
-        rotations: (n, k) in the reading's form.
-        reading: The interpretation by the file or the user.
-        places: (n,) origin of each, for messages: `poses.csv, line 3`.
-    """
-
-    positions: FloatArray
-    rotations: FloatArray
-    reading: Reading
-    places: tuple[str, ...]
+    positions: FloatArray  # (n, 3) in the reading's unit; NaN in a row without a pose.
+    rotations: FloatArray  # (n, k) in the reading's form.
+    reading: Reading  # The interpretation by the file or the user.
+    places: tuple[str, ...]  # (n,) origin of each, for messages: `poses.csv, line 3`.
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -355,14 +355,10 @@ class DocumentTable:
 
     Every method raises DataError, naming the field, where the value is absent without a default,
     of another type, or out of range.
-
-    Attributes:
-        content: The parsed table.
-        label: Its location, for messages.
     """
 
-    content: Mapping[str, Any]
-    label: str
+    content: Mapping[str, Any]  # The parsed table.
+    label: str  # Its location, for messages.
 
     def _value(self, key: str, default: object, needed: str) -> object:
         value = self.content.get(key, default)

@@ -18,141 +18,97 @@ _SMALL_TURN_DEG = (0.3, 1.0)
 
 @dataclass(frozen=True)
 class NeedLimits:
-    """Limits on a task's need.
+    """Limits on a task's need."""
 
-    Attributes:
-        probability: Probability of picks within the need: `good` from the first on, `bad` below the
-            second.
-        chance: Share of sessions of sound cells with left-out errors beyond the need.
-    """
-
+    # Probability of picks within the need: `good` from the first on, `bad` below the second.
     probability: Pair = (0.95, 0.5)
-    chance: float = 0.01
+    chance: float = 0.01  # Share of sessions of sound cells with left-out errors beyond the need.
 
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """Limits on a calibration without a need: one camera and robot, or a whole cell.
+    """Limits on a calibration without a need: one camera and robot, or a whole cell."""
 
-    Attributes:
-        scatter_mm: Left-out scatter of the target's position [mm].
-        scatter_deg: Left-out scatter of its orientation [deg].
-        sigma_mm: Predicted sigma of the worst direction of an edge [mm].
-        sigma_deg: The same in rotation [deg]: 0.1 deg moves a point 0.5 m away by 1 mm.
-        pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
-        level: Scatter of a camera's poses over that expected from its corners.
-        robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
-            larger errors are seldom independent between stops, as the covariance assumes.
-        robot_deg: The same in rotation [deg].
-        stops: Stops of the robot in the fit; fewer do not suffice to check the result.
-        lost_share: Share of views that could not be used.
-        optimism: Left-out over in-sample scatter; large where each view has high leverage.
-        outlier: Residual of a view over the median of all views.
-        holdout: Residuals of held-out views over those of views left out in turn.
-    """
-
-    scatter_mm: Pair = (2.0, 10.0)
-    scatter_deg: Pair = (0.3, 2.0)
-    sigma_mm: Pair = _PLACE_MM
+    scatter_mm: Pair = (2.0, 10.0)  # Left-out scatter of the target's position [mm].
+    scatter_deg: Pair = (0.3, 2.0)  # Left-out scatter of its orientation [deg].
+    sigma_mm: Pair = _PLACE_MM  # Predicted sigma of the worst direction of an edge [mm].
+    # The same in rotation [deg]: 0.1 deg moves a point 0.5 m away by 1 mm.
     sigma_deg: Pair = (0.1, 0.3)
+    # Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
     pixel_px: Pair = (0.7, 3.0)
-    level: float = 2.0
+    level: float = 2.0  # Scatter of a camera's poses over that expected from its corners.
+    # Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and larger errors
+    # are seldom independent between stops, as the covariance assumes.
     robot_mm: float = 0.2
-    robot_deg: float = 0.02
+    robot_deg: float = 0.02  # The same in rotation [deg].
+    # Stops of the robot in the fit; fewer do not suffice to check the result.
     stops: tuple[int, int] = (10, 5)
-    lost_share: Pair = (0.25, 0.6)
+    lost_share: Pair = (0.25, 0.6)  # Share of views that could not be used.
+    # Left-out over in-sample scatter; large where each view has high leverage.
     optimism: Pair = (1.6, 4.0)
-    outlier: float = 6.0
-    holdout: float = 4.0
+    outlier: float = 6.0  # Residual of a view over the median of all views.
+    holdout: float = 4.0  # Residuals of held-out views over those of views left out in turn.
 
 
 @dataclass(frozen=True)
 class ToolLimits:
-    """Limits on a tool by touches.
+    """Limits on a tool by touches."""
 
-    Attributes:
-        sigma_mm: Predicted sigma of the tip's worst direction [mm].
-        sigma_deg: The same of the rotation [deg].
-        noise_mm: Noise of a touch per axis [mm].
-        touches: Touches in the fit; fewer do not suffice to check it.
-    """
-
-    sigma_mm: Pair = _TOUCHED_MM
-    sigma_deg: Pair = _SMALL_TURN_DEG
-    noise_mm: Pair = _TOUCH_NOISE_MM
-    touches: int = 5
+    sigma_mm: Pair = _TOUCHED_MM  # Predicted sigma of the tip's worst direction [mm].
+    sigma_deg: Pair = _SMALL_TURN_DEG  # The same of the rotation [deg].
+    noise_mm: Pair = _TOUCH_NOISE_MM  # Noise of a touch per axis [mm].
+    touches: int = 5  # Touches in the fit; fewer do not suffice to check it.
 
 
 @dataclass(frozen=True)
 class FixtureLimits:
-    """Limits on a fixture by touches or markers.
+    """Limits on a fixture by touches or markers."""
 
-    Attributes:
-        sigma_mm: Predicted sigma of the fixture's worst offset, at the centre of its points [mm].
-        sigma_deg: The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
-        noise_mm: Noise of a touch per axis [mm].
-        points: Points of a drawing in the fit; with fewer a wrong one cannot be detected.
-    """
-
+    # Predicted sigma of the fixture's worst offset, at the centre of its points [mm].
     sigma_mm: Pair = _TOUCHED_MM
+    # The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
     sigma_deg: Pair = (0.1, 0.4)
-    noise_mm: Pair = _TOUCH_NOISE_MM
-    points: int = 4
+    noise_mm: Pair = _TOUCH_NOISE_MM  # Noise of a touch per axis [mm].
+    points: int = 4  # Points of a drawing in the fit; with fewer a wrong one cannot be detected.
 
 
 @dataclass(frozen=True)
 class ImageFrameLimits:
-    """Limits on a tool or a fixture by a target in images.
+    """Limits on a tool or a fixture by a target in images."""
 
-    Attributes:
-        sigma_mm: Predicted sigma of the offset's worst direction [mm].
-        sigma_deg: The same of the rotation [deg].
-    """
-
-    sigma_mm: Pair = _PLACE_MM
-    sigma_deg: Pair = _SMALL_TURN_DEG
+    sigma_mm: Pair = _PLACE_MM  # Predicted sigma of the offset's worst direction [mm].
+    sigma_deg: Pair = _SMALL_TURN_DEG  # The same of the rotation [deg].
 
 
 @dataclass(frozen=True)
 class CheckLimits:
-    """Limits on a check of a calibration by a few stops.
+    """Limits on a check of a calibration by a few stops."""
 
-    Attributes:
-        likelihood_ratio: Likelihood ratio of a change to none at which it is reported. Its mean is
-            one without a change, so that by Markov's inequality chance exceeds the limit in at most
-            one of as many checks.
-        ruled_out: Likelihood ratio of the best cause to another at which that is ruled out.
-        unexplained: Significance level of residuals that no cause explains.
-        stops: Number of stops; fewer hardly separate causes.
-    """
-
+    # Likelihood ratio of a change to none at which it is reported. Its mean is one without a
+    # change, so that by Markov's inequality chance exceeds the limit in at most one of as many
+    # checks.
     likelihood_ratio: float = 100.0
+    # Likelihood ratio of the best cause to another at which that is ruled out.
     ruled_out: float = 20.0
-    unexplained: float = 1e-3
-    stops: int = 5
+    unexplained: float = 1e-3  # Significance level of residuals that no cause explains.
+    stops: int = 5  # Number of stops; fewer hardly separate causes.
 
 
 @dataclass(frozen=True)
 class DynamicsLimits:
-    """Limits on identified dynamics.
+    """Limits on identified dynamics."""
 
-    Attributes:
-        worse: Prediction error of other motions over the fit's residual.
-        bodies_worse: Prediction error of consistent parameters over that of base parameters.
-        slight_share: Share of a torque's range below which an error is no reason for doubt.
-        range_share: Prediction error over the torque's range.
-        known_share: Prediction error of known inertias over the range, beyond which the robot is
-            another one.
-        lag_share: Change of torques by their lag over the range, below which it is only a note.
-        undetermined_share: Share of undetermined base parameters; those of the wrist matter little.
-    """
-
-    worse: float = 1.5
+    worse: float = 1.5  # Prediction error of other motions over the fit's residual.
+    # Prediction error of consistent parameters over that of base parameters.
     bodies_worse: float = 1.3
+    # Share of a torque's range below which an error is no reason for doubt.
     slight_share: float = 0.02
-    range_share: Pair = (0.2, 0.6)
+    range_share: Pair = (0.2, 0.6)  # Prediction error over the torque's range.
+    # Prediction error of known inertias over the range, beyond which the robot is another one.
     known_share: float = 0.5
+    # Change of torques by their lag over the range, below which it is only a note.
     lag_share: float = 0.1
+    # Share of undetermined base parameters; those of the wrist matter little.
     undetermined_share: float = 0.5
 
 

@@ -67,16 +67,12 @@ _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 @dataclass(frozen=True)
 class Remedy:
-    """Advice on a finding.
+    """Advice on a finding."""
 
-    Attributes:
-        words: A sentence in the imperative.
-        command: A command line for it; empty where there is none. `with_paths` fills in the
-            placeholders SESSION, FIXED (a corrected copy of the session), OUT, NEW (beside OUT) and
-            AGAIN (the typed command).
-    """
-
-    words: str
+    words: str  # A sentence in the imperative.
+    # A command line for it; empty where there is none. `with_paths` fills in the placeholders
+    # SESSION, FIXED (a corrected copy of the session), OUT, NEW (beside OUT) and AGAIN (the typed
+    # command).
     command: Annotated[str, DROPPED] = ""
 
     def __str__(self) -> str:
@@ -108,36 +104,27 @@ READ_AGAIN = Remedy(
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding on a result.
+    """A finding on a result."""
 
-    Attributes:
-        kind: Its kind, as a short permanent name.
-        words: Its text, with figures.
-        do: Advice; None for none.
-        views: The views concerned.
-        probability: Probability that it is the cause of what is wrong; 0 for no cause.
-        by_limit: Whether this probability follows from the limit of its test (or comparison) alone,
-            the same in all sessions: it ranks causes, and is not stated.
-        without_it: The result without it, as a sentence.
-        is_fatal: Whether it alone makes a result bad.
-        until_mm: The need of a task from which on it is no doubt [mm]: zero for findings on the
-            size of errors, which a need judges better than a limit; infinite where errors are
-            unexplained.
-        mahalanobis_sq: Squared test statistic, as of a standard normal variable; zero where the
-            limit of its test decides.
-        up_to_mm: Greatest error of a pick that it causes [mm]; infinite where unknown.
-    """
-
-    kind: str
-    words: str
-    do: Remedy | None = None
-    views: tuple[int, ...] = ()
+    kind: str  # Its kind, as a short permanent name.
+    words: str  # Its text, with figures.
+    do: Remedy | None = None  # Advice; None for none.
+    views: tuple[int, ...] = ()  # The views concerned.
+    # Probability that it is the cause of what is wrong; 0 for no cause.
     probability: Annotated[float, DROPPED] = 0.0
+    # Whether this probability follows from the limit of its test (or comparison) alone, the same in
+    # all sessions: it ranks causes, and is not stated.
     by_limit: Annotated[bool, DROPPED] = False
-    without_it: Annotated[str, DROPPED] = ""
+    without_it: Annotated[str, DROPPED] = ""  # The result without it, as a sentence.
+    # Whether it alone makes a result bad.
     is_fatal: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
+    # The need of a task from which on it is no doubt [mm]: zero for findings on the size of errors,
+    # which a need judges better than a limit; infinite where errors are unexplained.
     until_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
+    # Squared test statistic, as of a standard normal variable; zero where the limit of its test
+    # decides.
     mahalanobis_sq: Annotated[float, UNWRITTEN] = field(default=0.0, compare=False)
+    # Greatest error of a pick that it causes [mm]; infinite where unknown.
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 
     def of(self, name: str) -> Self:
@@ -159,19 +146,15 @@ def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ..
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a result can be trusted.
+    """Whether a result can be trusted."""
 
-    Attributes:
-        status: The judgement.
-        findings: The reasons: doubts, fatal ones first, findings on needs, then notes.
-        good_for_mm: The least need for which it is good [mm]; None where errors are unexplained.
-        good_for_mm_uncorrected: The same by the controller's own poses, where the arm was
-            calibrated; `good_for_mm` then is for corrected targets.
-    """
-
-    status: VerdictStatus
+    status: VerdictStatus  # The judgement.
+    # The reasons: doubts, fatal ones first, findings on needs, then notes.
     findings: tuple[Finding, ...] = ()
+    # The least need for which it is good [mm]; None where errors are unexplained.
     good_for_mm: float | None = None
+    # The same by the controller's own poses, where the arm was calibrated; `good_for_mm` then is
+    # for corrected targets.
     good_for_mm_uncorrected: float | None = None
 
     @classmethod

@@ -51,16 +51,12 @@ _NEXT = (
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """A dynamic model in its b base parameters.
+    """A dynamic model in its b base parameters."""
 
-    Attributes:
-        model: The model in its p standard parameters.
-        independent: (b,) ascending indices of the standard parameters whose columns are kept.
-        dependence: (b, p) `base = dependence @ standard`; the identity in the kept columns.
-    """
-
-    model: DynamicModel
+    model: DynamicModel  # The model in its p standard parameters.
+    # (b,) ascending indices of the standard parameters whose columns are kept.
     independent: IntArray
+    # (b, p) `base = dependence @ standard`; the identity in the kept columns.
     dependence: FloatArray
 
     @classmethod
@@ -155,16 +151,11 @@ class Condition:
 
     The parameters' units change the raw condition arbitrarily, and do not matter to a least-squares
     fit: compare motions by columns of unit length (van der Sluis 1969).
-
-    Attributes:
-        weighted: Each joint's rows divided by its noise, columns of unit length.
-        scaled: Rows as they are, columns of unit length.
-        raw: Rows and columns as they are, in SI units.
     """
 
-    weighted: float
-    scaled: float
-    raw: float
+    weighted: float  # Each joint's rows divided by its noise, columns of unit length.
+    scaled: float  # Rows as they are, columns of unit length.
+    raw: float  # Rows and columns as they are, in SI units.
 
 
 def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> Condition:

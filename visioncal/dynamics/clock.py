@@ -23,17 +23,11 @@ _JUMP = 4.0
 
 @dataclass(frozen=True, eq=False)
 class StampClock:
-    """Sampling clock of a stream.
+    """Sampling clock of a stream."""
 
-    Attributes:
-        usual_s: Median step from one sample to the next [s].
-        counts: (m - 1,) each step in usual steps; more than one where samples are missing.
-        jitter: Standard deviation of the steps from whole multiples, over the usual step.
-    """
-
-    usual_s: float
-    counts: IntArray
-    jitter: float
+    usual_s: float  # Median step from one sample to the next [s].
+    counts: IntArray  # (m - 1,) each step in usual steps; more than one where samples are missing.
+    jitter: float  # Standard deviation of the steps from whole multiples, over the usual step.
 
     @classmethod
     def of(cls, times_s: FloatArray) -> Self:
@@ -55,17 +49,11 @@ class StampClock:
 
 @dataclass(frozen=True, eq=False)
 class EvenPart:
-    """A part of a stream without long gaps, on an even clock.
+    """A part of a stream without long gaps, on an even clock."""
 
-    Attributes:
-        samples: Its samples; angles are interpolated where they are missing.
-        invalid: (m, n) torques without information.
-        present: (m,) where torques were recorded.
-    """
-
-    samples: RecordedSamples
-    invalid: Mask
-    present: Mask
+    samples: RecordedSamples  # Its samples; angles are interpolated where they are missing.
+    invalid: Mask  # (m, n) torques without information.
+    present: Mask  # (m,) where torques were recorded.
 
     def __len__(self) -> int:
         return len(self.samples)

@@ -57,14 +57,10 @@ class LowPass:
 
     Its response is 6 dB down at the cut-off, and outputs come at twice the cut-off's rate: white
     noise stays nearly white. Only full windows give outputs, so there are no end effects.
-
-    Attributes:
-        taps: (w,) coefficients, whose sum is 1; w - 1 is a multiple of twice `step`.
-        step: Decimation: samples from one output to the next.
     """
 
-    taps: FloatArray
-    step: int
+    taps: FloatArray  # (w,) coefficients, whose sum is 1; w - 1 is a multiple of twice `step`.
+    step: int  # Decimation: samples from one output to the next.
 
     @classmethod
     def of(cls, band_hz: float, rate_hz: float) -> Self:
@@ -218,19 +214,13 @@ def _derivative_noise(residual: FloatArray, window: int, order: int, step: float
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Evenly sampled motion and torques without a long gap, and their filter.
+    """Evenly sampled motion and torques without a long gap, and their filter."""
 
-    Attributes:
-        measured: The samples.
-        invalid: (m, n) torques without information: saturated, or of a joint that stands still.
-        present: (m,) where torques were recorded; regressors are filtered over the same samples.
-        lowpass: Filter of torques and regressors alike.
-    """
-
-    measured: Measured
-    invalid: Mask
+    measured: Measured  # The samples.
+    invalid: Mask  # (m, n) torques without information: saturated, or of a joint that stands still.
+    # (m,) where torques were recorded; regressors are filtered over the same samples.
     present: Mask
-    lowpass: LowPass
+    lowpass: LowPass  # Filter of torques and regressors alike.
 
     @property
     def times_s(self) -> FloatArray:
@@ -286,25 +276,15 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
-    """A conditioned stream, ready for the regression.
+    """A conditioned stream, ready for the regression."""
 
-    Attributes:
-        label: Its file, for messages.
-        pieces: The parts between its gaps.
-        band_hz: Bandwidth of the motion [Hz].
-        cutoff_hz: Where the low-pass is 6 dB down [Hz].
-        rate_hz: Sampling rate before the filter [Hz].
-        notes: Messages on faults of the samples, and how they were handled.
-        of_currents: Whether the torques are currents times gains.
-    """
-
-    label: str
-    pieces: tuple[Piece, ...]
-    band_hz: float
-    cutoff_hz: float
-    rate_hz: float
-    notes: tuple[str, ...]
-    of_currents: bool = False
+    label: str  # Its file, for messages.
+    pieces: tuple[Piece, ...]  # The parts between its gaps.
+    band_hz: float  # Bandwidth of the motion [Hz].
+    cutoff_hz: float  # Where the low-pass is 6 dB down [Hz].
+    rate_hz: float  # Sampling rate before the filter [Hz].
+    notes: tuple[str, ...]  # Messages on faults of the samples, and how they were handled.
+    of_currents: bool = False  # Whether the torques are currents times gains.
 
     @property
     def count(self) -> int:

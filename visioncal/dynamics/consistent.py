@@ -26,17 +26,11 @@ _POSITIVE = ("Fc", "Fv", "Ia")
 
 @dataclass(frozen=True, eq=False)
 class Consistent:
-    """Physically consistent standard parameters.
+    """Physically consistent standard parameters."""
 
-    Attributes:
-        values: (p,) in the order of `DynamicModel.names`.
-        covariance: (p, p) posterior covariance, given torques and prior.
-        misfit: Chi-square by which the torques fit worse than with the best base parameters.
-    """
-
-    values: FloatArray
-    covariance: FloatArray
-    misfit: float
+    values: FloatArray  # (p,) in the order of `DynamicModel.names`.
+    covariance: FloatArray  # (p, p) posterior covariance, given torques and prior.
+    misfit: float  # Chi-square by which the torques fit worse than with the best base parameters.
 
     def inertias(self, joints: int) -> Inertias:
         """Inertial parameters of the links."""

@@ -41,19 +41,12 @@ _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """A recording with some mistake undone.
+    """A recording with some mistake undone."""
 
-    Attributes:
-        words: The mistake, for the message; empty for the recording as it is.
-        joints: The joints concerned.
-        measured: The corrected recording.
-        predicted: (m, n) torques of the links by the robot's inertias [N m].
-    """
-
-    words: str
-    joints: tuple[int, ...]
-    measured: Measured
-    predicted: FloatArray
+    words: str  # The mistake, for the message; empty for the recording as it is.
+    joints: tuple[int, ...]  # The joints concerned.
+    measured: Measured  # The corrected recording.
+    predicted: FloatArray  # (m, n) torques of the links by the robot's inertias [N m].
 
 
 def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:

@@ -178,24 +178,16 @@ def _chained(basis: tuple[FloatArray, ...], gradients: list[FloatArray]) -> Floa
 
 @dataclass(frozen=True)
 class ExcitationRequest:
-    """Options of the search for an exciting motion.
+    """Options of the search for an exciting motion."""
 
-    Attributes:
-        period_s: Duration of the motion [s].
-        harmonics: Number of its harmonics.
-        terms: The friction to be identified besides the inertias.
-        starts: Number of random motions to start from.
-        seed: Seed of these.
-        steps: Greatest number of steps in each round of a descent.
-        seconds: Time limit [s of one core], at which the search ends once a motion is found.
-    """
-
-    period_s: float = 20.0
-    harmonics: int = 5
+    period_s: float = 20.0  # Duration of the motion [s].
+    harmonics: int = 5  # Number of its harmonics.
+    # The friction to be identified besides the inertias.
     terms: FrictionTerms = field(default_factory=FrictionTerms)
-    starts: int = 4
-    seed: int = 0
-    steps: int = 80
+    starts: int = 4  # Number of random motions to start from.
+    seed: int = 0  # Seed of these.
+    steps: int = 80  # Greatest number of steps in each round of a descent.
+    # Time limit [s of one core], at which the search ends once a motion is found.
     seconds: float = np.inf
 
     def __post_init__(self) -> None:
@@ -221,30 +213,19 @@ class ExcitationRequest:
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """An exciting motion.
+    """An exciting motion."""
 
-    Attributes:
-        request: The options of the search.
-        base: The parameters that it determines.
-        weights: (n,) inverse of the joints' torque noise, taken to be proportional to their
-            greatest torques; ones where these are not known.
-        series: The motion.
-        condition: Condition numbers of its regressor.
-        random: Median of those of random motions within the limits of joints and drives.
-        extremes: Its extremes, at a thousand samples a second.
-        starts: Number of descents made.
-        seconds: Duration of the search [s of one core].
-    """
-
-    request: ExcitationRequest
-    base: BaseModel
+    request: ExcitationRequest  # The options of the search.
+    base: BaseModel  # The parameters that it determines.
+    # (n,) inverse of the joints' torque noise, taken to be proportional to their greatest torques;
+    # ones where these are not known.
     weights: FloatArray
-    series: Series
-    condition: Condition
-    random: Condition
-    extremes: MotionExtremes
-    starts: int
-    seconds: float
+    series: Series  # The motion.
+    condition: Condition  # Condition numbers of its regressor.
+    random: Condition  # Median of those of random motions within the limits of joints and drives.
+    extremes: MotionExtremes  # Its extremes, at a thousand samples a second.
+    starts: int  # Number of descents made.
+    seconds: float  # Duration of the search [s of one core].
 
 
 def excite(

@@ -49,15 +49,10 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Fourier series of n joints that begin and end at rest.
+    """Fourier series of n joints that begin and end at rest."""
 
-    Attributes:
-        harmonics: The basis functions.
-        free: (n, 2 count - 1) coefficients in the basis `Harmonics.resting` [rad].
-    """
-
-    harmonics: Harmonics
-    free: FloatArray
+    harmonics: Harmonics  # The basis functions.
+    free: FloatArray  # (n, 2 count - 1) coefficients in the basis `Harmonics.resting` [rad].
 
     @property
     def coefficients(self) -> tuple[FloatArray, FloatArray, FloatArray]:

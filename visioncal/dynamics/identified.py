@@ -28,52 +28,32 @@ UNKNOWN = "not at all"
 
 @dataclass(frozen=True, eq=False)
 class StreamStatistics:
-    """Statistics of a fitted stream.
+    """Statistics of a fitted stream."""
 
-    Attributes:
-        label: Its file.
-        samples: Number of filtered samples.
-        left_out: Number of their torques that were not used: outliers and invalid ones.
-        band_hz: Bandwidth of the motion [Hz].
-        cutoff_hz: Where the low-pass is 6 dB down [Hz].
-        rate_hz: Sampling rate before the filter [Hz].
-        noise_nm: (n,) noise of the filtered torques [N m].
-        rms_nm: (n,) root mean square of the residuals [N m].
-        torque_nm: (n,) standard deviation of the torques, as their range [N m].
-        notes: Messages on faults of its samples.
-    """
-
-    label: Annotated[str, Key("stream")]
-    samples: int
-    left_out: int
-    band_hz: float
-    cutoff_hz: float
-    rate_hz: float
-    noise_nm: Vector
-    rms_nm: Vector
-    torque_nm: Vector
-    notes: Annotated[tuple[str, ...], KEPT] = ()
+    label: Annotated[str, Key("stream")]  # Its file.
+    samples: int  # Number of filtered samples.
+    left_out: int  # Number of their torques that were not used: outliers and invalid ones.
+    band_hz: float  # Bandwidth of the motion [Hz].
+    cutoff_hz: float  # Where the low-pass is 6 dB down [Hz].
+    rate_hz: float  # Sampling rate before the filter [Hz].
+    noise_nm: Vector  # (n,) noise of the filtered torques [N m].
+    rms_nm: Vector  # (n,) root mean square of the residuals [N m].
+    torque_nm: Vector  # (n,) standard deviation of the torques, as their range [N m].
+    notes: Annotated[tuple[str, ...], KEPT] = ()  # Messages on faults of its samples.
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueValidation:
-    """Prediction errors of torques that were not fitted.
+    """Prediction errors of torques that were not fitted."""
 
-    Attributes:
-        label: The samples, for messages.
-        rms_nm: (n,) root mean square error [N m].
-        torque_nm: (n,) standard deviation of the torques, as their range [N m].
-        noise_nm: (n,) noise of the torques by the fit [N m].
-        consistent_rms_nm: (n,) error with the consistent standard parameters; None without these.
-        known_rms_nm: (n,) error with the robot's own inertias and friction fitted to them; None
-            where it has no inertias.
-    """
-
-    label: Annotated[str, Key("samples")]
-    rms_nm: Vector
-    torque_nm: Vector
-    noise_nm: Vector
+    label: Annotated[str, Key("samples")]  # The samples, for messages.
+    rms_nm: Vector  # (n,) root mean square error [N m].
+    torque_nm: Vector  # (n,) standard deviation of the torques, as their range [N m].
+    noise_nm: Vector  # (n,) noise of the torques by the fit [N m].
+    # (n,) error with the consistent standard parameters; None without these.
     consistent_rms_nm: Vector | None = None
+    # (n,) error with the robot's own inertias and friction fitted to them; None where it has no
+    # inertias.
     known_rms_nm: Vector | None = None
 
     @property
@@ -84,17 +64,11 @@ class TorqueValidation:
 
 @dataclass(frozen=True)
 class Lag:
-    """Delay of the torques behind the angles.
+    """Delay of the torques behind the angles."""
 
-    Attributes:
-        seconds: The delay; negative where torques are ahead [s].
-        sigma_s: Its standard deviation [s].
-        share: Greatest change of a joint's torques by it, over their range.
-    """
-
-    seconds: float
-    sigma_s: float
-    share: float
+    seconds: float  # The delay; negative where torques are ahead [s].
+    sigma_s: float  # Its standard deviation [s].
+    share: float  # Greatest change of a joint's torques by it, over their range.
 
     @property
     def words(self) -> str:
@@ -109,32 +83,21 @@ class Lag:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Identified dynamics of an arm; `save` writes them as dynamics.json.
+    """Identified dynamics of an arm; `save` writes them as dynamics.json."""
 
-    Attributes:
-        robot: The arm before identification.
-        base: Its model in base parameters.
-        values: (b,) the base parameters.
-        covariance: (b + 2 a, b + 2 a) of these, of a Stribeck humps [N m], and of the logarithms of
-            their speeds.
-        stribeck: The humps.
-        consistent: Consistent standard parameters; None where the robot's inertias are not known.
-        streams: Statistics of the fitted streams.
-        validation: Prediction errors of torques that were not fitted; None where there were none.
-        facts: Provenance: session, digest, date.
-        lag: Delay of the torques, which was corrected; None where not significant.
-    """
-
-    robot: Robot
-    base: BaseModel
-    values: FloatArray
+    robot: Robot  # The arm before identification.
+    base: BaseModel  # Its model in base parameters.
+    values: FloatArray  # (b,) the base parameters.
+    # (b + 2 a, b + 2 a) of these, of a Stribeck humps [N m], and of the logarithms of their speeds.
     covariance: FloatArray
-    stribeck: Stribeck
+    stribeck: Stribeck  # The humps.
+    # Consistent standard parameters; None where the robot's inertias are not known.
     consistent: Consistent | None
-    streams: tuple[StreamStatistics, ...]
+    streams: tuple[StreamStatistics, ...]  # Statistics of the fitted streams.
+    # Prediction errors of torques that were not fitted; None where there were none.
     validation: TorqueValidation | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    lag: Lag | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)  # Provenance: session, digest, date.
+    lag: Lag | None = None  # Delay of the torques, which was corrected; None where not significant.
 
     @classmethod
     def load(cls, path: Path | str) -> Self:

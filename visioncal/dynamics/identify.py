@@ -37,19 +37,14 @@ _ROUNDS, _SETTLED = 5, 0.1
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the identification.
+    """Options of the identification."""
 
-    Attributes:
-        terms: The joints' own parameters: friction, offsets, rotors.
-        stribeck: Whether Stribeck humps of friction are fitted.
-        consistent: Whether consistent standard parameters are fitted near the robot's own.
-        checked: Whether mistaken recordings are searched for and refused.
-    """
-
+    # The joints' own parameters: friction, offsets, rotors.
     terms: FrictionTerms = field(default_factory=partial(FrictionTerms, slow_rad_s=SLOW_RAD_S))
-    stribeck: bool = True
+    stribeck: bool = True  # Whether Stribeck humps of friction are fitted.
+    # Whether consistent standard parameters are fitted near the robot's own.
     consistent: bool = True
-    checked: bool = True
+    checked: bool = True  # Whether mistaken recordings are searched for and refused.
 
 
 @dataclass(frozen=True, eq=False)

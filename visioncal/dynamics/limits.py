@@ -21,23 +21,14 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class MotionMargins:
-    """Margins of a planned motion.
+    """Margins of a planned motion."""
 
-    Attributes:
-        margin_rad: Distance of the joints from the ends of their ranges [rad].
-        speed: Usable share of the greatest speeds.
-        acceleration: Usable share of the greatest accelerations.
-        torque: Safety factor of the torques predicted by the nominal inertias.
-        clearance_m: Distance of the arm from itself, the floor and all bodies [m].
-        floor_m: Height of the floor in the base frame [m]; None for none.
-    """
-
-    margin_rad: float = 0.05
-    speed: float = 0.9
-    acceleration: float = 0.9
-    torque: float = 1.2
-    clearance_m: float = 0.03
-    floor_m: float | None = 0.0
+    margin_rad: float = 0.05  # Distance of the joints from the ends of their ranges [rad].
+    speed: float = 0.9  # Usable share of the greatest speeds.
+    acceleration: float = 0.9  # Usable share of the greatest accelerations.
+    torque: float = 1.2  # Safety factor of the torques predicted by the nominal inertias.
+    clearance_m: float = 0.03  # Distance of the arm from itself, the floor and all bodies [m].
+    floor_m: float | None = 0.0  # Height of the floor in the base frame [m]; None for none.
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -54,44 +45,27 @@ class MotionMargins:
 
 @dataclass(frozen=True)
 class DefaultLimits:
-    """Defaults of limits that the robot's description does not state; None for no default.
+    """Defaults of limits that the robot's description does not state; None for no default."""
 
-    Attributes:
-        range_rad: Farthest position to either side [rad].
-        speed_rad_s: Greatest speed [rad/s].
-        acceleration_rad_s2: Greatest acceleration [rad/s^2].
-    """
-
-    range_rad: float | None = None
-    speed_rad_s: float | None = None
-    acceleration_rad_s2: float | None = None
+    range_rad: float | None = None  # Farthest position to either side [rad].
+    speed_rad_s: float | None = None  # Greatest speed [rad/s].
+    acceleration_rad_s2: float | None = None  # Greatest acceleration [rad/s^2].
 
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Limits of a motion, margins included.
+    """Limits of a motion, margins included."""
 
-    Attributes:
-        robot: The arm.
-        lower: (n,) least positions [rad].
-        upper: (n,) greatest positions [rad].
-        speed: (n,) greatest speeds [rad/s].
-        acceleration: (n,) greatest accelerations [rad/s^2].
-        torque: (n,) greatest torques predicted by the nominal inertias [N m]; inf where unknown.
-        inertias: Nominal ones, with the payload; None where unknown.
-        bodies: Collision bodies of the arm and of the cell.
-        share: The margins.
-    """
-
-    robot: Robot
-    lower: FloatArray
-    upper: FloatArray
-    speed: FloatArray
-    acceleration: FloatArray
+    robot: Robot  # The arm.
+    lower: FloatArray  # (n,) least positions [rad].
+    upper: FloatArray  # (n,) greatest positions [rad].
+    speed: FloatArray  # (n,) greatest speeds [rad/s].
+    acceleration: FloatArray  # (n,) greatest accelerations [rad/s^2].
+    # (n,) greatest torques predicted by the nominal inertias [N m]; inf where unknown.
     torque: FloatArray
-    inertias: Inertias | None
-    bodies: tuple[Body, ...]
-    share: MotionMargins
+    inertias: Inertias | None  # Nominal ones, with the payload; None where unknown.
+    bodies: tuple[Body, ...]  # Collision bodies of the arm and of the cell.
+    share: MotionMargins  # The margins.
 
     @cached_property
     def collisions(self) -> Collisions:
@@ -222,29 +196,19 @@ def _check_left(allowed: MotionLimits) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MotionExtremes:
-    """Extremes of a motion, against its limits.
+    """Extremes of a motion, against its limits."""
 
-    Attributes:
-        allowed: The limits.
-        lowest: (n,) least positions [rad].
-        highest: (n,) greatest positions [rad].
-        speed: (n,) greatest speeds [rad/s].
-        acceleration: (n,) greatest accelerations [rad/s^2].
-        torque: (n,) greatest torques predicted by the nominal inertias [N m]; None where unknown.
-        apart_m: Least distance of collision pairs less the required one [m]; inf without pairs.
-        nearest: The nearest pair; empty without pairs.
-        nearest_s: Time at which it is nearest [s].
-    """
-
-    allowed: MotionLimits
-    lowest: FloatArray
-    highest: FloatArray
-    speed: FloatArray
-    acceleration: FloatArray
+    allowed: MotionLimits  # The limits.
+    lowest: FloatArray  # (n,) least positions [rad].
+    highest: FloatArray  # (n,) greatest positions [rad].
+    speed: FloatArray  # (n,) greatest speeds [rad/s].
+    acceleration: FloatArray  # (n,) greatest accelerations [rad/s^2].
+    # (n,) greatest torques predicted by the nominal inertias [N m]; None where unknown.
     torque: FloatArray | None
+    # Least distance of collision pairs less the required one [m]; inf without pairs.
     apart_m: float
-    nearest: tuple[str, ...]
-    nearest_s: float
+    nearest: tuple[str, ...]  # The nearest pair; empty without pairs.
+    nearest_s: float  # Time at which it is nearest [s].
 
     @property
     def clearance_m(self) -> float:

@@ -28,21 +28,14 @@ def sign(dq: FloatArray, slow_rad_s: float = SLOW_RAD_S) -> FloatArray:
 
 @dataclass(frozen=True)
 class FrictionTerms:
-    """Torque terms of each joint beside those of the rigid links.
+    """Torque terms of each joint beside those of the rigid links."""
 
-    Attributes:
-        coulomb: `Fc sign(dq)`: dry friction [N m].
-        viscous: `Fv dq` [N m s/rad].
-        offset: A constant: asymmetry of friction, or offset of the measurement [N m].
-        motor_inertia: `Ia ddq`: the rotor's inertia on the joint's side of the gear [kg m^2].
-        slow_rad_s: See `sign`.
-    """
-
-    coulomb: bool = True
-    viscous: bool = True
-    offset: bool = True
+    coulomb: bool = True  # `Fc sign(dq)`: dry friction [N m].
+    viscous: bool = True  # `Fv dq` [N m s/rad].
+    offset: bool = True  # A constant: asymmetry of friction, or offset of the measurement [N m].
+    # `Ia ddq`: the rotor's inertia on the joint's side of the gear [kg m^2].
     motor_inertia: bool = False
-    slow_rad_s: float = SLOW_RAD_S
+    slow_rad_s: float = SLOW_RAD_S  # See `sign`.
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -88,24 +81,15 @@ class Friction:
     `(Fc + Fs exp(-(dq / vs)^2)) sign(dq) + Fv dq + offset + Ia ddq`: dry friction with Stribeck's
     increase at low speed (as in Armstrong-Helouvry, Dupont and Canudas de Wit 1994), viscous
     friction, and the rotor's inertia.
-
-    Attributes:
-        coulomb: (n,) Fc [N m].
-        viscous: (n,) Fv [N m s/rad].
-        offset: (n,) [N m].
-        motor_inertia: (n,) Ia [kg m^2].
-        breaking: (n,) Fs, breakaway torque in excess of `coulomb` [N m].
-        breaking_rad_s: (n,) vs, Stribeck speed [rad/s].
-        slow_rad_s: See `sign`.
     """
 
-    coulomb: FloatArray
-    viscous: FloatArray
-    offset: FloatArray
-    motor_inertia: FloatArray
-    breaking: FloatArray
-    breaking_rad_s: FloatArray
-    slow_rad_s: float = SLOW_RAD_S
+    coulomb: FloatArray  # (n,) Fc [N m].
+    viscous: FloatArray  # (n,) Fv [N m s/rad].
+    offset: FloatArray  # (n,) [N m].
+    motor_inertia: FloatArray  # (n,) Ia [kg m^2].
+    breaking: FloatArray  # (n,) Fs, breakaway torque in excess of `coulomb` [N m].
+    breaking_rad_s: FloatArray  # (n,) vs, Stribeck speed [rad/s].
+    slow_rad_s: float = SLOW_RAD_S  # See `sign`.
 
     @classmethod
     def none(cls, joints: int) -> Self:

@@ -7,19 +7,12 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Positions, speeds and accelerations of n joints at m times.
+    """Positions, speeds and accelerations of n joints at m times."""
 
-    Attributes:
-        times_s: (m,) ascending [s].
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
-    """
-
-    times_s: FloatArray
-    q: FloatArray
-    dq: FloatArray
-    ddq: FloatArray
+    times_s: FloatArray  # (m,) ascending [s].
+    q: FloatArray  # (m, n) joint angles [rad].
+    dq: FloatArray  # (m, n) their speeds [rad/s].
+    ddq: FloatArray  # (m, n) their accelerations [rad/s^2].
 
     def __len__(self) -> int:
         return len(self.times_s)

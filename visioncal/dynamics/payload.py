@@ -42,19 +42,13 @@ _RANK = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Estimated inertial parameters of a body on the flange.
+    """Estimated inertial parameters of a body on the flange."""
 
-    Attributes:
-        values: (10,) inertial parameters in the flange's frame, in the order of `Inertias`.
-        covariance: (10, 10) of these.
-        rms_nm: (n,) root mean square of the residual torques [N m].
-        gains_sigma_kg: Standard deviation of the mass by the drive gains alone [kg].
-    """
-
+    # (10,) inertial parameters in the flange's frame, in the order of `Inertias`.
     values: FloatArray
-    covariance: FloatArray
-    rms_nm: FloatArray
-    gains_sigma_kg: float = 0.0
+    covariance: FloatArray  # (10, 10) of these.
+    rms_nm: FloatArray  # (n,) root mean square of the residual torques [N m].
+    gains_sigma_kg: float = 0.0  # Standard deviation of the mass by the drive gains alone [kg].
 
     @property
     def mass_kg(self) -> float:
@@ -224,14 +218,10 @@ def _gains_covariance(loaded: Sequence[Conditioned], fit: Regression, sigma: flo
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """The gains of n drives.
+    """The gains of n drives."""
 
-    Attributes:
-        nm_per_a: (n,) joint torque per current [N m/A].
-        sigma: (n,) standard deviations [N m/A]; inf where the payload does not act on the joint.
-    """
-
-    nm_per_a: FloatArray
+    nm_per_a: FloatArray  # (n,) joint torque per current [N m/A].
+    # (n,) standard deviations [N m/A]; inf where the payload does not act on the joint.
     sigma: FloatArray
 
     @property

@@ -23,23 +23,14 @@ _HOW = (
 
 @dataclass(frozen=True, eq=False)
 class RecordedSamples:
-    """The complete samples of a stream.
+    """The complete samples of a stream."""
 
-    Attributes:
-        label: The stream's file, for messages: `streams/robot.csv`.
-        times_s: (m,) times [s].
-        q: (m, n) joint angles [rad].
-        dq: (m, n) reported speeds [rad/s]; None where the controller reports none.
-        torques_nm: (m, n) torques of the joints [N m].
-        of_currents: Whether the torques are currents times gains.
-    """
-
-    label: str
-    times_s: FloatArray
-    q: FloatArray
-    dq: FloatArray | None
-    torques_nm: FloatArray
-    of_currents: bool = False
+    label: str  # The stream's file, for messages: `streams/robot.csv`.
+    times_s: FloatArray  # (m,) times [s].
+    q: FloatArray  # (m, n) joint angles [rad].
+    dq: FloatArray | None  # (m, n) reported speeds [rad/s]; None where the controller reports none.
+    torques_nm: FloatArray  # (m, n) torques of the joints [N m].
+    of_currents: bool = False  # Whether the torques are currents times gains.
 
     def __len__(self) -> int:
         return len(self.times_s)

@@ -30,19 +30,12 @@ _LEAST_POWER = 0.02
 
 @dataclass(frozen=True, eq=False)
 class NoiseBlock:
-    """Regressor and torques of samples that share a noise level for each joint.
+    """Regressor and torques of samples that share a noise level for each joint."""
 
-    Attributes:
-        x: (k, n, p) regressor.
-        y: (k, n) torques [N m].
-        used: (k, n) mask of the torques that are fitted.
-        correlation: (l,) autocorrelation of filtered white noise at lags 1, 2, ...
-    """
-
-    x: FloatArray
-    y: FloatArray
-    used: Mask
-    correlation: FloatArray
+    x: FloatArray  # (k, n, p) regressor.
+    y: FloatArray  # (k, n) torques [N m].
+    used: Mask  # (k, n) mask of the torques that are fitted.
+    correlation: FloatArray  # (l,) autocorrelation of filtered white noise at lags 1, 2, ...
 
     def __post_init__(self) -> None:
         # Contiguous for each joint, as it is read again and again.
@@ -64,19 +57,12 @@ class NoiseBlock:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """A fit of p parameters to blocks of n joints.
+    """A fit of p parameters to blocks of n joints."""
 
-    Attributes:
-        values: (p,) the parameters.
-        covariance: (p, p) of these.
-        sigmas: (n,) noise of the joints, for each block [N m].
-        blocks: The fitted blocks, outliers masked.
-    """
-
-    values: FloatArray
-    covariance: FloatArray
-    sigmas: tuple[FloatArray, ...]
-    blocks: tuple[NoiseBlock, ...]
+    values: FloatArray  # (p,) the parameters.
+    covariance: FloatArray  # (p, p) of these.
+    sigmas: tuple[FloatArray, ...]  # (n,) noise of the joints, for each block [N m].
+    blocks: tuple[NoiseBlock, ...]  # The fitted blocks, outliers masked.
 
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
@@ -86,17 +72,11 @@ class Regression:
 
 @dataclass(frozen=True, eq=False)
 class _JointFactor:
-    """Triangular factor of a joint's rows, which holds all their information.
+    """Triangular factor of a joint's rows, which holds all their information."""
 
-    Attributes:
-        columns: (c,) indices of the parameters that affect this joint.
-        triangle: (c + 1, c + 1) R factor of [x, y].
-        count: Number of rows.
-    """
-
-    columns: IntArray
-    triangle: FloatArray
-    count: int
+    columns: IntArray  # (c,) indices of the parameters that affect this joint.
+    triangle: FloatArray  # (c + 1, c + 1) R factor of [x, y].
+    count: int  # Number of rows.
 
     def squared_residuals(self, values: FloatArray) -> float:
         """Sum of squared residuals."""

@@ -28,28 +28,21 @@ _ROTORS = 0.75
 
 @dataclass(frozen=True)
 class IdentificationRequest:
-    """Options of `identify_session`.
+    """Options of `identify_session`."""
 
-    Attributes:
-        streams: Names of the streams to fit; all with torques or currents where empty.
-        validate_on: The stream to predict; the end of the fastest motion where empty.
-        cutoff_hz: Cut-off of the low-pass [Hz]; by the motion where None.
-        gains_nm_a: Torque per current, by joint, where currents were recorded [N m/A].
-        options: What is estimated.
-        rotors: Whether rotor inertias are estimated; None to decide by the held-out torques, since
-            torques sensed behind the gears do not include them.
-        robot: Which robot of a whole cell; its streams have, or begin with, its name.
-        lag_s: Delay of the torques behind the angles; estimated where None [s].
-    """
-
+    # Names of the streams to fit; all with torques or currents where empty.
     streams: tuple[str, ...] = ()
-    validate_on: str = ""
-    cutoff_hz: float | None = None
+    validate_on: str = ""  # The stream to predict; the end of the fastest motion where empty.
+    cutoff_hz: float | None = None  # Cut-off of the low-pass [Hz]; by the motion where None.
+    # Torque per current, by joint, where currents were recorded [N m/A].
     gains_nm_a: tuple[float, ...] = ()
-    options: Options = field(default_factory=Options)
+    options: Options = field(default_factory=Options)  # What is estimated.
+    # Whether rotor inertias are estimated; None to decide by the held-out torques, since torques
+    # sensed behind the gears do not include them.
     rotors: bool | None = None
+    # Which robot of a whole cell; its streams have, or begin with, its name.
     robot: str | None = None
-    lag_s: float | None = None
+    lag_s: float | None = None  # Delay of the torques behind the angles; estimated where None [s].
 
 
 @dataclass(frozen=True, eq=False)

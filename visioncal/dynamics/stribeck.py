@@ -30,19 +30,12 @@ _CHANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Stribeck:
-    """Stribeck humps of a joints.
+    """Stribeck humps of a joints."""
 
-    Attributes:
-        joints: (a,) indices of the joints, from 0.
-        hump_nm: (a,) Fs - Fc [N m].
-        speed_rad_s: (a,) vs [rad/s].
-        slow_rad_s: See `model.sign`.
-    """
-
-    joints: IntArray
-    hump_nm: FloatArray
-    speed_rad_s: FloatArray
-    slow_rad_s: float
+    joints: IntArray  # (a,) indices of the joints, from 0.
+    hump_nm: FloatArray  # (a,) Fs - Fc [N m].
+    speed_rad_s: FloatArray  # (a,) vs [rad/s].
+    slow_rad_s: float  # See `model.sign`.
 
     @classmethod
     def none(cls) -> Self:
@@ -144,40 +137,25 @@ def _optimised(problem: "_Weighted", start: Stribeck) -> "_HumpFit":
 
 @dataclass(frozen=True, eq=False)
 class _HumpFit:
-    """Best fit at given speeds of the humps.
+    """Best fit at given speeds of the humps."""
 
-    Attributes:
-        humps: The fitted humps.
-        cost: Sum of squared residuals, in units of the noise.
-        information: (a, a) over the logarithms of the speeds, other parameters eliminated.
-        gradient: (a,) of half the cost, likewise.
-    """
-
-    humps: Stribeck
-    cost: float
+    humps: Stribeck  # The fitted humps.
+    cost: float  # Sum of squared residuals, in units of the noise.
+    # (a, a) over the logarithms of the speeds, other parameters eliminated.
     information: FloatArray
-    gradient: FloatArray
+    gradient: FloatArray  # (a,) of half the cost, likewise.
 
 
 @dataclass(frozen=True, eq=False)
 class _Weighted:
-    """The problem without humps, weighted by given noise.
+    """The problem without humps, weighted by given noise."""
 
-    Attributes:
-        streams: The samples.
-        blocks: Their rows in units of the noise.
-        weights: (k, n) weights of each block [1/(N m)].
-        information: (p, p) over the parameters without humps.
-        right: (p,) right-hand side of their normal equations.
-        total: Sum of squared weighted torques.
-    """
-
-    streams: Sequence[Conditioned]
-    blocks: tuple[NoiseBlock, ...]
-    weights: tuple[FloatArray, ...]
-    information: FloatArray
-    right: FloatArray
-    total: float
+    streams: Sequence[Conditioned]  # The samples.
+    blocks: tuple[NoiseBlock, ...]  # Their rows in units of the noise.
+    weights: tuple[FloatArray, ...]  # (k, n) weights of each block [1/(N m)].
+    information: FloatArray  # (p, p) over the parameters without humps.
+    right: FloatArray  # (p,) right-hand side of their normal equations.
+    total: float  # Sum of squared weighted torques.
 
     @classmethod
     def of(

@@ -34,19 +34,12 @@ _FIGURES_HZ = 200.0
 
 @dataclass(frozen=True)
 class SweepRequest:
-    """Options of planned sweeps.
+    """Options of planned sweeps."""
 
-    Attributes:
-        speeds: Number of speeds of each joint, logarithmically spaced.
-        slowest_rad_s: The least of them [rad/s].
-        hold_s: Duration of constant speed, where the range allows it [s].
-        seed: Seed of the random postures.
-    """
-
-    speeds: int = 6
-    slowest_rad_s: float = 0.02
-    hold_s: float = 3.0
-    seed: int = 0
+    speeds: int = 6  # Number of speeds of each joint, logarithmically spaced.
+    slowest_rad_s: float = 0.02  # The least of them [rad/s].
+    hold_s: float = 3.0  # Duration of constant speed, where the range allows it [s].
+    seed: int = 0  # Seed of the random postures.
 
     def __post_init__(self) -> None:
         if not (2 <= self.speeds <= 30 and self.slowest_rad_s > 0.0):
@@ -68,22 +61,14 @@ class Stroke:
 
     The ramps are fifth-order polynomials without acceleration at both ends. They cover half the
     distance of full speed, whence their highest coefficient is zero.
-
-    Attributes:
-        joint: Index of the joint, from 0.
-        begin: Start position [rad].
-        end: End position [rad].
-        speed: The constant speed, above zero [rad/s].
-        ramp_s: Duration of a ramp [s].
-        sweeps: Whether it is a sweep, or only the move to one.
     """
 
-    joint: int
-    begin: float
-    end: float
-    speed: float
-    ramp_s: float
-    sweeps: bool
+    joint: int  # Index of the joint, from 0.
+    begin: float  # Start position [rad].
+    end: float  # End position [rad].
+    speed: float  # The constant speed, above zero [rad/s].
+    ramp_s: float  # Duration of a ramp [s].
+    sweeps: bool  # Whether it is a sweep, or only the move to one.
 
     @property
     def duration_s(self) -> float:
@@ -111,19 +96,12 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """Sweeps of all joints, from a posture and back to it.
+    """Sweeps of all joints, from a posture and back to it."""
 
-    Attributes:
-        home: (n,) posture of the other joints [rad].
-        strokes: The strokes in order.
-        extremes: Extremes of the motion.
-        left_out: Names of joints with too little free range.
-    """
-
-    home: FloatArray
-    strokes: tuple[Stroke, ...]
-    extremes: MotionExtremes
-    left_out: tuple[str, ...]
+    home: FloatArray  # (n,) posture of the other joints [rad].
+    strokes: tuple[Stroke, ...]  # The strokes in order.
+    extremes: MotionExtremes  # Extremes of the motion.
+    left_out: tuple[str, ...]  # Names of joints with too little free range.
 
     @cached_property
     def begins_s(self) -> FloatArray:

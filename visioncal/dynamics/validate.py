@@ -18,32 +18,21 @@ from visioncal.robot import joint_torques
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Filtered torques of a stream, measured and predicted.
+    """Filtered torques of a stream, measured and predicted."""
 
-    Attributes:
-        label: The stream's file.
-        times_s: (k,) times [s].
-        measured_nm: (k, n) [N m].
-        predicted_nm: (k, n) by the base parameters [N m].
-        consistent_nm: (k, n) by the consistent standard parameters [N m]; None without these.
-        known_nm: (k, n) by the robot's own inertias and friction fitted to them [N m]; None where
-            it has no inertias.
-        used: (k, n) mask of valid torques.
-        q: (k, n) joint angles, filtered likewise [rad].
-        dq: (k, n) their speeds [rad/s].
-        notes: Messages on faults of the samples.
-    """
-
-    label: str
-    times_s: FloatArray
-    measured_nm: FloatArray
-    predicted_nm: FloatArray
+    label: str  # The stream's file.
+    times_s: FloatArray  # (k,) times [s].
+    measured_nm: FloatArray  # (k, n) [N m].
+    predicted_nm: FloatArray  # (k, n) by the base parameters [N m].
+    # (k, n) by the consistent standard parameters [N m]; None without these.
     consistent_nm: FloatArray | None
+    # (k, n) by the robot's own inertias and friction fitted to them [N m]; None where it has no
+    # inertias.
     known_nm: FloatArray | None
-    used: Mask
-    q: FloatArray
-    dq: FloatArray
-    notes: tuple[str, ...] = ()
+    used: Mask  # (k, n) mask of valid torques.
+    q: FloatArray  # (k, n) joint angles, filtered likewise [rad].
+    dq: FloatArray  # (k, n) their speeds [rad/s].
+    notes: tuple[str, ...] = ()  # Messages on faults of the samples.
 
     def rms_nm(self, predicted_nm: FloatArray) -> FloatArray:
         """(n,) root mean square error of a prediction [N m]."""

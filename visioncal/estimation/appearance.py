@@ -109,15 +109,11 @@ def board_prior(target: Target) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """Intrinsics of a camera and shapes of the boards.
+    """Intrinsics of a camera and shapes of the boards."""
 
-    Attributes:
-        camera: The intrinsics.
-        board: (s,) deviations of all targets from their stated shapes, those of printed boards in
-            the order of `BOARD_NAMES`.
-    """
-
-    camera: Camera
+    camera: Camera  # The intrinsics.
+    # (s,) deviations of all targets from their stated shapes, those of printed boards in the order
+    # of `BOARD_NAMES`.
     board: FloatArray
 
     @property
@@ -134,25 +130,15 @@ class Appearance:
 
 @dataclass(frozen=True, eq=False)
 class LensBoardParameters:
-    """Free parameters of an appearance, with the information on them from all but the robot.
+    """Free parameters of an appearance, with the information on them from all but the robot."""
 
-    Attributes:
-        appearance: The values for which the views' poses were estimated.
-        basis: (c, 3, s) of `boards_basis`, by corner number.
-        positions: (c, 3) corners of the flat boards, each in its own frame [m].
-        columns: (k,) indices of the free parameters among the appearance's values.
-        anchored: (k,) mask of those that are held and only count in the covariance.
-        information: (k, k) on the free parameters, from the corners and the prior.
-        gradient: (k,) half the gradient of the same, at the present values.
-    """
-
-    appearance: Appearance
-    basis: FloatArray
-    positions: FloatArray
-    columns: IntArray
-    anchored: Mask
-    information: FloatArray
-    gradient: FloatArray
+    appearance: Appearance  # The values for which the views' poses were estimated.
+    basis: FloatArray  # (c, 3, s) of `boards_basis`, by corner number.
+    positions: FloatArray  # (c, 3) corners of the flat boards, each in its own frame [m].
+    columns: IntArray  # (k,) indices of the free parameters among the appearance's values.
+    anchored: Mask  # (k,) mask of those that are held and only count in the covariance.
+    information: FloatArray  # (k, k) on the free parameters, from the corners and the prior.
+    gradient: FloatArray  # (k,) half the gradient of the same, at the present values.
 
     def effect(self, shift: FloatArray) -> Effect:
         """The parameters as an effect on observations, given their (m, 6, k) Jacobian."""
@@ -165,26 +151,19 @@ class Compressed:
     """Normal equations of the corners, reduced to poses and appearance.
 
     Information is for a corner noise of 1 px.
-
-    Attributes:
-        cam_from_target: (v, 4, 4) the best-fitting poses for the appearance.
-        information: (v, 6, 6) on each pose's right perturbation.
-        by_shared: (v, 6, k) Jacobian of the poses with respect to the appearance.
-        shared_information: (k, k) on the appearance, with free poses (Schur complement).
-        shared_pulls: (v, k) half the gradient of each view's squared error by the appearance.
-        residuals: (n, 2) [px].
-        by_field: (v, 6, m) Jacobian of the poses with respect to lens errors beyond the model, for
-            coefficients in units of the corner noise; see `lens_field`.
-        coefficients: Estimate of these coefficients from the corners; None where there are none.
     """
 
-    cam_from_target: FloatArray
-    information: FloatArray
-    by_shared: FloatArray
-    shared_information: FloatArray
+    cam_from_target: FloatArray  # (v, 4, 4) the best-fitting poses for the appearance.
+    information: FloatArray  # (v, 6, 6) on each pose's right perturbation.
+    by_shared: FloatArray  # (v, 6, k) Jacobian of the poses with respect to the appearance.
+    shared_information: FloatArray  # (k, k) on the appearance, with free poses (Schur complement).
+    # (v, k) half the gradient of each view's squared error by the appearance.
     shared_pulls: FloatArray
-    residuals: FloatArray
+    residuals: FloatArray  # (n, 2) [px].
+    # (v, 6, m) Jacobian of the poses with respect to lens errors beyond the model, for coefficients
+    # in units of the corner noise; see `lens_field`.
     by_field: FloatArray
+    # Estimate of these coefficients from the corners; None where there are none.
     coefficients: Coefficients | None = None
 
     @cached_property

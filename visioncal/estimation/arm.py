@@ -39,33 +39,27 @@ _REACH_M = 0.6
 
 @dataclass(frozen=True, eq=False)
 class ArmErrors:
-    """Errors of the arm as random effects.
+    """Errors of the arm as random effects."""
 
-    Attributes:
-        basis: (s, 6, p) Jacobian of the flange at each stop; all errors are in radians.
-        sigma: Their standard deviation [rad], shrunk by the Akaike weight against none; lengths are
-            off by 0.5 m times as much.
-        gain: Twice the gain in log-likelihood over white noise alone.
-        of_links: Whether they are errors of this arm's links, which can be estimated; else the
-            basis is generic for any arm, and only their size is meaningful.
-        white: (2,) white noise left beside them, of rotation [rad] and position [m]; None where
-            that is the noise of the fit.
-        fit_sigmas: (2,) noise of the fit: white noise and errors together as single stops show
-            them, without what is the same at all stops. None of links.
-        far_posture_errors: (2, 2) errors at postures far from all others of the fit, of rotation
-            [rad] and position [m], measured and predicted; see `pose_errors.left_out_clusters`.
-            None where that is not known.
-        time_correlated_count: Number of errors, the last ones, that are correlated in time; the
-            others are correlated over the posture. At another time they have other values.
-    """
-
-    basis: FloatArray
+    basis: FloatArray  # (s, 6, p) Jacobian of the flange at each stop; all errors are in radians.
+    # Their standard deviation [rad], shrunk by the Akaike weight against none; lengths are off by
+    # 0.5 m times as much.
     sigma: float
-    gain: float
+    gain: float  # Twice the gain in log-likelihood over white noise alone.
+    # Whether they are errors of this arm's links, which can be estimated; else the basis is generic
+    # for any arm, and only their size is meaningful.
     of_links: bool
+    # (2,) white noise left beside them, of rotation [rad] and position [m]; None where that is the
+    # noise of the fit.
     white: FloatArray | None = None
+    # (2,) noise of the fit: white noise and errors together as single stops show them, without what
+    # is the same at all stops. None of links.
     fit_sigmas: FloatArray | None = None
+    # (2, 2) errors at postures far from all others of the fit, of rotation [rad] and position [m],
+    # measured and predicted; see `pose_errors.left_out_clusters`. None where that is not known.
     far_posture_errors: FloatArray | None = None
+    # Number of errors, the last ones, that are correlated in time; the others are correlated over
+    # the posture. At another time they have other values.
     time_correlated_count: int = 0
 
     @property

@@ -26,34 +26,28 @@ _FEWEST_TWISTS, _BY_CHANCE = 6, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """A robot's nominal model and the current values of its errors.
+    """A robot's nominal model and the current values of its errors."""
 
-    Attributes:
-        nominal: The nominal model.
-        flange_from_reported: (4, 4) the frame of the reported poses in the model's flange.
-        weights: The blocks by name with the size of their errors, relative to the first's:
-            `offsets` of the joints, `links` (each by six, behind its joint), `ratios` of the gears,
-            `eccentricity` (sine and cosine of each joint), `compliance` and `backlash` of each
-            joint, `weight` (compliances times unknown link masses), and `harmonics` of the joints'
-            functions.
-        values: (p,) current values [rad], block after block, in units of the first block's size.
-        torque_nm: The torque under which a joint whose compliance is 1 rad bends by that [N m].
-        yielding: (n,) mask of the joints that bend; None for all.
-        functions: Bending functions of unknown link masses; None where masses are known.
-        harmonic_directions: (2 n k, r) Jacobian of sine and cosine of each joint and order from 2
-            on, by the values of `harmonics`.
-        harmonic_sizes: (2 n k,) prior sizes of these, relative to the size of their block; what
-            `harmonic_directions` does not span keeps its prior.
-    """
-
-    nominal: Robot
+    nominal: Robot  # The nominal model.
+    # (4, 4) the frame of the reported poses in the model's flange.
     flange_from_reported: FloatArray
+    # The blocks by name with the size of their errors, relative to the first's: `offsets` of the
+    # joints, `links` (each by six, behind its joint), `ratios` of the gears, `eccentricity` (sine
+    # and cosine of each joint), `compliance` and `backlash` of each joint, `weight` (compliances
+    # times unknown link masses), and `harmonics` of the joints' functions.
     weights: Mapping[str, float]
+    # (p,) current values [rad], block after block, in units of the first block's size.
     values: FloatArray
+    # The torque under which a joint whose compliance is 1 rad bends by that [N m].
     torque_nm: float = 1.0
-    yielding: Mask | None = None
+    yielding: Mask | None = None  # (n,) mask of the joints that bend; None for all.
+    # Bending functions of unknown link masses; None where masses are known.
     functions: WeightFunctions | None = None
+    # (2 n k, r) Jacobian of sine and cosine of each joint and order from 2 on, by the values of
+    # `harmonics`.
     harmonic_directions: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    # (2 n k,) prior sizes of these, relative to the size of their block; what `harmonic_directions`
+    # does not span keeps its prior.
     harmonic_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

@@ -14,18 +14,13 @@ from visioncal.robot import Loads
 
 @dataclass(frozen=True, eq=False)
 class ArmPair:
-    """The two frames on either side of an arm between which it is observed most often.
-
-    Attributes:
-        observer: The observing frame.
-        observed: The observed frame.
-    """
+    """The two frames on either side of an arm between which it is observed most often."""
 
     problem: Problem
     state: State
     robot: str
-    observer: str
-    observed: str
+    observer: str  # The observing frame.
+    observed: str  # The observed frame.
 
     @classmethod
     def of(cls, problem: Problem, state: State, robot: str) -> "ArmPair":
@@ -153,33 +148,22 @@ class ArmPair:
 
 @dataclass(frozen=True, eq=False)
 class ArmData:
-    """Observations of a robot's arm whose errors are estimated.
-
-    Attributes:
-        covariance: (u, u) of the unknowns.
-        columns: (p,) columns of its errors among the unknowns.
-        error_rad: Size of the errors.
-        stops: (m,) the stops at which it was observed.
-        q: (m, n) joint angles there [rad].
-        loads: Its loads there.
-        at: (3,) reference point of the target, in its frame [m].
-        frames: (f,) columns of the unknown frames without a prior.
-        measured: (6,) which components of the poses are measured (rotation, translation).
-    """
+    """Observations of a robot's arm whose errors are estimated."""
 
     problem: Problem
     state: State
     noise: Noise
-    covariance: FloatArray
+    covariance: FloatArray  # (u, u) of the unknowns.
     robot: str
     model: ArmModel
-    columns: IntArray
-    error_rad: float
-    stops: IntArray
-    q: FloatArray
-    loads: Loads
-    at: FloatArray
-    frames: IntArray
+    columns: IntArray  # (p,) columns of its errors among the unknowns.
+    error_rad: float  # Size of the errors.
+    stops: IntArray  # (m,) the stops at which it was observed.
+    q: FloatArray  # (m, n) joint angles there [rad].
+    loads: Loads  # Its loads there.
+    at: FloatArray  # (3,) reference point of the target, in its frame [m].
+    frames: IntArray  # (f,) columns of the unknown frames without a prior.
+    # (6,) which components of the poses are measured (rotation, translation).
     measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
 
     @property

@@ -17,20 +17,16 @@ from visioncal.estimation.problem_parts import Noise, State
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """Names of the error sources; sources with the same name are merged.
+    """Names of the error sources; sources with the same name are merged."""
 
-    Attributes:
-        sensors: The source of each observing frame's measurement noise, by the frame.
-        robots: The source of each robot's flange error from stop to stop, by the robot.
-        columns: The problem's columns with the prior uncertainty of effects, by the source. Columns
-            of no source do not count.
-        priors: The source of hand-measured frames.
-    """
-
+    # The source of each observing frame's measurement noise, by the frame.
     sensors: Mapping[str, str]
+    # The source of each robot's flange error from stop to stop, by the robot.
     robots: Mapping[str, str]
+    # The problem's columns with the prior uncertainty of effects, by the source. Columns of no
+    # source do not count.
     columns: Mapping[str, IntArray] = field(default_factory=dict)
-    priors: str = "priors"
+    priors: str = "priors"  # The source of hand-measured frames.
 
 
 def covariance_by_source(

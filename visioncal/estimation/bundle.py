@@ -25,22 +25,14 @@ _CONVERGED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BundleFit:
-    """Result of the bundle adjustment.
-
-    Attributes:
-        cam_from_target: (v, 4, 4).
-        residuals: (n, 2) [px].
-        sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
-        covariance: (4 + k, 4 + k) of the intrinsics, poses marginalised.
-        settled: Whether the iteration converged.
-    """
+    """Result of the bundle adjustment."""
 
     camera: Camera
-    cam_from_target: FloatArray
-    residuals: FloatArray
-    sigma_px: float
-    covariance: FloatArray
-    settled: bool
+    cam_from_target: FloatArray  # (v, 4, 4).
+    residuals: FloatArray  # (n, 2) [px].
+    sigma_px: float  # Standard deviation of a corner's coordinate, stated or by the residuals [px].
+    covariance: FloatArray  # (4 + k, 4 + k) of the intrinsics, poses marginalised.
+    settled: bool  # Whether the iteration converged.
 
 
 @dataclass(frozen=True, eq=False)

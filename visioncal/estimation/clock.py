@@ -50,37 +50,23 @@ _ALIKE = 1.2
 
 @dataclass(frozen=True, eq=False)
 class ClockFit:
-    """A clock offset with both edges.
+    """A clock offset with both edges."""
 
-    Attributes:
-        offset_s: Camera clock minus robot clock [s].
-        sigma_s: Its standard deviation [s]; very large where the motion does not determine it.
-        fit: Both edges, by the moving frames, and the noise.
-        frames: Number of frames used.
-    """
-
-    offset_s: float
-    sigma_s: float
-    fit: Solution
-    frames: int
+    offset_s: float  # Camera clock minus robot clock [s].
+    sigma_s: float  # Its standard deviation [s]; very large where the motion does not determine it.
+    fit: Solution  # Both edges, by the moving frames, and the noise.
+    frames: int  # Number of frames used.
 
 
 @dataclass(frozen=True, eq=False)
 class DelayedFit:
-    """A clock offset with delays of corners within the image.
+    """A clock offset with delays of corners within the image."""
 
-    Attributes:
-        clock: The offset and both edges.
-        times_s: (k,) their times [s].
-        sigmas_s: (k,) standard deviations of the times [s].
-        freedom: Degrees of freedom of these.
-    """
-
-    clock: ClockFit
+    clock: ClockFit  # The offset and both edges.
     delays: tuple[Delay, ...]
-    times_s: FloatArray
-    sigmas_s: FloatArray
-    freedom: float
+    times_s: FloatArray  # (k,) their times [s].
+    sigmas_s: FloatArray  # (k,) standard deviations of the times [s].
+    freedom: float  # Degrees of freedom of these.
 
     @property
     def is_clear(self) -> Mask:
@@ -91,19 +77,12 @@ class DelayedFit:
 
 @dataclass(frozen=True)
 class ClockChange:
-    """Step or drift of a clock offset.
+    """Step or drift of a clock offset."""
 
-    Attributes:
-        from_s: Camera time of the step, or of the start of the drift [s].
-        step_s: Increase of the offset [s]; of a drift, per second.
-        sigma_s: Its standard deviation.
-        is_drift: Whether the offset grows steadily.
-    """
-
-    from_s: float
-    step_s: float
-    sigma_s: float
-    is_drift: bool
+    from_s: float  # Camera time of the step, or of the start of the drift [s].
+    step_s: float  # Increase of the offset [s]; of a drift, per second.
+    sigma_s: float  # Its standard deviation.
+    is_drift: bool  # Whether the offset grows steadily.
 
     def shares(self, stamps_s: FloatArray) -> FloatArray:
         """(m,) change of the offset at some times [s], in units of `step_s`."""

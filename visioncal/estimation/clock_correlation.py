@@ -27,19 +27,14 @@ _FEWEST_PAIRS = 4
 
 @dataclass(frozen=True, eq=False)
 class ImageTimes:
-    """Views of a camera, by its own clock.
-
-    Attributes:
-        stamps_s: (m,) times [s], ascending.
-        cam_from_target: (m, 4, 4) [m].
-        covariance: (m, 6, 6) of their right perturbations; None where unknown.
-        stack: The corners that the poses were made from, frame by frame; None without any.
-    """
+    """Views of a camera, by its own clock."""
 
     mount: Mount
-    stamps_s: FloatArray
-    cam_from_target: FloatArray
+    stamps_s: FloatArray  # (m,) times [s], ascending.
+    cam_from_target: FloatArray  # (m, 4, 4) [m].
+    # (m, 6, 6) of their right perturbations; None where unknown.
     covariance: FloatArray | None = None
+    # The corners that the poses were made from, frame by frame; None without any.
     stack: CornerStack | None = None
 
     def __len__(self) -> int:
@@ -65,19 +60,13 @@ class ImageTimes:
 
 @dataclass(frozen=True)
 class Match:
-    """An offset at which camera and robot rotate alike.
+    """An offset at which camera and robot rotate alike."""
 
-    Attributes:
-        offset_s: Camera clock minus robot clock [s].
-        sigma_s: Its standard deviation by the angles [s]; infinite where they do not depend on it.
-        correlation: Correlation of the angles there.
-        at_end: Whether it lies at an end of the search range.
-    """
-
-    offset_s: float
+    offset_s: float  # Camera clock minus robot clock [s].
+    # Its standard deviation by the angles [s]; infinite where they do not depend on it.
     sigma_s: float
-    correlation: float
-    at_end: bool = False
+    correlation: float  # Correlation of the angles there.
+    at_end: bool = False  # Whether it lies at an end of the search range.
 
 
 def turning_matches(
@@ -120,23 +109,14 @@ def turning_matches(
 
 @dataclass(frozen=True, eq=False)
 class _Rotation:
-    """Rotation angles of camera and robot between pairs of frames.
+    """Rotation angles of camera and robot between pairs of frames."""
 
-    Attributes:
-        by_camera: (k,) angles from the camera [rad].
-        first: (k,) grid step of each pair's first frame at zero offset.
-        second: (k,) grid step of its second frame.
-        steps: (g,) the grid's steps within the robot's samples, ascending.
-        quaternions: (g, 4) of the robot there.
-        per_window: Number of pairs that share a stretch of time.
-    """
-
-    by_camera: FloatArray
-    first: IntArray
-    second: IntArray
-    steps: IntArray
-    quaternions: FloatArray
-    per_window: float
+    by_camera: FloatArray  # (k,) angles from the camera [rad].
+    first: IntArray  # (k,) grid step of each pair's first frame at zero offset.
+    second: IntArray  # (k,) grid step of its second frame.
+    steps: IntArray  # (g,) the grid's steps within the robot's samples, ascending.
+    quaternions: FloatArray  # (g, 4) of the robot there.
+    per_window: float  # Number of pairs that share a stretch of time.
 
     @classmethod
     def of(

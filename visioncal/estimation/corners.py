@@ -32,32 +32,22 @@ def floored_sigma_px(sigma_px: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class CornerStack:
-    """The n corners of v views.
+    """The n corners of v views."""
 
-    Attributes:
-        views: (v,) view numbers.
-        blurs: (v,) blur of each view's edges, as a sigma [px].
-        starts: (v,) index of each view's first corner.
-        view_of: (n,) index of each corner's view.
-        ids: (n,) each corner's number on the target.
-        points: (n, 3) corners on the target [m].
-        px: (n, 2) detected image positions [px].
-        weights: (n,) weights of the corners' residuals, inverse to their standard deviations; None
-            where all are one.
-        stated_px: Stated standard deviation of a corner of weight one [px]; None if not stated.
-        zooms: (n, 2) displacement of the corners by one sigma of their view's focus jitter, in
-            units of the corner noise, unweighted; None for no jitter.
-    """
-
-    views: tuple[int, ...]
-    blurs: tuple[float, ...]
-    starts: IntArray
-    view_of: IntArray
-    ids: IntArray
-    points: FloatArray
-    px: FloatArray
+    views: tuple[int, ...]  # (v,) view numbers.
+    blurs: tuple[float, ...]  # (v,) blur of each view's edges, as a sigma [px].
+    starts: IntArray  # (v,) index of each view's first corner.
+    view_of: IntArray  # (n,) index of each corner's view.
+    ids: IntArray  # (n,) each corner's number on the target.
+    points: FloatArray  # (n, 3) corners on the target [m].
+    px: FloatArray  # (n, 2) detected image positions [px].
+    # (n,) weights of the corners' residuals, inverse to their standard deviations; None where all
+    # are one.
     weights: FloatArray | None = None
+    # Stated standard deviation of a corner of weight one [px]; None if not stated.
     stated_px: float | None = None
+    # (n, 2) displacement of the corners by one sigma of their view's focus jitter, in units of the
+    # corner noise, unweighted; None for no jitter.
     zooms: FloatArray | None = None
 
     @classmethod
@@ -222,25 +212,15 @@ class CornerStack:
 
 @dataclass(frozen=True, eq=False)
 class WithoutPoses:
-    """Jacobian columns of a stack after elimination of the views' poses.
+    """Jacobian columns of a stack after elimination of the views' poses."""
 
-    Attributes:
-        stack: The corners.
-        by_pose: (n, 2, 6) derivatives by the poses, in units of the corner noise.
-        information: (v, 6, 6) on the poses.
-        inverse: (v, 6, 6) inverse of the information.
-        roots: (v,) square roots of the views' weights.
-        answer: (v, 6, c) response of the poses to the columns' parameters.
-        left: (n, 2, c) columns projected orthogonally to the poses, times the roots.
-    """
-
-    stack: CornerStack
-    by_pose: FloatArray
-    information: FloatArray
-    inverse: FloatArray
-    roots: FloatArray
-    answer: FloatArray
-    left: FloatArray
+    stack: CornerStack  # The corners.
+    by_pose: FloatArray  # (n, 2, 6) derivatives by the poses, in units of the corner noise.
+    information: FloatArray  # (v, 6, 6) on the poses.
+    inverse: FloatArray  # (v, 6, 6) inverse of the information.
+    roots: FloatArray  # (v,) square roots of the views' weights.
+    answer: FloatArray  # (v, 6, c) response of the poses to the columns' parameters.
+    left: FloatArray  # (n, 2, c) columns projected orthogonally to the poses, times the roots.
 
     @classmethod
     def of(
@@ -332,18 +312,13 @@ class WithoutPoses:
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:
-    """Reprojection of a stack.
+    """Reprojection of a stack."""
 
-    Attributes:
-        residuals: (n, 2) predicted minus detected, weighted [px].
-        by_pose: (n, 2, 6) derivatives by the right perturbation of the view's `cam_from_target`.
-        by_intrinsics: (n, 2, k) derivatives by the intrinsics.
-        by_point: (n, 2, 3) derivatives by each corner's position on the target, unweighted.
-    """
-
-    residuals: FloatArray
+    residuals: FloatArray  # (n, 2) predicted minus detected, weighted [px].
+    # (n, 2, 6) derivatives by the right perturbation of the view's `cam_from_target`.
     by_pose: FloatArray
-    by_intrinsics: FloatArray
+    by_intrinsics: FloatArray  # (n, 2, k) derivatives by the intrinsics.
+    # (n, 2, 3) derivatives by each corner's position on the target, unweighted.
     by_point: FloatArray
 
 

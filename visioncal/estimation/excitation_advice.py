@@ -15,17 +15,11 @@ _SPANS_RAD = tuple(np.deg2rad([30.0, 60.0, 120.0, 240.0]).tolist())
 
 @dataclass(frozen=True)
 class Move:
-    """A joint that has to move over a wider range.
+    """A joint that has to move over a wider range."""
 
-    Attributes:
-        joint: Index from 0.
-        moved: Its range over the stops [rad or m].
-        wanted: Sufficient range, all other joints unchanged [rad or m].
-    """
-
-    joint: int
-    moved: float
-    wanted: float
+    joint: int  # Index from 0.
+    moved: float  # Its range over the stops [rad or m].
+    wanted: float  # Sufficient range, all other joints unchanged [rad or m].
 
 
 def joints_to_move(

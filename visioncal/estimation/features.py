@@ -46,18 +46,12 @@ _BEHIND = 0.1
 
 @dataclass(frozen=True, eq=False)
 class FeatureTouches:
-    """Touched points of a fixture's features, n in all.
+    """Touched points of a fixture's features, n in all."""
 
-    Attributes:
-        labels: (n,) the touches' names.
-        kinds: (n,) the touched features.
-        points: (n, 3) in the base [m].
-        covariances: (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
-    """
-
-    labels: tuple[str, ...]
-    kinds: tuple[FeatureKind, ...]
-    points: FloatArray
+    labels: tuple[str, ...]  # (n,) the touches' names.
+    kinds: tuple[FeatureKind, ...]  # (n,) the touched features.
+    points: FloatArray  # (n, 3) in the base [m].
+    # (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
     covariances: FloatArray
 
     def __len__(self) -> int:
@@ -70,20 +64,17 @@ class FeatureTouches:
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
-    """A fixture's frame from n touches of its features.
+    """A fixture's frame from n touches of its features."""
 
-    Attributes:
-        agreement: The inlier touches, and their fit. Its residuals are in the fixture's frame [m],
-            zero where a coordinate is unconstrained.
-        noise_m: Noise of a touch per axis, beyond its stated one [m]: estimated where there are
-            redundant touches, else the expected one, else zero where each touch's own is stated;
-            None where nothing determines it.
-        worst: The least certain offset, and the least certain rotation. Where nothing determines
-            the noise they are those of a careful touch.
-    """
-
+    # The inlier touches, and their fit. Its residuals are in the fixture's frame [m], zero where a
+    # coordinate is unconstrained.
     agreement: GroupInliers[FloatArray]
+    # Noise of a touch per axis, beyond its stated one [m]: estimated where there are redundant
+    # touches, else the expected one, else zero where each touch's own is stated; None where nothing
+    # determines it.
     noise_m: float | None
+    # The least certain offset, and the least certain rotation. Where nothing determines the noise
+    # they are those of a careful touch.
     worst: tuple[Direction, Direction]
 
     @property

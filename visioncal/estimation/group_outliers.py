@@ -22,24 +22,18 @@ _ODDS = 100.0
 
 @dataclass(frozen=True, eq=False)
 class GroupInliers(Generic[State]):
-    """The inlier groups, and their fit.
+    """The inlier groups, and their fit."""
 
-    Attributes:
-        fit: From the inlier groups.
-        mask: (m,) mask of them.
-        mahalanobis_sq: (m,) squared Mahalanobis distance of each group from the prediction of the
-            others, over the number of predicted directions: one on average for noise.
-        limit: (m,) its rejection limit; infinite where the others do not predict the group at all.
-        doubtful: (m,) groups of which some are wrong, not known which: all of them stay.
-        explained: Whether noise explains the inliers: none is doubtful, and their misfit is within
-            the chi-square limit of the expected level, where one was given.
-    """
-
-    fit: GroupFit[State]
-    mask: Mask
+    fit: GroupFit[State]  # From the inlier groups.
+    mask: Mask  # (m,) mask of them.
+    # (m,) squared Mahalanobis distance of each group from the prediction of the others, over the
+    # number of predicted directions: one on average for noise.
     mahalanobis_sq: FloatArray
+    # (m,) its rejection limit; infinite where the others do not predict the group at all.
     limit: FloatArray
-    doubtful: Mask
+    doubtful: Mask  # (m,) groups of which some are wrong, not known which: all of them stay.
+    # Whether noise explains the inliers: none is doubtful, and their misfit is within the
+    # chi-square limit of the expected level, where one was given.
     explained: bool
 
     @property

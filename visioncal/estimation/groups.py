@@ -35,19 +35,12 @@ _START_SIGMA = 5e-4
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """A problem linearised at one state: m groups of up to d residuals, by p unknowns.
+    """A problem linearised at one state: m groups of up to d residuals, by p unknowns."""
 
-    Attributes:
-        residuals: (m, d) [m], zero where not observed.
-        jacobian: (m, d, p) by the unknowns' steps, zero where not observed.
-        observed: (m, d) mask of the existing residuals: groups may be smaller than d.
-        known: (m, d, d) stated covariance [m^2]; zeros where none is.
-    """
-
-    residuals: FloatArray
-    jacobian: FloatArray
-    observed: Mask
-    known: FloatArray
+    residuals: FloatArray  # (m, d) [m], zero where not observed.
+    jacobian: FloatArray  # (m, d, p) by the unknowns' steps, zero where not observed.
+    observed: Mask  # (m, d) mask of the existing residuals: groups may be smaller than d.
+    known: FloatArray  # (m, d, d) stated covariance [m^2]; zeros where none is.
 
     def __len__(self) -> int:
         return len(self.residuals)
@@ -118,26 +111,18 @@ class GroupProblem(Protocol[State]):
 
 @dataclass(frozen=True, eq=False)
 class GroupFit(Generic[State]):
-    """Fit to some of the groups.
+    """Fit to some of the groups."""
 
-    Attributes:
-        state: The maximum-likelihood unknowns.
-        covariance: (p, p) of their steps; undetermined directions have a large but finite variance.
-        sigma: Maximum-likelihood noise of one residual [m], beyond the stated one; the expected one
-            where there are no degrees of freedom.
-        freedom: Degrees of freedom: residuals used less directions determined.
-        groups: All groups at the solution, used or not.
-        used: (m,) mask of the groups of the fit.
-        settled: Whether the state converged.
-    """
-
-    state: State
+    state: State  # The maximum-likelihood unknowns.
+    # (p, p) of their steps; undetermined directions have a large but finite variance.
     covariance: FloatArray
+    # Maximum-likelihood noise of one residual [m], beyond the stated one; the expected one where
+    # there are no degrees of freedom.
     sigma: float
-    freedom: int
-    groups: Groups
-    used: Mask
-    settled: bool
+    freedom: int  # Degrees of freedom: residuals used less directions determined.
+    groups: Groups  # All groups at the solution, used or not.
+    used: Mask  # (m,) mask of the groups of the fit.
+    settled: bool  # Whether the state converged.
 
     @property
     def gains(self) -> FloatArray:

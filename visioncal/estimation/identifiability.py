@@ -19,34 +19,23 @@ LEAST_SHARE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """Identifiable and determined errors of an arm.
+    """Identifiable and determined errors of an arm."""
 
-    Attributes:
-        columns: Number of unknowns: of the frames and of the arm's errors.
-        identifiable: Number of them, or of their combinations, that any postures could determine.
-        determined: Number of them that the stops determine better than the prior.
-        values: (L,) singular values of the determined directions of the arm, descending.
-        missing: (p, k) the k directions of the arm's errors identifiable but not determined.
-    """
-
-    columns: int
+    columns: int  # Number of unknowns: of the frames and of the arm's errors.
+    # Number of them, or of their combinations, that any postures could determine.
     identifiable: int
-    determined: int
-    values: FloatArray
+    determined: int  # Number of them that the stops determine better than the prior.
+    values: FloatArray  # (L,) singular values of the determined directions of the arm, descending.
+    # (p, k) the k directions of the arm's errors identifiable but not determined.
     missing: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Jacobians:
-    """Jacobians of the observations by the frames at both ends and by the arm's errors.
+    """Jacobians of the observations by the frames at both ends and by the arm's errors."""
 
-    Attributes:
-        frames: (r, f) by the frames.
-        arm: (r, p) by the arm's errors, in units of their prior size.
-    """
-
-    frames: FloatArray
-    arm: FloatArray
+    frames: FloatArray  # (r, f) by the frames.
+    arm: FloatArray  # (r, p) by the arm's errors, in units of their prior size.
 
     def free(self) -> tuple[int, FloatArray]:
         """Rank of the frames, and (r, p) the arm's Jacobian projected off them.
@@ -109,21 +98,14 @@ class Indices:
     """Observability indices, by which sets of stops are compared; larger is better.
 
     With the singular values s_1 >= ... >= s_L of the determined directions, over m stops:
-
-    Attributes:
-        o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the noise ellipsoid's
-            volume.
-        o2: `s_L / s_1`, one over the condition number (Driels and Pathre 1990).
-        o3: `s_L` (Nahvi, Hollerbach and Hayward 1994).
-        o4: `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9).
-        o5: `1 / (1 / s_1 + ... + 1 / s_L)` (Sun and Hollerbach 2008, of A-optimality).
     """
 
+    # `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the noise ellipsoid's volume.
     o1: float
-    o2: float
-    o3: float
-    o4: float
-    o5: float
+    o2: float  # `s_L / s_1`, one over the condition number (Driels and Pathre 1990).
+    o3: float  # `s_L` (Nahvi, Hollerbach and Hayward 1994).
+    o4: float  # `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9).
+    o5: float  # `1 / (1 / s_1 + ... + 1 / s_L)` (Sun and Hollerbach 2008, of A-optimality).
 
     @property
     def condition(self) -> float:

@@ -236,19 +236,12 @@ def _fitted(
 
 @dataclass(frozen=True)
 class MeasuredScale:
-    """Scale of a board (or rig) measured by the chain alone, without the prior of its size.
+    """Scale of a board (or rig) measured by the chain alone, without the prior of its size."""
 
-    Attributes:
-        board: Index of the board.
-        scale: Relative deviation from the stated size, positive if larger.
-        sigma: Its standard deviation.
-        stated_sigma: Relative standard deviation of the stated size.
-    """
-
-    board: int
-    scale: float
-    sigma: float
-    stated_sigma: float
+    board: int  # Index of the board.
+    scale: float  # Relative deviation from the stated size, positive if larger.
+    sigma: float  # Its standard deviation.
+    stated_sigma: float  # Relative standard deviation of the stated size.
 
     @property
     def is_another(self) -> bool:
@@ -377,21 +370,13 @@ def chance_limit(freedom: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Normal equations for score tests of the values that a fit holds (Rao).
+    """Normal equations for score tests of the values that a fit holds (Rao)."""
 
-    Attributes:
-        information: (p, p) with all values free.
-        gradient: (p,) of half the squared error, at the fit.
-        moving: (p,) mask of the columns that are free in the problem.
-        columns: Columns of the lens and board values.
-        places: Indices of the values in these columns.
-    """
-
-    information: FloatArray
-    gradient: FloatArray
-    moving: Mask
-    columns: slice
-    places: IntArray
+    information: FloatArray  # (p, p) with all values free.
+    gradient: FloatArray  # (p,) of half the squared error, at the fit.
+    moving: Mask  # (p,) mask of the columns that are free in the problem.
+    columns: slice  # Columns of the lens and board values.
+    places: IntArray  # Indices of the values in these columns.
 
     @classmethod
     def of(cls, side: FrameModel, fitted: ConvergedFit) -> "Scores":

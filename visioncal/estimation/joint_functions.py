@@ -70,27 +70,20 @@ _INFORMATIVE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class JointFunctions:
-    """Estimated functions of an arm's joints.
+    """Estimated functions of an arm's joints."""
 
-    Attributes:
-        errors: The errors of the whole arm by block, with their re-estimated sizes.
-        levels: (r, 2) of the robots' noise beside them; see `Noise`.
-        sizes: (2 n k,) of sine and cosine of each joint and order from 2 on, relative to that of
-            their block.
-        directions: (2 n k, r) Jacobian of these by the block's values: combinations that the
-            observations determine.
-        sigma_rad: Their size s [rad].
-        length_rad: Correlation length l over the joint angle [rad].
-        gain: Twice the gain in log-likelihood over the nominal arm.
-    """
-
+    # The errors of the whole arm by block, with their re-estimated sizes.
     errors: Mapping[str, ArmErrors]
-    levels: FloatArray
+    levels: FloatArray  # (r, 2) of the robots' noise beside them; see `Noise`.
+    # (2 n k,) of sine and cosine of each joint and order from 2 on, relative to that of their
+    # block.
     sizes: FloatArray
+    # (2 n k, r) Jacobian of these by the block's values: combinations that the observations
+    # determine.
     directions: FloatArray
-    sigma_rad: float
-    length_rad: float
-    gain: float
+    sigma_rad: float  # Their size s [rad].
+    length_rad: float  # Correlation length l over the joint angle [rad].
+    gain: float  # Twice the gain in log-likelihood over the nominal arm.
 
 
 def most_orders() -> int:
@@ -169,22 +162,17 @@ def find_joint_functions(
 
 @dataclass(frozen=True, eq=False)
 class _Waves:
-    """The harmonics of a process as columns.
+    """The harmonics of a process as columns."""
 
-    Attributes:
-        columns: (s, 6, 2 n + r) Jacobian of the flange by sine and cosine of order 2 of each joint,
-            and by r combinations of higher orders in units of the process.
-        series: (k + 1,) variances of the process's orders, from 1 on; zeros without a process.
-        expanded: (2 n k, 2 n + r) each column in terms of sine and cosine of each joint and order.
-        seconds: Number 2 n of columns of order 2.
-        length_rad: Length of the process; 0 of none.
-    """
-
+    # (s, 6, 2 n + r) Jacobian of the flange by sine and cosine of order 2 of each joint, and by r
+    # combinations of higher orders in units of the process.
     columns: FloatArray
+    # (k + 1,) variances of the process's orders, from 1 on; zeros without a process.
     series: FloatArray
+    # (2 n k, 2 n + r) each column in terms of sine and cosine of each joint and order.
     expanded: FloatArray
-    seconds: int
-    length_rad: float
+    seconds: int  # Number 2 n of columns of order 2.
+    length_rad: float  # Length of the process; 0 of none.
 
     @classmethod
     def of(cls, harmonics: FloatArray, length_rad: float = 0.0) -> "_Waves":
@@ -208,31 +196,18 @@ class _Waves:
 
 @dataclass(frozen=True, eq=False)
 class _ArmLikelihood:
-    """Likelihood of an arm with groups of errors of unknown sizes.
+    """Likelihood of an arm with groups of errors of unknown sizes."""
 
-    Attributes:
-        nominal: The likelihood without errors of the arm.
-        mine: (u,) the units of the robot: no other depends on its errors.
-        own: (m, 6 w, p) Jacobian of these units by the unknowns, the arm's errors last.
-        others: (u - m, 6 w, p - q) that of the other units, without the arm's errors.
-        known: Prior information on the unknowns.
-        names: The groups, in the order of the sizes.
-        shares: (q, g) variance of each error per unit variance of each group.
-        bases: The columns of each block but the harmonics.
-        waves: The harmonics.
-        torque_nm: The torque of a unit compliance [N m].
-    """
-
-    nominal: RobotLikelihood
-    mine: Mask
-    own: FloatArray
-    others: FloatArray
-    known: PriorInformation
-    names: tuple[str, ...]
-    shares: FloatArray
-    bases: Mapping[str, FloatArray]
-    waves: _Waves
-    torque_nm: float
+    nominal: RobotLikelihood  # The likelihood without errors of the arm.
+    mine: Mask  # (u,) the units of the robot: no other depends on its errors.
+    own: FloatArray  # (m, 6 w, p) Jacobian of these units by the unknowns, the arm's errors last.
+    others: FloatArray  # (u - m, 6 w, p - q) that of the other units, without the arm's errors.
+    known: PriorInformation  # Prior information on the unknowns.
+    names: tuple[str, ...]  # The groups, in the order of the sizes.
+    shares: FloatArray  # (q, g) variance of each error per unit variance of each group.
+    bases: Mapping[str, FloatArray]  # The columns of each block but the harmonics.
+    waves: _Waves  # The harmonics.
+    torque_nm: float  # The torque of a unit compliance [N m].
 
     @classmethod
     def of(
@@ -411,15 +386,10 @@ class _ArmLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class _SizesAt(LikelihoodValue):
-    """Likelihood at some levels and sizes; its curvature is average information.
+    """Likelihood at some levels and sizes; its curvature is average information."""
 
-    Attributes:
-        logs: The logarithms of levels and sizes.
-        effects: (q,) the most likely errors of the arm.
-    """
-
-    logs: FloatArray
-    effects: FloatArray
+    logs: FloatArray  # The logarithms of levels and sizes.
+    effects: FloatArray  # (q,) the most likely errors of the arm.
 
 
 def _inverted(information: FloatArray) -> tuple[FloatArray, float]:

@@ -30,15 +30,10 @@ from visioncal.estimation.solve import (
 
 @dataclass(frozen=True)
 class Blocks:
-    """Free blocks of errors at a level.
+    """Free blocks of errors at a level."""
 
-    Attributes:
-        names: Blocks of the arm's errors, in the order of the search.
-        own: Blocks that define the level: without any of them it is another.
-    """
-
-    names: tuple[str, ...]
-    own: tuple[str, ...]
+    names: tuple[str, ...]  # Blocks of the arm's errors, in the order of the search.
+    own: tuple[str, ...]  # Blocks that define the level: without any of them it is another.
 
 
 LEVELS: Mapping[str, Blocks] = MappingProxyType(
@@ -59,22 +54,15 @@ _RIGID = Blocks((), ())
 
 @dataclass(frozen=True, eq=False)
 class LevelFit:
-    """Fit with the errors of one level of a robot's arm free.
+    """Fit with the errors of one level of a robot's arm free."""
 
-    Attributes:
-        errors: The errors by block; empty for the nominal arm.
-        gain: Twice the gain in log-likelihood over the nominal arm.
-        inside: (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
-        left_out: (m, 6) leave-one-out residuals of each stop, to first order.
-        has_rotation: (m,) which observations include a rotation.
-    """
-
-    errors: Mapping[str, ArmErrors]
+    errors: Mapping[str, ArmErrors]  # The errors by block; empty for the nominal arm.
     fit: Solution
-    gain: float
+    gain: float  # Twice the gain in log-likelihood over the nominal arm.
+    # (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
     inside: FloatArray
-    left_out: FloatArray
-    has_rotation: Mask
+    left_out: FloatArray  # (m, 6) leave-one-out residuals of each stop, to first order.
+    has_rotation: Mask  # (m,) which observations include a rotation.
 
     @property
     def size(self) -> int:
@@ -84,19 +72,14 @@ class LevelFit:
 
 @dataclass(frozen=True, eq=False)
 class ArmTrials:
-    """Cached fits with errors of one robot's arm: levels begin with the same blocks.
+    """Cached fits with errors of one robot's arm: levels begin with the same blocks."""
 
-    Attributes:
-        problem: The observations, without errors of this arm.
-        bases: (s, 6, p) by stop, columns of each block of errors by its name.
-        noise: Starts of the noise levels; default starts where None.
-    """
-
-    problem: Problem
+    problem: Problem  # The observations, without errors of this arm.
     state: State
     robot: str
+    # (s, 6, p) by stop, columns of each block of errors by its name.
     bases: Mapping[str, FloatArray]
-    noise: Noise | None = None
+    noise: Noise | None = None  # Starts of the noise levels; default starts where None.
     _fits: dict[tuple[ArmErrors, ...], Solution] = field(default_factory=dict)
     _likely: dict[tuple[ArmErrors, ...], RobotLikelihood] = field(default_factory=dict)
     _found: dict[tuple[int, float, tuple[ArmErrors, ...]], ArmErrors | None] = field(

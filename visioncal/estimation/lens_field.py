@@ -25,20 +25,13 @@ _MOVED = 1e-2
 
 @dataclass(frozen=True)
 class LensLevels:
-    """Sizes of the lens errors beyond the model, over the noise of a corner's coordinate.
+    """Sizes of the lens errors beyond the model, over the noise of a corner's coordinate."""
 
-    Attributes:
-        field: Standard deviation of the field, per axis.
-        length: The field's length, as a share of the image's width.
-        breathing: Relative change of the focal length as the distance doubles [1/px].
-        jitter: Relative change of the focal length from view to view [1/px].
-        gains: Fall of twice the log-likelihood without each of the three.
-    """
-
-    field: float = 0.0
-    length: float = 0.2
-    breathing: float = 0.0
-    jitter: float = 0.0
+    field: float = 0.0  # Standard deviation of the field, per axis.
+    length: float = 0.2  # The field's length, as a share of the image's width.
+    breathing: float = 0.0  # Relative change of the focal length as the distance doubles [1/px].
+    jitter: float = 0.0  # Relative change of the focal length from view to view [1/px].
+    # Fall of twice the log-likelihood without each of the three.
     gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -135,21 +128,13 @@ def displacements(
 
 @dataclass(frozen=True, eq=False)
 class Coefficients:
-    """Estimated coefficients of variance one, in units of the corners' noise.
+    """Estimated coefficients of variance one, in units of the corners' noise."""
 
-    Attributes:
-        mean: (m,) the most likely ones.
-        slope: (m, k) their derivative by the shared unknowns.
-        moving_roots: (m, o) roots of their covariance that move poses.
-        rest: (m, m - o) roots of the rest of it.
-        freedom: Number of coefficients that the corners determine.
-    """
-
-    mean: FloatArray
-    slope: FloatArray
-    moving_roots: FloatArray
-    rest: FloatArray
-    freedom: float
+    mean: FloatArray  # (m,) the most likely ones.
+    slope: FloatArray  # (m, k) their derivative by the shared unknowns.
+    moving_roots: FloatArray  # (m, o) roots of their covariance that move poses.
+    rest: FloatArray  # (m, m - o) roots of the rest of it.
+    freedom: float  # Number of coefficients that the corners determine.
 
     @classmethod
     def of(

@@ -54,34 +54,21 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """One camera's linearised corners and observations: o observations (chains) of v views.
+    """One camera's linearised corners and observations: o observations (chains) of v views."""
 
-    Attributes:
-        stack: The corners, without effects of the focus.
-        camera: The lens.
-        without: (n, 2, c + 2) columns of lens, board and breathing, of a change of focus, and of
-            the residuals, after elimination of the poses.
-        chained: (o,) the view of each observation.
-        jacobian: (o, 6, t) Jacobian of the observations' residuals by the unknowns.
-        by_errors: (o, 6, 6 w) Jacobian by the flange errors.
-        away: (o, 6) the residuals.
-        robots: (o, w) indices of these flanges' robots; -1 for none.
-        places: (c - 1,) indices of lens and board among the unknowns.
-        known: (t, t) information on the unknowns from everything else.
-        gradient: (t,) half the gradient of everything else.
-    """
-
-    stack: CornerStack
-    camera: Camera
+    stack: CornerStack  # The corners, without effects of the focus.
+    camera: Camera  # The lens.
+    # (n, 2, c + 2) columns of lens, board and breathing, of a change of focus, and of the
+    # residuals, after elimination of the poses.
     without: WithoutPoses
-    chained: IntArray
-    jacobian: FloatArray
-    by_errors: FloatArray
-    away: FloatArray
-    robots: IntArray
-    places: IntArray
-    known: FloatArray
-    gradient: FloatArray
+    chained: IntArray  # (o,) the view of each observation.
+    jacobian: FloatArray  # (o, 6, t) Jacobian of the observations' residuals by the unknowns.
+    by_errors: FloatArray  # (o, 6, 6 w) Jacobian by the flange errors.
+    away: FloatArray  # (o, 6) the residuals.
+    robots: IntArray  # (o, w) indices of these flanges' robots; -1 for none.
+    places: IntArray  # (c - 1,) indices of lens and board among the unknowns.
+    known: FloatArray  # (t, t) information on the unknowns from everything else.
+    gradient: FloatArray  # (t,) half the gradient of everything else.
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,35 +77,22 @@ class _Likelihood:
 
     Corner quantities are in units of the corner noise. The q unknowns are the t of the
     observations, breathing, and the field's modes.
-
-    Attributes:
-        rows: Number of residuals.
-        information: (q, q) on the unknowns, with the errors of single views at zero.
-        gradient: (q,) half the gradient of the squared error.
-        cost: The squared error.
-        local: (v, l, l) information on the errors of single views: of flanges, then of the focus.
-        cross: (v, l, q) information between these and the unknowns.
-        pulls: (v, l) half the gradient by the errors of single views.
-        kinds: (v, l) the level of each of these errors; -1 for none.
-        known: (t, t) information on the observations' unknowns from everything else.
-        known_gradient: (t,) half the gradient of everything else.
-        noise_px: (2,) RMS corner residuals with lens, board and field all free, and with lens and
-            board alone.
-        flanges: Number of robots.
     """
 
-    rows: float
-    information: FloatArray
-    gradient: FloatArray
-    cost: float
+    rows: float  # Number of residuals.
+    information: FloatArray  # (q, q) on the unknowns, with the errors of single views at zero.
+    gradient: FloatArray  # (q,) half the gradient of the squared error.
+    cost: float  # The squared error.
+    # (v, l, l) information on the errors of single views: of flanges, then of the focus.
     local: FloatArray
-    cross: FloatArray
-    pulls: FloatArray
-    kinds: IntArray
-    known: FloatArray
-    known_gradient: FloatArray
+    cross: FloatArray  # (v, l, q) information between these and the unknowns.
+    pulls: FloatArray  # (v, l) half the gradient by the errors of single views.
+    kinds: IntArray  # (v, l) the level of each of these errors; -1 for none.
+    known: FloatArray  # (t, t) information on the observations' unknowns from everything else.
+    known_gradient: FloatArray  # (t,) half the gradient of everything else.
+    # (2,) RMS corner residuals with lens, board and field all free, and with lens and board alone.
     noise_px: tuple[float, float]
-    flanges: int
+    flanges: int  # Number of robots.
 
     @cached_property
     def modes(self) -> IntArray:

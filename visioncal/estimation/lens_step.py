@@ -28,21 +28,13 @@ _SAME_WITHIN = 2
 
 @dataclass(frozen=True)
 class LensStep:
-    """A step of a lens.
+    """A step of a lens."""
 
-    Attributes:
-        first: Index of the first view after it, in the order of the views.
-        zoom: Relative increase of the focal length.
-        centre_px: (x, y) displacement of the principal point [px].
-        sigmas: Standard deviations of these three.
-        gain: Twice the gain in log-likelihood.
-    """
-
-    first: int
-    zoom: float
-    centre_px: tuple[float, float]
-    sigmas: tuple[float, float, float]
-    gain: float
+    first: int  # Index of the first view after it, in the order of the views.
+    zoom: float  # Relative increase of the focal length.
+    centre_px: tuple[float, float]  # (x, y) displacement of the principal point [px].
+    sigmas: tuple[float, float, float]  # Standard deviations of these three.
+    gain: float  # Twice the gain in log-likelihood.
 
 
 def lens_step(

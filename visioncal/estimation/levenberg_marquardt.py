@@ -27,18 +27,12 @@ NEAR_DAMPING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linearised(Generic[State]):
-    """A problem linearised at one state.
+    """A problem linearised at one state."""
 
-    Attributes:
-        state: The linearisation point.
-        cost: The squared error there.
-        step: Maps a damping to the state after the damped step.
-        fall: Maps a damping to the predicted decrease of the cost; None if not known.
-    """
-
-    state: State
-    cost: float
-    step: Callable[[float], State]
+    state: State  # The linearisation point.
+    cost: float  # The squared error there.
+    step: Callable[[float], State]  # Maps a damping to the state after the damped step.
+    # Maps a damping to the predicted decrease of the cost; None if not known.
     fall: Callable[[float], float] | None = None
 
 

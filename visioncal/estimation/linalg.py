@@ -23,14 +23,10 @@ class Spectrum:
     """Eigenvalues of an information matrix scaled to a unit diagonal.
 
     The scaling makes them independent of the units of the parameters.
-
-    Attributes:
-        values: (n,) ascending, non-negative.
-        vectors: (n, n) unit vectors in the parameters' own units, one per column.
     """
 
-    values: FloatArray
-    vectors: FloatArray
+    values: FloatArray  # (n,) ascending, non-negative.
+    vectors: FloatArray  # (n, n) unit vectors in the parameters' own units, one per column.
 
     @property
     def ratio(self) -> float:

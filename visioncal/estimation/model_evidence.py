@@ -31,36 +31,25 @@ _LEAST_SIGMA = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CalibrationPosterior:
-    """Posterior of the calibration, the prior of a verification.
-
-    Attributes:
-        covariance: (p, p) of their steps.
-        freedom: Degrees of freedom of its scale; infinite where it is known.
-    """
+    """Posterior of the calibration, the prior of a verification."""
 
     state: State
-    covariance: FloatArray
+    covariance: FloatArray  # (p, p) of their steps.
     noise: Noise
-    freedom: float
+    freedom: float  # Degrees of freedom of its scale; infinite where it is known.
 
 
 @dataclass(frozen=True, eq=False)
 class ChangeHypothesis:
-    """A change that may have happened since the calibration, of p unknowns.
-
-    Attributes:
-        by_sensor: (n, 6, p) right perturbations of the measured poses that undo it.
-        flange_jacobian: (s, 6, p) right perturbations of the flange at each stop that undo it.
-        units: (p,) the size of each unknown, for a change of one metre.
-        start: (p,) start of the search.
-        noise_factors: Factors on the noise of the stops, where larger noise is the change.
-    """
+    """A change that may have happened since the calibration, of p unknowns."""
 
     name: str
-    by_sensor: FloatArray
+    by_sensor: FloatArray  # (n, 6, p) right perturbations of the measured poses that undo it.
+    # (s, 6, p) right perturbations of the flange at each stop that undo it.
     flange_jacobian: FloatArray
-    units: FloatArray
-    start: FloatArray
+    units: FloatArray  # (p,) the size of each unknown, for a change of one metre.
+    start: FloatArray  # (p,) start of the search.
+    # Factors on the noise of the stops, where larger noise is the change.
     noise_factors: tuple[float, ...] = ()
 
     @property
@@ -73,23 +62,14 @@ class ChangeHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisEvidence:
-    """Evidence of the stops for one cause.
+    """Evidence of the stops for one cause."""
 
-    Attributes:
-        likelihood: Logarithm of its marginal likelihood.
-        values: (p,) its unknowns, by the stops alone.
-        covariance: (p, p) of these.
-        noise_factor: Most likely factor on the noise.
-        misfit: Squared Mahalanobis distance that the cause leaves unexplained.
-        freedom: Degrees of freedom of the misfit.
-    """
-
-    likelihood: float
-    values: FloatArray
-    covariance: FloatArray
-    noise_factor: float
-    misfit: float
-    freedom: int
+    likelihood: float  # Logarithm of its marginal likelihood.
+    values: FloatArray  # (p,) its unknowns, by the stops alone.
+    covariance: FloatArray  # (p, p) of these.
+    noise_factor: float  # Most likely factor on the noise.
+    misfit: float  # Squared Mahalanobis distance that the cause leaves unexplained.
+    freedom: int  # Degrees of freedom of the misfit.
 
 
 def evidence_of(

@@ -39,23 +39,14 @@ _RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """A frame that moved at some stop.
+    """A frame that moved at some stop."""
 
-    Attributes:
-        frame: The frame's name before the move.
-        twin: Its name from the move on.
-        stop: The first stop after the move.
-        change: (4, 4) its new pose in its own old frame: as first estimated.
-        rivals: Frames whose move would explain as much.
-        mahalanobis_sq: The evidence for it, where it is slight.
-    """
-
-    frame: str
-    twin: str
-    stop: int
-    change: FloatArray
-    rivals: tuple[str, ...] = ()
-    mahalanobis_sq: float = 0.0
+    frame: str  # The frame's name before the move.
+    twin: str  # Its name from the move on.
+    stop: int  # The first stop after the move.
+    change: FloatArray  # (4, 4) its new pose in its own old frame: as first estimated.
+    rivals: tuple[str, ...] = ()  # Frames whose move would explain as much.
+    mahalanobis_sq: float = 0.0  # The evidence for it, where it is slight.
 
 
 def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:

@@ -15,45 +15,31 @@ _NULL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """Normal equations with the flanges' errors eliminated, unit by unit.
+    """Normal equations with the flanges' errors eliminated, unit by unit."""
 
-    Attributes:
-        information: (p, p) on the unknowns, with the flanges' errors unconstrained.
-        gradient: (p,) half the gradient of the squared error.
-        cost: The squared error.
-        errors: (u, 6 w) estimate of each unit's flange errors.
-        jacobian: (u, 6 w, p) of these estimates by the unknowns.
-        covariance: (u, 6 w, 6 w) of these estimates, from the observations' noise alone.
-        by_flanges: (u, 6 w, 6 w) Jacobian of these estimates by the flange poses: the identity
-            where the flanges were observed and the errors are their own.
-    """
-
-    information: FloatArray
-    gradient: FloatArray
-    cost: float
-    errors: FloatArray
-    jacobian: FloatArray
-    covariance: FloatArray
+    information: FloatArray  # (p, p) on the unknowns, with the flanges' errors unconstrained.
+    gradient: FloatArray  # (p,) half the gradient of the squared error.
+    cost: float  # The squared error.
+    errors: FloatArray  # (u, 6 w) estimate of each unit's flange errors.
+    jacobian: FloatArray  # (u, 6 w, p) of these estimates by the unknowns.
+    covariance: FloatArray  # (u, 6 w, 6 w) of these estimates, from the observations' noise alone.
+    # (u, 6 w, 6 w) Jacobian of these estimates by the flange poses: the identity where the flanges
+    # were observed and the errors are their own.
     by_flanges: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """Inverse of the observations' covariance, block diagonal less a low-rank part for each unit.
+    """Inverse of the observations' covariance, block diagonal less a low-rank part a unit."""
 
-    Attributes:
-        weights: (n, 6, 6) inverse covariance of each observation's own noise, including its
-            flange's error if no other observation shares that.
-        taken: (n, 6 w, 6) factors of the Schur complement for shared flange errors: the square of
-            their product with the observations, summed over a unit, is subtracted.
-        units: (n,) unit of each observation; -1 if it shares no errors.
-        count: Number of units.
-    """
-
+    # (n, 6, 6) inverse covariance of each observation's own noise, including its flange's error if
+    # no other observation shares that.
     weights: FloatArray
+    # (n, 6 w, 6) factors of the Schur complement for shared flange errors: the square of their
+    # product with the observations, summed over a unit, is subtracted.
     taken: FloatArray
-    units: IntArray
-    count: int
+    units: IntArray  # (n,) unit of each observation; -1 if it shares no errors.
+    count: int  # Number of units.
 
     @classmethod
     def of(

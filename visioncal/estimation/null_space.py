@@ -29,15 +29,11 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Null:
-    """Changes of a table's parameters that no stops of the arm can determine.
+    """Changes of a table's parameters that no stops of the arm can determine."""
 
-    Attributes:
-        directions: (r, k) in reduced row echelon form: only a few parameters are nonzero in each.
-        frames: (12, r) compensating changes of the base frame and of the carried frame.
-    """
-
+    # (r, k) in reduced row echelon form: only a few parameters are nonzero in each.
     directions: FloatArray
-    frames: FloatArray
+    frames: FloatArray  # (12, r) compensating changes of the base frame and of the carried frame.
 
 
 def null_of(jacobian: Jacobians) -> Null:

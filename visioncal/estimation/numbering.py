@@ -36,22 +36,16 @@ _MOST_TRIED = 10**9
 
 @dataclass(frozen=True, eq=False)
 class Numbering:
-    """The order in which measured points fit a drawing.
+    """The order in which measured points fit a drawing."""
 
-    Attributes:
-        assignment: (n,) index of the drawn point of each measured one: `arange(n)` for the stated
-            order. Of several that fit equally well it is the one that moves the fewest.
-        rms_m: Root mean square distance of the points in that order [m].
-        stated_rms_m: The same in the stated order [m].
-        is_wrong: Whether the stated order fits significantly worse.
-        equally_good: Number of orders that fit as well as the best one; 1 where it is unique. Of
-            large sets not all orders are tried, and this is a lower bound.
-    """
-
+    # (n,) index of the drawn point of each measured one: `arange(n)` for the stated order. Of
+    # several that fit equally well it is the one that moves the fewest.
     assignment: IntArray
-    rms_m: float
-    stated_rms_m: float
-    is_wrong: bool
+    rms_m: float  # Root mean square distance of the points in that order [m].
+    stated_rms_m: float  # The same in the stated order [m].
+    is_wrong: bool  # Whether the stated order fits significantly worse.
+    # Number of orders that fit as well as the best one; 1 where it is unique. Of large sets not all
+    # orders are tried, and this is a lower bound.
     equally_good: int
 
     @property

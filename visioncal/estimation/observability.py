@@ -49,19 +49,12 @@ _PART_OF_NULL = 0.05
 
 @dataclass(frozen=True)
 class Direction:
-    """The least certain direction of an edge.
+    """The least certain direction of an edge."""
 
-    Attributes:
-        words: Its name, such as `the camera's offset along the tool's z`.
-        sigma: Its predicted standard deviation [m or rad].
-        limit: The largest accepted one, in the same unit.
-        is_rotation: Whether it is an angle.
-    """
-
-    words: str
-    sigma: float
-    limit: float
-    is_rotation: bool
+    words: str  # Its name, such as `the camera's offset along the tool's z`.
+    sigma: float  # Its predicted standard deviation [m or rad].
+    limit: float  # The largest accepted one, in the same unit.
+    is_rotation: bool  # Whether it is an angle.
 
     @property
     def figure(self) -> str:
@@ -118,21 +111,15 @@ def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Moun
 
 @dataclass(frozen=True)
 class CellWords:
-    """Wording of messages about a cell.
+    """Wording of messages about a cell."""
 
-    Attributes:
-        title: Prefix of messages.
-        names: Names of each unknown frame, and of its parent.
-        motion: Words for what is wrong with the motion, given the undetermined frame.
-        advice: Words for what to do, given that frame and its undetermined part in words, which may
-            be empty.
-        undetermined: Cause and advice where the first effect is not determined.
-    """
-
-    title: str
-    names: Mapping[str, tuple[str, str]]
+    title: str  # Prefix of messages.
+    names: Mapping[str, tuple[str, str]]  # Names of each unknown frame, and of its parent.
+    # Words for what is wrong with the motion, given the undetermined frame.
     motion: Callable[[str], str]
+    # Words for what to do, given that frame and its undetermined part in words, which may be empty.
     advice: Callable[[str, str], str]
+    # Cause and advice where the first effect is not determined.
     undetermined: tuple[str, str] = _UNDETERMINED["camera"]
 
 

@@ -70,21 +70,13 @@ _SUSPECT_SHARE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class InlierFit:
-    """The inliers, and their fit.
+    """The inliers, and their fit."""
 
-    Attributes:
-        problem: All n observations; a moved frame is two frames in its tree.
-        fit: The unknowns and the noise, by the inliers.
-        used: (n,) mask of the inliers.
-        distances: Distance of each observation from the prediction of the others.
-        moves: The moves, in the order in which they were found.
-    """
-
-    problem: Problem
-    fit: Solution
-    used: Mask
-    distances: Distances
-    moves: tuple[Move, ...]
+    problem: Problem  # All n observations; a moved frame is two frames in its tree.
+    fit: Solution  # The unknowns and the noise, by the inliers.
+    used: Mask  # (n,) mask of the inliers.
+    distances: Distances  # Distance of each observation from the prediction of the others.
+    moves: tuple[Move, ...]  # The moves, in the order in which they were found.
 
     @property
     def part(self) -> Problem:

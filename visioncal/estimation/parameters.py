@@ -18,17 +18,11 @@ _ROW = len(ROW_NAMES)
 
 @dataclass(frozen=True)
 class Parameter:
-    """A free parameter of a joint table.
+    """A free parameter of a joint table."""
 
-    Attributes:
-        joint: Its row, from 0.
-        kind: `theta`, `d`, `a`, `alpha`, `beta`, or `ratio`, `sine`, `cosine` of its function.
-        link: Its link: 0 for X_0, i for Z_i X_i.
-    """
-
-    joint: int
-    kind: str
-    link: int
+    joint: int  # Its row, from 0.
+    kind: str  # `theta`, `d`, `a`, `alpha`, `beta`, or `ratio`, `sine`, `cosine` of its function.
+    link: int  # Its link: 0 for X_0, i for Z_i X_i.
 
     @property
     def is_length(self) -> bool:

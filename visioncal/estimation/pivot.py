@@ -49,23 +49,18 @@ _ADVICE = (
 
 @dataclass(frozen=True, eq=False)
 class PivotFit:
-    """A tool from n touches of k points.
+    """A tool from n touches of k points."""
 
-    Attributes:
-        agreement: The inlier touches, and their fit, in the tool's frame.
-        oriented: Whether the rotation was measured; else it is the flange's own.
-        covariance: (6, 6) of the tool's right perturbation (rotation [rad], translation [m]); zero
-            in the rotation where that was not measured.
-        points_covariance: (k, 3, 3) of the touched points [m^2].
-        belongs_to: (n,) the other point that an outlier touch fits; None for none.
-        worst: The least certain directions: the tip's, then the rotation's if measured.
-    """
-
+    # The inlier touches, and their fit, in the tool's frame.
     agreement: GroupInliers[TouchUnknowns]
-    oriented: bool
+    oriented: bool  # Whether the rotation was measured; else it is the flange's own.
+    # (6, 6) of the tool's right perturbation (rotation [rad], translation [m]); zero in the
+    # rotation where that was not measured.
     covariance: FloatArray
-    points_covariance: FloatArray
+    points_covariance: FloatArray  # (k, 3, 3) of the touched points [m^2].
+    # (n,) the other point that an outlier touch fits; None for none.
     belongs_to: tuple[int | None, ...]
+    # The least certain directions: the tip's, then the rotation's if measured.
     worst: tuple[Direction, ...]
 
     @property

@@ -60,25 +60,17 @@ _MIXED_UNITS = (
 
 @dataclass(frozen=True, eq=False)
 class PointPairs:
-    """Measured points and their coordinates in the drawing, n in all.
+    """Measured points and their coordinates in the drawing, n in all."""
 
-    Attributes:
-        labels: (n,) the points' names, repeated for repeated measurements.
-        measured: (n, 3) in the base [m].
-        covariances: (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
-        nominal: (n, 3) in the fixture's frame [m].
-        nominal_sigma_m: (n,) tolerance of the part to its drawing, per axis, as a sigma [m].
-        spare_labels: (k,) names of drawn points that were not measured.
-        spare: (k, 3) their coordinates in the fixture's frame [m].
-    """
-
-    labels: tuple[str, ...]
-    measured: FloatArray
+    labels: tuple[str, ...]  # (n,) the points' names, repeated for repeated measurements.
+    measured: FloatArray  # (n, 3) in the base [m].
+    # (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
     covariances: FloatArray
-    nominal: FloatArray
+    nominal: FloatArray  # (n, 3) in the fixture's frame [m].
+    # (n,) tolerance of the part to its drawing, per axis, as a sigma [m].
     nominal_sigma_m: FloatArray
-    spare_labels: tuple[str, ...] = ()
-    spare: FloatArray | None = None
+    spare_labels: tuple[str, ...] = ()  # (k,) names of drawn points that were not measured.
+    spare: FloatArray | None = None  # (k, 3) their coordinates in the fixture's frame [m].
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -259,17 +251,11 @@ def _typical_distance(points: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Scale:
-    """Scale of the measured part relative to the drawing, if left free.
+    """Scale of the measured part relative to the drawing, if left free."""
 
-    Attributes:
-        value: Measured over drawn.
-        sigma: Its standard deviation.
-        differs: Whether it differs significantly from one.
-    """
-
-    value: float
-    sigma: float
-    differs: bool
+    value: float  # Measured over drawn.
+    sigma: float  # Its standard deviation.
+    differs: bool  # Whether it differs significantly from one.
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,23 +268,19 @@ class FixturePlacement:
 
 @dataclass(frozen=True, eq=False)
 class PointFit:
-    """A fixture's frame from n points.
+    """A fixture's frame from n points."""
 
-    Attributes:
-        agreement: The inlier points and their fit, without any scale. Its residuals are measured
-            less drawn, in the base [m].
-        scale: The scale if it were free.
-        numbering: The order in which the points fit the drawing best; repeated measurements count
-            once, at their first place.
-        hand_known: Whether mirrored points would have been found: coplanar points leave the sign of
-            the fixture's z axis open.
-        worst: The least certain offset, amid the points, and the least certain rotation.
-    """
-
+    # The inlier points and their fit, without any scale. Its residuals are measured less drawn, in
+    # the base [m].
     agreement: GroupInliers[FixturePlacement]
-    scale: Scale
+    scale: Scale  # The scale if it were free.
+    # The order in which the points fit the drawing best; repeated measurements count once, at their
+    # first place.
     numbering: Numbering
+    # Whether mirrored points would have been found: coplanar points leave the sign of the fixture's
+    # z axis open.
     hand_known: bool
+    # The least certain offset, amid the points, and the least certain rotation.
     worst: tuple[Direction, Direction]
 
     @property

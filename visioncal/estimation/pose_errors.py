@@ -71,19 +71,12 @@ _ITERATIONS, _CONVERGED, _WORST_DAMPING, _LONGEST_STEP = 30, 5e-3, 1e4, 1.5
 
 @dataclass(frozen=True, eq=False)
 class _Process:
-    """Errors with the covariance `size^2 kernel_ij at_i at_j'` between stops i and j.
+    """Errors with the covariance `size^2 kernel_ij at_i at_j'` between stops i and j."""
 
-    Attributes:
-        kernel: (s, s) correlation of the stops.
-        at: (s, 6, q) Jacobian of the flange at each stop by q independent errors.
-        size: Their standard deviation, in units of `at`.
-        lasts: Whether they are correlated over time, not over the posture.
-    """
-
-    kernel: FloatArray
-    at: FloatArray
-    size: float
-    lasts: bool = False
+    kernel: FloatArray  # (s, s) correlation of the stops.
+    at: FloatArray  # (s, 6, q) Jacobian of the flange at each stop by q independent errors.
+    size: float  # Their standard deviation, in units of `at`.
+    lasts: bool = False  # Whether they are correlated over time, not over the posture.
 
     def between(self, some: IntArray, others: IntArray) -> FloatArray:
         """(a, b, 6, 6) covariance between the flange at some stops and at others."""
@@ -94,21 +87,13 @@ class _Process:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """One model of an arm's errors.
+    """One model of an arm's errors."""
 
-    Attributes:
-        kind: A key of the priors.
-        prior: Its prior probability.
-        processes: The processes beside white noise.
-        white: (2,) the noise, of rotation [rad] and position [m].
-        value: The negative restricted log-likelihood at the most likely sizes.
-    """
-
-    kind: str
-    prior: float
-    processes: tuple[_Process, ...]
-    white: FloatArray
-    value: float = np.inf
+    kind: str  # A key of the priors.
+    prior: float  # Its prior probability.
+    processes: tuple[_Process, ...]  # The processes beside white noise.
+    white: FloatArray  # (2,) the noise, of rotation [rad] and position [m].
+    value: float = np.inf  # The negative restricted log-likelihood at the most likely sizes.
 
     @property
     def evidence(self) -> float:
@@ -313,23 +298,15 @@ def _columns(
 
 @dataclass(frozen=True, eq=False)
 class _StopBlock:
-    """Stops with a joint covariance.
+    """Stops with a joint covariance."""
 
-    Attributes:
-        stops: (u,) the stop of each unit, among those with a pose.
-        errors: (n,) reduced residuals of the units.
-        jacobian: (n, p) by the unknowns.
-        known: (n, n) covariance without the robot's own errors.
-        white: (2, n) contribution of the robot's rotation and position noise to its diagonal.
-        by_flange: (u, n / u, 6) Jacobian by the robot's flange.
-    """
-
-    stops: IntArray
-    errors: FloatArray
-    jacobian: FloatArray
-    known: FloatArray
+    stops: IntArray  # (u,) the stop of each unit, among those with a pose.
+    errors: FloatArray  # (n,) reduced residuals of the units.
+    jacobian: FloatArray  # (n, p) by the unknowns.
+    known: FloatArray  # (n, n) covariance without the robot's own errors.
+    # (2, n) contribution of the robot's rotation and position noise to its diagonal.
     white: FloatArray
-    by_flange: FloatArray
+    by_flange: FloatArray  # (u, n / u, 6) Jacobian by the robot's flange.
 
     def common(self, process: _Process) -> FloatArray:
         """(n, n) covariance by a process of unit size."""
@@ -347,17 +324,11 @@ class _LikelihoodAt(LikelihoodValue):
 
 @dataclass(frozen=True, eq=False)
 class _Likelihood:
-    """The restricted likelihood of one robot's errors.
+    """The restricted likelihood of one robot's errors."""
 
-    Attributes:
-        blocks: Its stops; different blocks count as independent.
-        information: (p, p) on the unknowns by everything else.
-        gradient: (p,) of that.
-    """
-
-    blocks: tuple[_StopBlock, ...]
-    information: FloatArray
-    gradient: FloatArray
+    blocks: tuple[_StopBlock, ...]  # Its stops; different blocks count as independent.
+    information: FloatArray  # (p, p) on the unknowns by everything else.
+    gradient: FloatArray  # (p,) of that.
 
     @classmethod
     def of(

@@ -30,17 +30,11 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class PlanarPoses:
-    """Closed-form poses of v views.
+    """Closed-form poses of v views."""
 
-    Attributes:
-        first: (v, 4, 4) the better `cam_from_target`.
-        second: (v, 4, 4) the other; equal where there is one.
-        solved: (v,) whether there is any; the poses of other views are meaningless.
-    """
-
-    first: FloatArray
-    second: FloatArray
-    solved: Mask
+    first: FloatArray  # (v, 4, 4) the better `cam_from_target`.
+    second: FloatArray  # (v, 4, 4) the other; equal where there is one.
+    solved: Mask  # (v,) whether there is any; the poses of other views are meaningless.
 
 
 def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
@@ -115,17 +109,12 @@ def _pose(rotation_vector: FloatArray, translation: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """Poses of v views.
+    """Poses of v views."""
 
-    Attributes:
-        cam_from_target: (v, 4, 4).
-        information: (v, 6, 6) of each pose's right perturbation, for corners of 1 px noise.
-        residuals: (n, 2) of the stack [px].
-    """
-
-    cam_from_target: FloatArray
+    cam_from_target: FloatArray  # (v, 4, 4).
+    # (v, 6, 6) of each pose's right perturbation, for corners of 1 px noise.
     information: FloatArray
-    residuals: FloatArray
+    residuals: FloatArray  # (n, 2) of the stack [px].
 
 
 def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:

@@ -27,21 +27,13 @@ _SET_SIZE = 5
 
 @dataclass(frozen=True, eq=False)
 class PositionReadings:
-    """Position readings of points on the flange by an instrument.
+    """Position readings of points on the flange by an instrument."""
 
-    Attributes:
-        base_from_flange: (m, 4, 4) one per reading.
-        read: (m, 3) positions in the instrument's frame [m].
-        points: (m,) index of the point.
-        stops: (m,) index of the robot's stop.
-        sigmas: (m,) standard deviations of each coordinate [m].
-    """
-
-    base_from_flange: FloatArray
-    read: FloatArray
-    points: IntArray
-    stops: IntArray
-    sigmas: FloatArray
+    base_from_flange: FloatArray  # (m, 4, 4) one per reading.
+    read: FloatArray  # (m, 3) positions in the instrument's frame [m].
+    points: IntArray  # (m,) index of the point.
+    stops: IntArray  # (m,) index of the robot's stop.
+    sigmas: FloatArray  # (m,) standard deviations of each coordinate [m].
 
     def subset(self, chosen: Mask) -> "PositionReadings":
         """Returns the readings of an (m,) mask."""
@@ -56,15 +48,10 @@ class PositionReadings:
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """Pose of the instrument and positions of the points on the flange.
+    """Pose of the instrument and positions of the points on the flange."""
 
-    Attributes:
-        base_from_instrument: (4, 4).
-        on_flange: (p, 3) the points in the flange's frame [m].
-    """
-
-    base_from_instrument: FloatArray
-    on_flange: FloatArray
+    base_from_instrument: FloatArray  # (4, 4).
+    on_flange: FloatArray  # (p, 3) the points in the flange's frame [m].
 
 
 def find_mounting(places: PositionReadings) -> tuple[Mounting, FloatArray]:

@@ -43,18 +43,12 @@ class _Group:
 
 @dataclass(frozen=True, eq=False)
 class _MovedGroup:
-    """Jacobians of a group's m observations with respect to the effects' values.
+    """Jacobians of a group's m observations with respect to the effects' values."""
 
-    Attributes:
-        values: (c,) indices of the effects' values that the group depends on.
-        places: (s,) indices, among these, of the values that move the measured poses.
-        by_sensor: (m, 6, s) Jacobian of the measured poses with respect to those.
-        by_steps: (m, 6, c) Jacobian of each path step's flange; None where no effect moves it.
-    """
-
-    values: IntArray
-    places: IntArray
-    by_sensor: FloatArray
+    values: IntArray  # (c,) indices of the effects' values that the group depends on.
+    places: IntArray  # (s,) indices, among these, of the values that move the measured poses.
+    by_sensor: FloatArray  # (m, 6, s) Jacobian of the measured poses with respect to those.
+    # (m, 6, c) Jacobian of each path step's flange; None where no effect moves it.
     by_steps: tuple[FloatArray | None, ...]
 
 
@@ -69,23 +63,18 @@ class JacobianBlock:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """All residuals, linearised.
+    """All residuals, linearised."""
 
-    Attributes:
-        residuals: (n, 6).
-        blocks: Jacobian with respect to the p unknowns, one block for each pair of frames.
-        by_errors: (n, 6, 6 w) Jacobian with respect to the flange errors, in the slots of the
-            robots of the observation's unit; see `Problem.units`.
-        by_flanges: (n, 6, 6 w) Jacobian with respect to the flange poses; equals `by_errors` unless
-            errors are those of the observed frame, see `Problem.is_combined`.
-        size: Number of unknowns p.
-    """
-
-    residuals: FloatArray
+    residuals: FloatArray  # (n, 6).
+    # Jacobian with respect to the p unknowns, one block for each pair of frames.
     blocks: tuple[JacobianBlock, ...]
+    # (n, 6, 6 w) Jacobian with respect to the flange errors, in the slots of the robots of the
+    # observation's unit; see `Problem.units`.
     by_errors: FloatArray
+    # (n, 6, 6 w) Jacobian with respect to the flange poses; equals `by_errors` unless errors are
+    # those of the observed frame, see `Problem.is_combined`.
     by_flanges: FloatArray
-    size: int
+    size: int  # Number of unknowns p.
 
     @property
     def jacobian(self) -> FloatArray:
@@ -118,30 +107,24 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The frames, the robots' poses, the observations and the unknowns.
+    """The frames, the robots' poses, the observations and the unknowns."""
 
-    Attributes:
-        tree: The frames.
-        poses: (s, 4, 4) `base_from_flange` by robot and stop; NaN where unknown.
-        effects: Jointly acting unknowns, in the order of their columns, after the edges.
-        priors: Manual measurements of frames.
-        points: Frames of which only the position is estimated; their rotation is arbitrary and
-            fixed.
-        least_levels: (s,) lower bounds of the sensors' noise levels; empty for no bounds.
-        with_repeats: Whether repeated observations of one stationary frame by another share an
-            error as large as the noise of one: errors of a lens or a print repeat in every view.
-        is_combined: Whether the observations' own noise is unknown: it and that of the only robot
-            are then one noise of estimated levels, in the observed frame.
-    """
-
-    tree: Tree
+    tree: Tree  # The frames.
+    # (s, 4, 4) `base_from_flange` by robot and stop; NaN where unknown.
     poses: Mapping[str, FloatArray]
     observations: Observations
+    # Jointly acting unknowns, in the order of their columns, after the edges.
     effects: tuple[Effect, ...] = ()
-    priors: tuple[FramePrior, ...] = ()
+    priors: tuple[FramePrior, ...] = ()  # Manual measurements of frames.
+    # Frames of which only the position is estimated; their rotation is arbitrary and fixed.
     points: frozenset[str] = frozenset()
+    # (s,) lower bounds of the sensors' noise levels; empty for no bounds.
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # Whether repeated observations of one stationary frame by another share an error as large as
+    # the noise of one: errors of a lens or a print repeat in every view.
     with_repeats: bool = False
+    # Whether the observations' own noise is unknown: it and that of the only robot are then one
+    # noise of estimated levels, in the observed frame.
     is_combined: bool = False
     # Last results of `linear`, keyed by `ideal`: a fit, its noise and its tests use the same one.
     _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)

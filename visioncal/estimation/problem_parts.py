@@ -22,27 +22,17 @@ UNEVEN = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """n measured poses.
+    """n measured poses."""
 
-    Attributes:
-        observers: (n,) the observing frame.
-        observed: (n,) the observed frame.
-        stops: (n,) the stop, numbered from 0.
-        sensors: (n,) index of the sensor's noise level; -1 where the covariance is absolute.
-        measured: (n, 4, 4) `observer_from_observed`.
-        covariance: (n, 6, 6) of its right perturbation, at a sensor's level of one.
-        has_rotation: (n,) whether its rotation was measured; else its position alone.
-        is_uneven: (n,) whether its covariance is a guess, with unknown differences between
-            observations.
-    """
-
-    observers: tuple[str, ...]
-    observed: tuple[str, ...]
-    stops: IntArray
+    observers: tuple[str, ...]  # (n,) the observing frame.
+    observed: tuple[str, ...]  # (n,) the observed frame.
+    stops: IntArray  # (n,) the stop, numbered from 0.
+    # (n,) index of the sensor's noise level; -1 where the covariance is absolute.
     sensors: IntArray
-    measured: FloatArray
-    covariance: FloatArray
-    has_rotation: Mask
+    measured: FloatArray  # (n, 4, 4) `observer_from_observed`.
+    covariance: FloatArray  # (n, 6, 6) of its right perturbation, at a sensor's level of one.
+    has_rotation: Mask  # (n,) whether its rotation was measured; else its position alone.
+    # (n,) whether its covariance is a guess, with unknown differences between observations.
     is_uneven: Mask
 
     def __len__(self) -> int:
@@ -86,26 +76,20 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A vector of k unknowns that acts on many observations together.
+    """A vector of k unknowns that acts on many observations together."""
 
-    Attributes:
-        name: Its name, as `lens and board` or `arm a`.
-        values: (k,) linearisation point.
-        prior: Prior, as information (k, k) and half its gradient (k,) at these values.
-        held: (k,) mask of the values that are held, and count in the covariance.
-        by_sensor: (n, 6, k) right Jacobian of the measured poses; None for zero.
-        flange_jacobian: By robot, (s, 6, k) right Jacobian of its flange at each stop.
-        rows_concerned: (n,) the observations to which `flange_jacobian` applies; None for all.
-        random: Number of the last values that are random coefficients, which no stop determines.
-    """
-
-    name: str
-    values: FloatArray
+    name: str  # Its name, as `lens and board` or `arm a`.
+    values: FloatArray  # (k,) linearisation point.
+    # Prior, as information (k, k) and half its gradient (k,) at these values.
     prior: PriorInformation
-    held: Mask
+    held: Mask  # (k,) mask of the values that are held, and count in the covariance.
+    # (n, 6, k) right Jacobian of the measured poses; None for zero.
     by_sensor: FloatArray | None = None
+    # By robot, (s, 6, k) right Jacobian of its flange at each stop.
     flange_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
+    # (n,) the observations to which `flange_jacobian` applies; None for all.
     rows_concerned: Mask | None = None
+    # Number of the last values that are random coefficients, which no stop determines.
     random: int = 0
 
     @classmethod
@@ -170,25 +154,16 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class FramePrior:
-    """Prior of one frame's pose in another with no robot between, by a gauge or a drawing.
+    """Prior of one frame's pose in another with no robot between, by a gauge or a drawing."""
 
-    Attributes:
-        first: The reference frame.
-        second: The frame whose pose it is.
-        axes: (c,) measured components of its origin, 0 for x, along the first's axes.
-        values_m: (c,) their values [m].
-        sigma_m: The standard deviation of each [m].
-        rotation: (3, 3) `first_from_second`, if measured.
-        sigma_rad: Its standard deviation about each axis [rad].
-    """
-
-    first: str
-    second: str
+    first: str  # The reference frame.
+    second: str  # The frame whose pose it is.
+    # (c,) measured components of its origin, 0 for x, along the first's axes.
     axes: tuple[int, ...]
-    values_m: tuple[float, ...]
-    sigma_m: float
-    rotation: FloatArray | None = None
-    sigma_rad: float = 0.0
+    values_m: tuple[float, ...]  # (c,) their values [m].
+    sigma_m: float  # The standard deviation of each [m].
+    rotation: FloatArray | None = None  # (3, 3) `first_from_second`, if measured.
+    sigma_rad: float = 0.0  # Its standard deviation about each axis [rad].
 
     @property
     def name(self) -> str:
@@ -255,15 +230,11 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise levels, as standard deviations.
+    """Noise levels, as standard deviations."""
 
-    Attributes:
-        robots: (r, 2) of each robot's flange, of rotation [rad] and translation [m], per axis.
-        sensors: (s,) scale of each sensor's stated sigmas.
-    """
-
+    # (r, 2) of each robot's flange, of rotation [rad] and translation [m], per axis.
     robots: FloatArray
-    sensors: FloatArray
+    sensors: FloatArray  # (s,) scale of each sensor's stated sigmas.
 
     @classmethod
     def of_robot(cls, sigma_rad: float, sigma_m: float) -> "Noise":

@@ -15,19 +15,12 @@ _MUCH_BETTER, _CLOSED_M = 20.0, 2e-3
 
 @dataclass(frozen=True)
 class PoseReading:
-    """Alternative convention for the poses, under which the touches close.
+    """Alternative convention for the poses, under which the touches close."""
 
-    Attributes:
-        words: Its name: `with quaternions as w, x, y, z`.
-        rms_m: Root mean square distance of the touches with it [m].
-        as_read_m: The same as they were read [m].
-        options: Command options that read columns of the usual names so; empty where none are
-            known.
-    """
-
-    words: str
-    rms_m: float
-    as_read_m: float
+    words: str  # Its name: `with quaternions as w, x, y, z`.
+    rms_m: float  # Root mean square distance of the touches with it [m].
+    as_read_m: float  # The same as they were read [m].
+    # Command options that read columns of the usual names so; empty where none are known.
     options: str = ""
 
 

@@ -33,49 +33,32 @@ _LEAST_CHANCE = 1e-300
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Excess correlation of the errors of neighbouring stops.
+    """Excess correlation of the errors of neighbouring stops."""
 
-    Attributes:
-        factor: Variance of the solution by the blocked jackknife, over the model's; one on average
-            where errors are independent.
-        is_significant: Whether chance does not explain it.
-    """
-
+    # Variance of the solution by the blocked jackknife, over the model's; one on average where
+    # errors are independent.
     factor: float
-    is_significant: bool
+    is_significant: bool  # Whether chance does not explain it.
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A steady motion of base or target over the session.
+    """A steady motion of base or target over the session."""
 
-    Attributes:
-        moved_m: Displacement of a stationary target from the first stop to the last, at its mean
-            position [m].
-        moved_rad: Its rotation [rad].
-        mahalanobis_sq: The test statistic.
-    """
-
+    # Displacement of a stationary target from the first stop to the last, at its mean position [m].
     moved_m: float
-    moved_rad: float
-    mahalanobis_sq: float
+    moved_rad: float  # Its rotation [rad].
+    mahalanobis_sq: float  # The test statistic.
 
 
 @dataclass(frozen=True)
 class LensField:
-    """Excess of common errors of the corners in regions of the image.
+    """Excess of common errors of the corners in regions of the image."""
 
-    Attributes:
-        factor: Variance of the cells' mean residuals over that of noise; at least one.
-        sigma_px: Size of the displacements beyond the lens model, per axis [px].
-        mahalanobis_sq: The evidence, as the square of a standard normal variable.
-        is_significant: Whether chance does not explain it.
-    """
-
-    factor: float
-    sigma_px: float
-    mahalanobis_sq: float
-    is_significant: bool
+    factor: float  # Variance of the cells' mean residuals over that of noise; at least one.
+    sigma_px: float  # Size of the displacements beyond the lens model, per axis [px].
+    mahalanobis_sq: float  # The evidence, as the square of a standard normal variable.
+    is_significant: bool  # Whether chance does not explain it.
 
 
 def lens_field(

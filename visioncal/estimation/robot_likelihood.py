@@ -42,25 +42,16 @@ _LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
 
 @dataclass(frozen=True, eq=False)
 class RobotLikelihood:
-    """Restricted likelihood of the robots' noise levels.
+    """Restricted likelihood of the robots' noise levels."""
 
-    Attributes:
-        reduced: The estimates of each unit's flange errors.
-        components: Variance components of these estimates.
-        known: Information on the free unknowns from other sources than these estimates.
-        moving: (p,) mask of the free unknowns.
-        members: (u, w) the robots of each unit; see `Problem.units`.
-        stops: (u,) the stop of each unit that has observations.
-        before: (r, 2) the robots' previous levels.
-    """
-
-    reduced: Reduced
-    components: Components
+    reduced: Reduced  # The estimates of each unit's flange errors.
+    components: Components  # Variance components of these estimates.
+    # Information on the free unknowns from other sources than these estimates.
     known: PriorInformation
-    moving: Mask
-    members: IntArray
-    stops: IntArray
-    before: FloatArray
+    moving: Mask  # (p,) mask of the free unknowns.
+    members: IntArray  # (u, w) the robots of each unit; see `Problem.units`.
+    stops: IntArray  # (u,) the stop of each unit that has observations.
+    before: FloatArray  # (r, 2) the robots' previous levels.
     _weighed: dict[int, tuple[tuple[FloatArray, WeightedResiduals], ...]] = field(
         default_factory=dict, init=False, repr=False
     )

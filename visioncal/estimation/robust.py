@@ -29,17 +29,11 @@ _MISSED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Distance of each of m units from the prediction of the others.
+    """Distance of each of m units from the prediction of the others."""
 
-    Attributes:
-        squares: (m,) squared Mahalanobis distances.
-        directions: (m,) number of predicted directions of the unit.
-        limit: (m,) largest square of noise.
-    """
-
-    squares: FloatArray
-    directions: FloatArray
-    limit: FloatArray
+    squares: FloatArray  # (m,) squared Mahalanobis distances.
+    directions: FloatArray  # (m,) number of predicted directions of the unit.
+    limit: FloatArray  # (m,) largest square of noise.
 
     @property
     def beyond(self) -> FloatArray:

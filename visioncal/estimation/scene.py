@@ -29,23 +29,17 @@ _FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A camera and its targets.
+    """A camera and its targets."""
 
-    Attributes:
-        targets: The nominal targets; the corners of several are numbered consecutively.
-        estimated: Whether they were estimated from these corners.
-        mode: Treatment of given intrinsics: `hold`, `refine` or `auto`.
-        matrix_sigma_px: Prior sigma of given fx, fy, cx, cy; None where not stated.
-        names: Names of several targets.
-        is_focus_fixed: Whether the focal length varies neither with the distance nor at random.
-    """
-
+    # The nominal targets; the corners of several are numbered consecutively.
     targets: tuple[Target, ...]
     camera: Camera
-    estimated: bool
-    mode: str = "auto"
+    estimated: bool  # Whether they were estimated from these corners.
+    mode: str = "auto"  # Treatment of given intrinsics: `hold`, `refine` or `auto`.
+    # Prior sigma of given fx, fy, cx, cy; None where not stated.
     matrix_sigma_px: float | None = None
-    names: tuple[str, ...] = ("",)
+    names: tuple[str, ...] = ("",)  # Names of several targets.
+    # Whether the focal length varies neither with the distance nor at random.
     is_focus_fixed: bool = False
 
 
@@ -61,26 +55,20 @@ def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class CornerProblem:
-    """The corners of m views with the priors of lens and boards.
-
-    Attributes:
-        positions: (c, 3) corners of the flat boards, each in its own frame [m].
-        basis: (c, 3, s) of `boards_basis`.
-        prior_sigma: (k + s,) prior sigmas of lens and boards; inf where there is no prior.
-        shares: (m,) weight of each view for lens and board; see `repeat_shares`.
-        contested: Whether given intrinsics are held although the corners contradict them.
-        levels: Sizes of lens errors beyond the model; None before their estimation.
-        doubted: Columns of given intrinsics whose prior sigma counts in the covariance.
-    """
+    """The corners of m views with the priors of lens and boards."""
 
     scene: Scene
     stack: CornerStack
-    positions: FloatArray
-    basis: FloatArray
+    positions: FloatArray  # (c, 3) corners of the flat boards, each in its own frame [m].
+    basis: FloatArray  # (c, 3, s) of `boards_basis`.
+    # (k + s,) prior sigmas of lens and boards; inf where there is no prior.
     prior_sigma: FloatArray
-    shares: FloatArray
+    shares: FloatArray  # (m,) weight of each view for lens and board; see `repeat_shares`.
+    # Whether given intrinsics are held although the corners contradict them.
     contested: bool = False
+    # Sizes of lens errors beyond the model; None before their estimation.
     levels: LensLevels | None = None
+    # Columns of given intrinsics whose prior sigma counts in the covariance.
     doubted: IntArray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @classmethod

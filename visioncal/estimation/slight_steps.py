@@ -53,42 +53,25 @@ _MOST_EXPLAINED = 0.99
 
 @dataclass(frozen=True, eq=False)
 class Slip:
-    """A step of a joint's offset at some stop.
+    """A step of a joint's offset at some stop."""
 
-    Attributes:
-        robot: Its robot, as the problem names it.
-        joint: Index of the joint.
-        stop: The first stop with the new offset.
-        step_rad: Increase of actual minus reported angle [rad].
-        sigma_rad: Its standard deviation [rad].
-        mahalanobis_sq: The test statistic.
-    """
-
-    robot: str
-    joint: int
-    stop: int
-    step_rad: float
-    sigma_rad: float
-    mahalanobis_sq: float
+    robot: str  # Its robot, as the problem names it.
+    joint: int  # Index of the joint.
+    stop: int  # The first stop with the new offset.
+    step_rad: float  # Increase of actual minus reported angle [rad].
+    sigma_rad: float  # Its standard deviation [rad].
+    mahalanobis_sq: float  # The test statistic.
 
 
 @dataclass(frozen=True, eq=False)
 class Resized:
-    """A step of a board's size at some stop, as where a print was exchanged.
+    """A step of a board's size at some stop, as where a print was exchanged."""
 
-    Attributes:
-        frame: The board, as the problem names it.
-        stop: The first stop with the new size.
-        share: Relative increase of the size.
-        sigma: Its standard deviation.
-        mahalanobis_sq: The test statistic.
-    """
-
-    frame: str
-    stop: int
-    share: float
-    sigma: float
-    mahalanobis_sq: float
+    frame: str  # The board, as the problem names it.
+    stop: int  # The first stop with the new size.
+    share: float  # Relative increase of the size.
+    sigma: float  # Its standard deviation.
+    mahalanobis_sq: float  # The test statistic.
 
 
 def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
@@ -342,25 +325,15 @@ def step_covariance(
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Score tests of steps of k unknowns, c numbers each, at one stop.
+    """Score tests of steps of k unknowns, c numbers each, at one stop."""
 
-    Attributes:
-        stop: The stop.
-        seen: (k,) indices of the tested unknowns.
-        alone: (k, c, c) information on each, all else held.
-        own: (k, c, c) marginal information on each.
-        following: (k, p, c) response of the fit's unknowns to each.
-        steps: (k, c) the most likely steps.
-        squares: (k,) the test statistics.
-    """
-
-    stop: int
-    seen: IntArray
-    alone: FloatArray
-    own: FloatArray
-    following: FloatArray
-    steps: FloatArray
-    squares: FloatArray
+    stop: int  # The stop.
+    seen: IntArray  # (k,) indices of the tested unknowns.
+    alone: FloatArray  # (k, c, c) information on each, all else held.
+    own: FloatArray  # (k, c, c) marginal information on each.
+    following: FloatArray  # (k, p, c) response of the fit's unknowns to each.
+    steps: FloatArray  # (k, c) the most likely steps.
+    squares: FloatArray  # (k,) the test statistics.
 
 
 def _scored(

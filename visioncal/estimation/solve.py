@@ -398,17 +398,11 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RepeatErrors:
-    """Errors shared by repeats of one static frame seen by another, as q additional unknowns.
+    """Errors shared by repeats of one static frame seen by another, as q additional unknowns."""
 
-    Attributes:
-        jacobian: (n, 6, q) of the residuals by these errors.
-        values: (q,) maximum-posterior estimates.
-        covariance: (p + q, p + q) of all unknowns, these last.
-    """
-
-    jacobian: FloatArray
-    values: FloatArray
-    covariance: FloatArray
+    jacobian: FloatArray  # (n, 6, q) of the residuals by these errors.
+    values: FloatArray  # (q,) maximum-posterior estimates.
+    covariance: FloatArray  # (p + q, p + q) of all unknowns, these last.
 
     @classmethod
     def of(cls, problem: Problem, solution: Solution) -> "RepeatErrors":

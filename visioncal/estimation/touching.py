@@ -33,21 +33,13 @@ _SETS = 60
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """n touches of k points.
+    """n touches of k points."""
 
-    Attributes:
-        base_from_flange: (n, 4, 4) poses of the flange [m].
-        points: (n,) index of the touched point.
-        kinds: (n,) kind of each touch.
-        labels: (n,) names of the touches, for messages.
-        names: (k,) names of the points, for messages.
-    """
-
-    base_from_flange: FloatArray
-    points: IntArray
-    kinds: tuple[TouchKind, ...]
-    labels: tuple[str, ...]
-    names: tuple[str, ...]
+    base_from_flange: FloatArray  # (n, 4, 4) poses of the flange [m].
+    points: IntArray  # (n,) index of the touched point.
+    kinds: tuple[TouchKind, ...]  # (n,) kind of each touch.
+    labels: tuple[str, ...]  # (n,) names of the touches, for messages.
+    names: tuple[str, ...]  # (k,) names of the points, for messages.
 
     def __len__(self) -> int:
         return len(self.points)
@@ -82,15 +74,11 @@ class TouchProblem:
 
     The unknowns' steps are the tool's right perturbation (rotation [rad], translation [m]), without
     the rotation where that is not estimated, and the points in the base [m].
-
-    Attributes:
-        noise: Stated errors of the flange.
-        oriented: Whether the tool's rotation is estimated.
     """
 
     touches: Touches
-    noise: Noise
-    oriented: bool
+    noise: Noise  # Stated errors of the flange.
+    oriented: bool  # Whether the tool's rotation is estimated.
 
     def guesses(self) -> Iterator[TouchUnknowns]:
         """Yields starts from all touches of kind `point`, and from small sets of them."""

@@ -24,13 +24,9 @@ _NODES = np.arange(-1, 3)
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Sampling times.
+    """Sampling times."""
 
-    Attributes:
-        stamps_s: (n,) times [s], ascending; two or more.
-    """
-
-    stamps_s: FloatArray
+    stamps_s: FloatArray  # (n,) times [s], ascending; two or more.
 
     @property
     def step_s(self) -> float:
@@ -83,13 +79,9 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(Samples):
-    """A sampled motion.
+    """A sampled motion."""
 
-    Attributes:
-        poses: (n, 4, 4) poses [m].
-    """
-
-    poses: FloatArray
+    poses: FloatArray  # (n, 4, 4) poses [m].
 
     @property
     def speed_window_s(self) -> float:

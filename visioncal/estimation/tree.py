@@ -16,17 +16,11 @@ from visioncal.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """Edge from a frame to its parent; unknown if neither a robot nor a known transform.
+    """Edge from a frame to its parent; unknown if neither a robot nor a known transform."""
 
-    Attributes:
-        parent: The parent frame.
-        robot: The robot whose pose `parent_from_frame` is; empty where none is.
-        known: (4, 4) `parent_from_frame`, if known.
-    """
-
-    parent: str
-    robot: str = ""
-    known: FloatArray | None = None
+    parent: str  # The parent frame.
+    robot: str = ""  # The robot whose pose `parent_from_frame` is; empty where none is.
+    known: FloatArray | None = None  # (4, 4) `parent_from_frame`, if known.
 
     @property
     def is_unknown(self) -> bool:
@@ -36,30 +30,19 @@ class Branch:
 
 @dataclass(frozen=True)
 class PathStep:
-    """One edge of a path through the tree.
+    """One edge of a path through the tree."""
 
-    Attributes:
-        frame: The edge's child frame, which names it.
-        robot: The edge's robot; empty for none.
-        is_up: Whether it is traversed from the child to the parent, as `frame_from_parent`.
-    """
-
-    frame: str
-    robot: str
-    is_up: bool
+    frame: str  # The edge's child frame, which names it.
+    robot: str  # The edge's robot; empty for none.
+    is_up: bool  # Whether it is traversed from the child to the parent, as `frame_from_parent`.
 
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """The frames of a cell.
+    """The frames of a cell."""
 
-    Attributes:
-        root: The frame without a parent.
-        branches: Edge of every other frame, by its name.
-    """
-
-    root: str
-    branches: Mapping[str, Branch]
+    root: str  # The frame without a parent.
+    branches: Mapping[str, Branch]  # Edge of every other frame, by its name.
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -127,21 +110,14 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Stride:
-    """One step of m paths, each by its own edge.
+    """One step of m paths, each by its own edge."""
 
-    Attributes:
-        is_up: Whether the edges are traversed from child to parent.
-        edges: (m,) indices of unknown edges; empty for known edges and robots.
-        poses: (m, 4, 4) transforms in the direction of the path, for known edges and robots.
-        moves: (m, 6, k) their Jacobian by all effects; None for zero.
-        slots: (m,) index of a robot's flange error within its unit; -1 for none.
-    """
-
-    is_up: bool
-    edges: IntArray
+    is_up: bool  # Whether the edges are traversed from child to parent.
+    edges: IntArray  # (m,) indices of unknown edges; empty for known edges and robots.
+    # (m, 4, 4) transforms in the direction of the path, for known edges and robots.
     poses: FloatArray
-    moves: FloatArray | None
-    slots: IntArray
+    moves: FloatArray | None  # (m, 6, k) their Jacobian by all effects; None for zero.
+    slots: IntArray  # (m,) index of a robot's flange error within its unit; -1 for none.
 
     def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
         """(m, 4, 4) inverse transforms of the step, after a change (k,) of the effects."""
@@ -156,17 +132,12 @@ class Stride:
 
 @dataclass(frozen=True, eq=False)
 class TreePaths:
-    """Paths of m observations with the same structure.
+    """Paths of m observations with the same structure."""
 
-    Attributes:
-        rows: (m,) the observations, group by group.
-        groups: Indices of the groups of observations, and their slices of the rows.
-        strides: The steps, from the observer on.
-    """
-
-    rows: IntArray
+    rows: IntArray  # (m,) the observations, group by group.
+    # Indices of the groups of observations, and their slices of the rows.
     groups: tuple[tuple[int, slice], ...]
-    strides: tuple[Stride, ...]
+    strides: tuple[Stride, ...]  # The steps, from the observer on.
 
     def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
         """(m, 4, 4) `observed_from_observer`."""

@@ -40,15 +40,10 @@ _LIKELY_RANGE, _FOLLOWED = (-7.0, 12.0), 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Variance components of m residuals of size d: `known + sum sigma_k^2 parts_k`.
+    """Variance components of m residuals of size d: `known + sum sigma_k^2 parts_k`."""
 
-    Attributes:
-        known: (m, d, d) known part of the covariance.
-        parts: (k, m, d) diagonal of each component at a standard deviation of one.
-    """
-
-    known: FloatArray
-    parts: FloatArray
+    known: FloatArray  # (m, d, d) known part of the covariance.
+    parts: FloatArray  # (k, m, d) diagonal of each component at a standard deviation of one.
 
     def total(self, sigmas: FloatArray) -> FloatArray:
         """Covariances (m, d, d) of the residuals at (k,) standard deviations."""
@@ -58,15 +53,10 @@ class Components:
 
 @dataclass(frozen=True, eq=False)
 class PriorInformation:
-    """Gaussian prior of p parameters, linearised.
+    """Gaussian prior of p parameters, linearised."""
 
-    Attributes:
-        information: (p, p), zero for parameters without a prior.
-        gradient: (p,) half the gradient of the prior cost at the current state.
-    """
-
-    information: FloatArray
-    gradient: FloatArray
+    information: FloatArray  # (p, p), zero for parameters without a prior.
+    gradient: FloatArray  # (p,) half the gradient of the prior cost at the current state.
 
     def beside(self, count: int) -> "PriorInformation":
         """The same with `count` parameters without a prior appended."""
@@ -89,16 +79,11 @@ Found = TypeVar("Found", bound=LikelihoodValue)
 
 @dataclass(frozen=True)
 class RatioPrior:
-    """Log-normal prior of the ratio of two sigmas.
+    """Log-normal prior of the ratio of two sigmas."""
 
-    Attributes:
-        ratio: Median of the second sigma over the first.
-        log_sigma: Standard deviation of the ratio's logarithm.
-        places: Indices of each pair of sigmas that the prior applies to.
-    """
-
-    ratio: float
-    log_sigma: float
+    ratio: float  # Median of the second sigma over the first.
+    log_sigma: float  # Standard deviation of the ratio's logarithm.
+    # Indices of each pair of sigmas that the prior applies to.
     places: tuple[tuple[int, int], ...] = ((0, 1),)
 
     def beside(self, found: "LikelihoodValue", logs: FloatArray) -> "LikelihoodValue":
@@ -322,23 +307,14 @@ def profile_interval(
 
 @dataclass(frozen=True, eq=False)
 class WeightedResiduals:
-    """Generalised least-squares fit of residuals (m, d) at given sigmas.
+    """Generalised least-squares fit of residuals (m, d) at given sigmas."""
 
-    Attributes:
-        sigmas: (k,) the sigmas.
-        weights: (m, d, d) inverse covariance of the residuals.
-        weighted: (m, d, p) weights times the Jacobian.
-        root: (p, p) square root of the parameters' covariance.
-        pulled: (m, d) weighted residuals at the fitted parameters.
-        value: Negative log-likelihood.
-    """
-
-    sigmas: FloatArray
-    weights: FloatArray
-    weighted: FloatArray
-    root: FloatArray
-    pulled: FloatArray
-    value: float
+    sigmas: FloatArray  # (k,) the sigmas.
+    weights: FloatArray  # (m, d, d) inverse covariance of the residuals.
+    weighted: FloatArray  # (m, d, p) weights times the Jacobian.
+    root: FloatArray  # (p, p) square root of the parameters' covariance.
+    pulled: FloatArray  # (m, d) weighted residuals at the fitted parameters.
+    value: float  # Negative log-likelihood.
 
     @classmethod
     def of(

@@ -39,17 +39,11 @@ FAR_M = 20.0
 
 @dataclass(frozen=True, eq=False)
 class ArmErrors:
-    """Posterior of the errors of an arm that was calibrated with the camera.
+    """Posterior of the errors of an arm that was calibrated with the camera."""
 
-    Attributes:
-        model: The arm's model with its p error parameters.
-        covariance: (p, p) of the parameters.
-        with_camera: (6 + k + m, p) cross-covariance with the camera's edge and lens, as in
-            `CalibratedCamera`.
-    """
-
-    model: "ArmModel"
-    covariance: FloatArray
+    model: "ArmModel"  # The arm's model with its p error parameters.
+    covariance: FloatArray  # (p, p) of the parameters.
+    # (6 + k + m, p) cross-covariance with the camera's edge and lens, as in `CalibratedCamera`.
     with_camera: FloatArray
 
     @classmethod
@@ -81,33 +75,23 @@ class ArmErrors:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedCamera:
-    """Calibrated camera: lens, extrinsics, their joint covariance, and the noise levels.
+    """Calibrated camera: lens, extrinsics, their joint covariance, and the noise levels."""
 
-    Attributes:
-        mount: Where it is mounted.
-        lens: The intrinsics (k values) and the field beyond the lens model (m coefficients).
-        edge: (4, 4) `flange_from_cam` or `base_from_cam`.
-        covariance: (6 + k + m, 6 + k + m) of the edge's right perturbation and the lens together.
-        flange_sigmas: (6,) noise of the flange at one stop, per axis [rad, m].
-        arm_sigma: Size of posture-dependent arm errors [rad], 0.5 m of length for each radian; zero
-            where there are none.
-        arm: The arm's errors, where it was calibrated with the camera.
-        pixel_px: Noise of a corner's coordinate [px]; None where unknown.
-        noise_dof: Degrees of freedom of the noise estimate; infinite where unknown.
-        warnings: Reasons not to trust the camera, in sentences.
-        distances_m: (2,) least and greatest distance at which its views looked; None where unknown.
-    """
-
-    mount: Mount
+    mount: Mount  # Where it is mounted.
+    # The intrinsics (k values) and the field beyond the lens model (m coefficients).
     lens: CameraResult
-    edge: FloatArray
+    edge: FloatArray  # (4, 4) `flange_from_cam` or `base_from_cam`.
+    # (6 + k + m, 6 + k + m) of the edge's right perturbation and the lens together.
     covariance: FloatArray
-    flange_sigmas: FloatArray
+    flange_sigmas: FloatArray  # (6,) noise of the flange at one stop, per axis [rad, m].
+    # Size of posture-dependent arm errors [rad], 0.5 m of length for each radian; zero where there
+    # are none.
     arm_sigma: float
-    arm: ArmErrors | None
-    pixel_px: float | None
-    noise_dof: float
-    warnings: tuple[str, ...]
+    arm: ArmErrors | None  # The arm's errors, where it was calibrated with the camera.
+    pixel_px: float | None  # Noise of a corner's coordinate [px]; None where unknown.
+    noise_dof: float  # Degrees of freedom of the noise estimate; infinite where unknown.
+    warnings: tuple[str, ...]  # Reasons not to trust the camera, in sentences.
+    # (2,) least and greatest distance at which its views looked; None where unknown.
     distances_m: FloatArray | None
 
     @classmethod
@@ -255,19 +239,13 @@ class CalibratedCamera:
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Camera pose in the base at one stop, and its dependence on the flange.
+    """Camera pose in the base at one stop, and its dependence on the flange."""
 
-    Attributes:
-        base_from_cam: (4, 4).
-        flange_jacobian: (6, 6) its right perturbation by the flange's; zero for a fixed camera.
-        flange_noise: (6, 6) covariance of the flange's noise.
-        arm_basis: (6, a) see `Eye.arm_basis`.
-    """
-
-    base_from_cam: FloatArray
+    base_from_cam: FloatArray  # (4, 4).
+    # (6, 6) its right perturbation by the flange's; zero for a fixed camera.
     flange_jacobian: FloatArray
-    flange_noise: FloatArray
-    arm_basis: FloatArray
+    flange_noise: FloatArray  # (6, 6) covariance of the flange's noise.
+    arm_basis: FloatArray  # (6, a) see `Eye.arm_basis`.
 
     def point(self, point_cam: FloatArray) -> FloatArray:
         """(3,) position in the base of a point in the camera's frame [m]."""
@@ -345,17 +323,11 @@ def _arm_sigma(calibration: Calibration) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A plane in the base: `normal . p = offset`.
+    """A plane in the base: `normal . p = offset`."""
 
-    Attributes:
-        normal: (3,) of unit length.
-        offset_m: Its distance from the base's origin along the normal [m].
-        covariance: (4, 4) of normal and offset.
-    """
-
-    normal: FloatArray
-    offset_m: float
-    covariance: FloatArray
+    normal: FloatArray  # (3,) of unit length.
+    offset_m: float  # Its distance from the base's origin along the normal [m].
+    covariance: FloatArray  # (4, 4) of normal and offset.
 
     @classmethod
     @typed

@@ -13,19 +13,12 @@ from visioncal.estimation.pointfit import PointPairs
 
 @dataclass(frozen=True, eq=False)
 class NominalPoints:
-    """Nominal points of a drawing, n in all.
+    """Nominal points of a drawing, n in all."""
 
-    Attributes:
-        source: What they were read from, for messages and for the record.
-        names: (n,) unique names.
-        positions: (n, 3) [m] in the drawing's frame.
-        sigma_m: (n,) standard deviation of each coordinate [m]; 0 where taken as exact.
-    """
-
-    source: str
-    names: tuple[str, ...]
-    positions: FloatArray
-    sigma_m: FloatArray
+    source: str  # What they were read from, for messages and for the record.
+    names: tuple[str, ...]  # (n,) unique names.
+    positions: FloatArray  # (n, 3) [m] in the drawing's frame.
+    sigma_m: FloatArray  # (n,) standard deviation of each coordinate [m]; 0 where taken as exact.
 
     def beside(
         self, names: Sequence[str], measured: FloatArray, covariances: FloatArray

@@ -28,47 +28,37 @@ from visioncal.results import Edge, Frame, Observation
 
 @dataclass(frozen=True)
 class Words:
-    """Wording of messages for one way of measuring points.
+    """Wording of messages for one way of measuring points."""
 
-    Attributes:
-        things: What the measurements are called.
-        again: Advice for outliers, as a sentence.
-        noisy: Advice for noisy measurements, as a sentence.
-        weak: Advice for a poorly determined direction, as a sentence.
-        side: Side that they were measured from, behind the words `the side that`.
-    """
-
-    things: str = "touches"
+    things: str = "touches"  # What the measurements are called.
+    # Advice for outliers, as a sentence.
     again: str = "Touch what is named once more, and write the new poses in its rows."
+    # Advice for noisy measurements, as a sentence.
     noisy: str = (
         "Touch again with a sharp tip, and check the tool; an arm that was never calibrated is "
         "off by a millimetre from posture to posture."
     )
+    # Advice for a poorly determined direction, as a sentence.
     weak: str = (
         "Touch points that are farther apart, or more of them; a tip that is known better "
         "helps where all touches share its error."
     )
+    # Side that they were measured from, behind the words `the side that`.
     side: str = "the tool came from"
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Noise, limits and wording of a fixture's fit.
+    """Noise, limits and wording of a fixture's fit."""
 
-    Attributes:
-        touch_noise_m: Known repeatability of a touch, per axis [m]; None where unknown.
-        doubts: Findings on the tool or camera that the points were measured with.
-        details: Its figures, for the record.
-        options: Limits of the verdict.
-        words: Wording for the kind of measurement.
-        assumed_noise_m: Assumed noise where it is unknown and points are few [m].
-    """
-
+    # Known repeatability of a touch, per axis [m]; None where unknown.
     touch_noise_m: float | None = None
+    # Findings on the tool or camera that the points were measured with.
     doubts: tuple[Finding, ...] = ()
-    details: Mapping[str, Any] = field(default_factory=dict)
-    options: FixtureLimits = field(default_factory=FixtureLimits)
-    words: Words = field(default_factory=Words)
+    details: Mapping[str, Any] = field(default_factory=dict)  # Its figures, for the record.
+    options: FixtureLimits = field(default_factory=FixtureLimits)  # Limits of the verdict.
+    words: Words = field(default_factory=Words)  # Wording for the kind of measurement.
+    # Assumed noise where it is unknown and points are few [m].
     assumed_noise_m: float = TOUCH_NOISE_M
 
     @property
@@ -79,29 +69,17 @@ class FitSettings:
 
 @dataclass(frozen=True, eq=False)
 class FixtureFit(Generic[State]):
-    """Fit of a fixture to n points.
+    """Fit of a fixture to n points."""
 
-    Attributes:
-        measured: The points.
-        labels: (n,) their names in the record.
-        names: (n,) their names in messages: `Touch 3`, `Point P3`.
-        matrix: (4, 4) `base_from_fixture`.
-        covariance: (6, 6) of its right perturbation, with the points' common errors.
-        centre: (3,) centroid of the points, in the fixture [m].
-        agreement: The inliers.
-        causes: (n,) probable cause if the point is an outlier.
-        noise_m: Noise of a touch per axis [m].
-    """
-
-    measured: MeasuredPoints
-    labels: tuple[str, ...]
-    names: tuple[str, ...]
-    matrix: FloatArray
-    covariance: FloatArray
-    centre: FloatArray
-    agreement: GroupInliers[State]
-    causes: Sequence[str]
-    noise_m: float
+    measured: MeasuredPoints  # The points.
+    labels: tuple[str, ...]  # (n,) their names in the record.
+    names: tuple[str, ...]  # (n,) their names in messages: `Touch 3`, `Point P3`.
+    matrix: FloatArray  # (4, 4) `base_from_fixture`.
+    covariance: FloatArray  # (6, 6) of its right perturbation, with the points' common errors.
+    centre: FloatArray  # (3,) centroid of the points, in the fixture [m].
+    agreement: GroupInliers[State]  # The inliers.
+    causes: Sequence[str]  # (n,) probable cause if the point is an outlier.
+    noise_m: float  # Noise of a touch per axis [m].
 
     @property
     def agrees(self) -> Mask:

@@ -59,24 +59,17 @@ class MarkerPoints:
 
     A fit to the points weights them with `independent`; `common` adds J common J^T to the result's
     covariance, where J (6, 3 n) is the result's Jacobian by the points.
-
-    Attributes:
-        names: (n,) the markers' ids as text.
-        points: (n, 3) [m].
-        independent: (n, 3, 3) covariance of each by its pixel noise [m^2].
-        common: (3 n, 3 n) covariance by shared errors: the camera's transform, its lens, the
-            markers' printed size, the arm's errors, and the robot's noise, which moves all markers
-            of one image together [m^2].
-        seen_in: (n,) number of inlier images of each.
-        warnings: Sentences.
     """
 
-    names: tuple[str, ...]
-    points: FloatArray
-    independent: FloatArray
+    names: tuple[str, ...]  # (n,) the markers' ids as text.
+    points: FloatArray  # (n, 3) [m].
+    independent: FloatArray  # (n, 3, 3) covariance of each by its pixel noise [m^2].
+    # (3 n, 3 n) covariance by shared errors: the camera's transform, its lens, the markers' printed
+    # size, the arm's errors, and the robot's noise, which moves all markers of one image together
+    # [m^2].
     common: FloatArray
-    seen_in: tuple[int, ...]
-    warnings: tuple[str, ...]
+    seen_in: tuple[int, ...]  # (n,) number of inlier images of each.
+    warnings: tuple[str, ...]  # Sentences.
 
     @property
     def covariance(self) -> FloatArray:

@@ -51,23 +51,14 @@ _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 @dataclass(frozen=True, eq=False)
 class _PlacedTarget:
-    """Estimated pose of a target on a tool or fixture, with its input.
+    """Estimated pose of a target on a tool or fixture, with its input."""
 
-    Attributes:
-        kind: What the target is on.
-        shown: The images.
-        seen: The estimated frame.
-        worst: Directions of its largest sigmas: offset, rotation.
-        views: (m,) the views that it was estimated from.
-        lost: Why other views were not used, by number.
-    """
-
-    kind: FrameKind
-    shown: SessionImages
-    seen: TargetPose
-    worst: tuple[Direction, Direction]
-    views: tuple[View, ...]
-    lost: Mapping[int, str]
+    kind: FrameKind  # What the target is on.
+    shown: SessionImages  # The images.
+    seen: TargetPose  # The estimated frame.
+    worst: tuple[Direction, Direction]  # Directions of its largest sigmas: offset, rotation.
+    views: tuple[View, ...]  # (m,) the views that it was estimated from.
+    lost: Mapping[int, str]  # Why other views were not used, by number.
 
 
 @typed

@@ -29,19 +29,13 @@ _STEPS, _CONVERGED = 10, 1e-12
 
 @dataclass(frozen=True, eq=False)
 class CandidateViews:
-    """Candidate poses of a target from m images.
+    """Candidate poses of a target from m images."""
 
-    Attributes:
-        views: Candidates of each image, the best by reprojection first.
-        flange_noise: (6, 6) covariance of the flange at one stop.
-        common: (c, c) covariance of the errors that all images share.
-        freedom: Degrees of freedom of the noise levels.
-    """
-
+    # Candidates of each image, the best by reprojection first.
     views: Sequence[Sequence[TargetPlace]]
-    flange_noise: FloatArray
-    common: FloatArray
-    freedom: float
+    flange_noise: FloatArray  # (6, 6) covariance of the flange at one stop.
+    common: FloatArray  # (c, c) covariance of the errors that all images share.
+    freedom: float  # Degrees of freedom of the noise levels.
 
     def independent(self, place: TargetPlace) -> FloatArray:
         """(6, 6) covariance of a candidate by errors of its image alone: pixels and robot."""
@@ -60,43 +54,26 @@ class CandidateViews:
 
 @dataclass(frozen=True, eq=False)
 class Mean:
-    """Weighted mean pose of a target over images.
+    """Weighted mean pose of a target over images."""
 
-    Attributes:
-        matrix: (4, 4) `parent_from_target`.
-        independent: (6, 6) covariance by the images' independent errors.
-        gains: (m, 6, 6) weight of each image; zero for outliers.
-        by_common: (6, c) Jacobian by the errors that all images share.
-    """
-
-    matrix: FloatArray
-    independent: FloatArray
-    gains: FloatArray
-    by_common: FloatArray
+    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    independent: FloatArray  # (6, 6) covariance by the images' independent errors.
+    gains: FloatArray  # (m, 6, 6) weight of each image; zero for outliers.
+    by_common: FloatArray  # (6, c) Jacobian by the errors that all images share.
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInliers:
-    """Inlier images and their mean pose.
+    """Inlier images and their mean pose."""
 
-    Attributes:
-        mean: Mean of the inliers.
-        picks: (m,) index of each image's selected candidate.
-        inliers: (m,) inlier mask.
-        residuals: (m, 6) residual of each image's pose from the mean [rad, m].
-        mahalanobis_sq: (m,) its squared Mahalanobis distance; six on average under noise.
-        limit: Its outlier limit.
-        variance: Variance factor of the images' independent errors; at least one.
-        rival: Another pose that is a candidate of all inliers; None where there is none.
-    """
-
-    mean: Mean
-    picks: IntArray
-    inliers: Mask
-    residuals: FloatArray
-    mahalanobis_sq: FloatArray
-    limit: float
-    variance: float
+    mean: Mean  # Mean of the inliers.
+    picks: IntArray  # (m,) index of each image's selected candidate.
+    inliers: Mask  # (m,) inlier mask.
+    residuals: FloatArray  # (m, 6) residual of each image's pose from the mean [rad, m].
+    mahalanobis_sq: FloatArray  # (m,) its squared Mahalanobis distance; six on average under noise.
+    limit: float  # Its outlier limit.
+    variance: float  # Variance factor of the images' independent errors; at least one.
+    # Another pose that is a candidate of all inliers; None where there is none.
     rival: FloatArray | None
 
 

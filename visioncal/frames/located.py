@@ -16,21 +16,15 @@ _EXACT_SHARE, _ROUNDING_M = 1e-12, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Position in the base with its covariance.
+    """Position in the base with its covariance."""
 
-    Attributes:
-        p_base: (3,) [m].
-        parts: (3, 3) covariance by source [m^2]: `pixels`, `calibration` (the camera's transform
-            and its lens together), `robot` (at this stop), `arm`, `plane`, `target`, `focus` (a
-            pixel's, by the change of the focal length at this view).
-        freedom: Effective degrees of freedom of the covariance.
-        warnings: Sentences to read before a robot is sent there.
-    """
-
-    p_base: FloatArray
+    p_base: FloatArray  # (3,) [m].
+    # (3, 3) covariance by source [m^2]: `pixels`, `calibration` (the camera's transform and its
+    # lens together), `robot` (at this stop), `arm`, `plane`, `target`, `focus` (a pixel's, by the
+    # change of the focal length at this view).
     parts: Mapping[str, FloatArray]
-    freedom: float
-    warnings: tuple[str, ...] = ()
+    freedom: float  # Effective degrees of freedom of the covariance.
+    warnings: tuple[str, ...] = ()  # Sentences to read before a robot is sent there.
 
     @cached_property
     def covariance(self) -> FloatArray:

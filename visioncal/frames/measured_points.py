@@ -23,19 +23,12 @@ NO_TOOL = (
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """Tool that points were touched with.
+    """Tool that points were touched with."""
 
-    Attributes:
-        name: The transform's name, as `flange_from_gripper`.
-        edge: The transform.
-        oriented: Whether its rotation was measured.
-        verdict: Its verdict.
-    """
-
-    name: str
-    edge: Edge
-    oriented: bool
-    verdict: Verdict
+    name: str  # The transform's name, as `flange_from_gripper`.
+    edge: Edge  # The transform.
+    oriented: bool  # Whether its rotation was measured.
+    verdict: Verdict  # Its verdict.
 
     @classmethod
     def among(cls, frames: Mapping[str, Frame], source: str, name: str | None) -> "Tool":
@@ -67,26 +60,16 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPoints:
-    """Measured points, n in all, with their covariance.
+    """Measured points, n in all, with their covariance."""
 
-    Attributes:
-        source: What they were read from, for the record.
-        labels: (n,) the measurements' names, such as the rows' view numbers.
-        places: (n,) their rows, `touches.csv, line 3`; empty where there are none.
-        names: (n,) names of the points; empty where unknown.
-        points: (n, 3) in the base [m].
-        independent: (n, 3, 3) covariance of each by its independent errors [m^2].
-        common: (3 n, 3 n) covariance by common errors, such as the tip's [m^2].
-        outward: (n, 3) unit directions in the base to where the tool came from; NaN where unknown.
-    """
-
-    source: str
-    labels: tuple[str, ...]
-    places: tuple[str, ...]
-    names: tuple[str, ...]
-    points: FloatArray
-    independent: FloatArray
-    common: FloatArray
+    source: str  # What they were read from, for the record.
+    labels: tuple[str, ...]  # (n,) the measurements' names, such as the rows' view numbers.
+    places: tuple[str, ...]  # (n,) their rows, `touches.csv, line 3`; empty where there are none.
+    names: tuple[str, ...]  # (n,) names of the points; empty where unknown.
+    points: FloatArray  # (n, 3) in the base [m].
+    independent: FloatArray  # (n, 3, 3) covariance of each by its independent errors [m^2].
+    common: FloatArray  # (3 n, 3 n) covariance by common errors, such as the tip's [m^2].
+    # (n, 3) unit directions in the base to where the tool came from; NaN where unknown.
     outward: FloatArray
 
     def __len__(self) -> int:

@@ -23,17 +23,11 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Positions of a point by each view.
+    """Positions of a point by each view."""
 
-    Attributes:
-        found: The positions, by view number.
-        lost: Why other views give none, by view number.
-        warnings: Warnings on the session, in sentences.
-    """
-
-    found: Mapping[int, Located]
-    lost: Mapping[int, str]
-    warnings: tuple[str, ...] = ()
+    found: Mapping[int, Located]  # The positions, by view number.
+    lost: Mapping[int, str]  # Why other views give none, by view number.
+    warnings: tuple[str, ...] = ()  # Warnings on the session, in sentences.
 
 
 @typed

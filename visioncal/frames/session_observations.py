@@ -26,23 +26,14 @@ _NO_IMAGE = "it has no image"
 
 @dataclass(frozen=True, eq=False)
 class SessionImages:
-    """Usable images of a session by the calibrated camera.
+    """Usable images of a session by the calibrated camera."""
 
-    Attributes:
-        source: The session's name.
-        target: The target to look for.
-        sights: (m,) usable images, labelled `view 3`.
-        views: (m,) their views.
-        lost: Why other views are unusable, by view number.
-        warnings: Warnings on the session, in sentences.
-    """
-
-    source: str
-    target: Target
-    sights: tuple[Sight, ...]
-    views: tuple[View, ...]
-    lost: Mapping[int, str]
-    warnings: tuple[str, ...]
+    source: str  # The session's name.
+    target: Target  # The target to look for.
+    sights: tuple[Sight, ...]  # (m,) usable images, labelled `view 3`.
+    views: tuple[View, ...]  # (m,) their views.
+    lost: Mapping[int, str]  # Why other views are unusable, by view number.
+    warnings: tuple[str, ...]  # Warnings on the session, in sentences.
 
 
 def detect_session_target(

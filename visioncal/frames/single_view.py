@@ -28,21 +28,16 @@ Parent: TypeAlias = Literal["base", "flange"]
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """One image of a target.
+    """One image of a target."""
 
-    Attributes:
-        label: Its name in messages and results.
-        seen: The target's corners, or the (h, w) grey image to find them in.
-        base_from_flange: (4, 4) the flange's pose at the image as reported; None where no robot is
-            between parent and target.
-        stop: Number of the robot's stop; where None, images with the same pose are of one stop.
-        joints_rad: (n,) joints [rad] where the pose is the calibrated arm's for these joints.
-    """
-
-    label: str
-    seen: Corners | Image
+    label: str  # Its name in messages and results.
+    seen: Corners | Image  # The target's corners, or the (h, w) grey image to find them in.
+    # (4, 4) the flange's pose at the image as reported; None where no robot is between parent and
+    # target.
     base_from_flange: FloatArray | None = None
+    # Number of the robot's stop; where None, images with the same pose are of one stop.
     stop: int | None = None
+    # (n,) joints [rad] where the pose is the calibrated arm's for these joints.
     joints_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -58,20 +53,15 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class TargetPlace:
-    """Candidate pose of a target in the parent's frame, from one image.
+    """Candidate pose of a target in the parent's frame, from one image."""
 
-    Attributes:
-        matrix: (4, 4) `parent_from_target`.
-        pixels: (6, 6) covariance of its right perturbation by the pixel noise.
-        flange_jacobian: (6, 6) Jacobian by the flange's perturbation; zero where the robot is not
-            between. With k images of one stop it is multiplied by sqrt(k), so that their mean has
-            the variance of the error that they share.
-        by_common: (6, c) Jacobian by the errors that all images share: see `common_covariance`.
-    """
-
-    matrix: FloatArray
-    pixels: FloatArray
+    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    pixels: FloatArray  # (6, 6) covariance of its right perturbation by the pixel noise.
+    # (6, 6) Jacobian by the flange's perturbation; zero where the robot is not between. With k
+    # images of one stop it is multiplied by sqrt(k), so that their mean has the variance of the
+    # error that they share.
     flange_jacobian: FloatArray
+    # (6, c) Jacobian by the errors that all images share: see `common_covariance`.
     by_common: FloatArray
 
 

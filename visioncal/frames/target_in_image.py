@@ -32,26 +32,16 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidates:
-    """Candidate poses of a target in one image, c in all, the best by reprojection first.
+    """Candidate poses of a target in one image, c in all, the best by reprojection first."""
 
-    Attributes:
-        cam_from_target: (c, 4, 4).
-        covariance: (c, 6, 6) of the right perturbations, by the pixel noise alone.
-        by_lens: (c, 6, k + m) Jacobians by the camera's intrinsics, and by the lens's field beyond
-            its model.
-        by_scale: (c, 6) Jacobians by the target's relative size.
-        scale_sigma: Standard deviation of the relative size.
-        symmetries: (c,) index of the target's symmetry that each has applied.
-        warnings: Warnings on the image, in sentences.
-    """
-
-    cam_from_target: FloatArray
-    covariance: FloatArray
+    cam_from_target: FloatArray  # (c, 4, 4).
+    covariance: FloatArray  # (c, 6, 6) of the right perturbations, by the pixel noise alone.
+    # (c, 6, k + m) Jacobians by the camera's intrinsics, and by the lens's field beyond its model.
     by_lens: FloatArray
-    by_scale: FloatArray
-    scale_sigma: float
-    symmetries: tuple[int, ...]
-    warnings: tuple[str, ...]
+    by_scale: FloatArray  # (c, 6) Jacobians by the target's relative size.
+    scale_sigma: float  # Standard deviation of the relative size.
+    symmetries: tuple[int, ...]  # (c,) index of the target's symmetry that each has applied.
+    warnings: tuple[str, ...]  # Warnings on the image, in sentences.
 
 
 def target_pose_candidates(

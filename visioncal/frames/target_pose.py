@@ -32,32 +32,23 @@ _FALSE_ALARM = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class TargetPose:
-    """Pose of a target on a tool or fixture, estimated from images.
+    """Pose of a target on a tool or fixture, estimated from images."""
 
-    Attributes:
-        matrix: (4, 4) `parent_from_target`.
-        independent: (6, 6) covariance of its right perturbation by errors that average out over
-            images: the pixels and, where it is between, the robot.
-        common: (6, 6) covariance by errors that all images share: the camera's transform, its lens,
-            the target's size, the arm's errors.
-        labels: (m,) the images.
-        inliers: (m,) inlier mask; outliers are not used.
-        away_mm: (m,) distance of each image's pose from the mean [mm].
-        away_deg: (m,) the same in rotation [deg].
-        scatter: Ratio of the images' scatter to the calibration's noise, at least one; its square
-            scales `independent`.
-        warnings: Sentences.
-    """
-
-    matrix: FloatArray
+    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    # (6, 6) covariance of its right perturbation by errors that average out over images: the pixels
+    # and, where it is between, the robot.
     independent: FloatArray
+    # (6, 6) covariance by errors that all images share: the camera's transform, its lens, the
+    # target's size, the arm's errors.
     common: FloatArray
-    labels: tuple[str, ...]
-    inliers: Mask
-    away_mm: FloatArray
-    away_deg: FloatArray
+    labels: tuple[str, ...]  # (m,) the images.
+    inliers: Mask  # (m,) inlier mask; outliers are not used.
+    away_mm: FloatArray  # (m,) distance of each image's pose from the mean [mm].
+    away_deg: FloatArray  # (m,) the same in rotation [deg].
+    # Ratio of the images' scatter to the calibration's noise, at least one; its square scales
+    # `independent`.
     scatter: float
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # Sentences.
 
     @property
     def covariance(self) -> FloatArray:

@@ -34,36 +34,24 @@ _FALSE_ALARM = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class TouchPoint:
-    """Point of a board to be touched.
+    """Point of a board to be touched."""
 
-    Attributes:
-        name: The point's name on the board.
-        board_m: (3,) position on the board [m].
-        base_m: (3,) position in the base by the camera [m].
-        base_from_flange: (4, 4) flange pose with the tip on it and the tool's z into the board.
-        radius95_mm: Predicted gap that 95 % do not exceed [mm].
-    """
-
-    name: str
-    board_m: FloatArray
-    base_m: FloatArray
+    name: str  # The point's name on the board.
+    board_m: FloatArray  # (3,) position on the board [m].
+    base_m: FloatArray  # (3,) position in the base by the camera [m].
+    # (4, 4) flange pose with the tip on it and the tool's z into the board.
     base_from_flange: FloatArray
-    radius95_mm: float
+    radius95_mm: float  # Predicted gap that 95 % do not exceed [mm].
 
 
 @dataclass(frozen=True, eq=False)
 class TouchTargets:
-    """Points of a board, and what the flange carries to them.
-
-    Attributes:
-        board: The board in the base, its z into it.
-        flange_from_tip: The tip.
-        parts_m: (k, 3) all that is known beyond the flange, in its frame, the tip first [m].
-    """
+    """Points of a board, and what the flange carries to them."""
 
     points: tuple[TouchPoint, ...]
-    board: Frame
-    flange_from_tip: Edge
+    board: Frame  # The board in the base, its z into it.
+    flange_from_tip: Edge  # The tip.
+    # (k, 3) all that is known beyond the flange, in its frame, the tip first [m].
     parts_m: FloatArray
 
     def above(self, point: TouchPoint, height_m: float) -> FloatArray:

@@ -27,26 +27,18 @@ _SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 
 @dataclass(frozen=True, eq=False)
 class TouchRows:
-    """The rows of a file of touches, n in all.
+    """The rows of a file of touches, n in all."""
 
-    Attributes:
-        source: What they were read from, for messages and for the record.
-        labels: (n,) the rows' view numbers, as text.
-        places: (n,) the rows' lines: `touches.csv, line 3`.
-        base_from_flange: (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose,
-            and in the rotation where there are positions alone.
-        joints_rad: (n, j) joint angles [rad], NaN in a row without; None where there are none.
-        kinds: (n,) kinds of the touches; empty where not stated.
-        points: (n,) names of the touched points; empty where not stated.
-    """
-
-    source: str
-    labels: tuple[str, ...]
-    places: tuple[str, ...]
+    source: str  # What they were read from, for messages and for the record.
+    labels: tuple[str, ...]  # (n,) the rows' view numbers, as text.
+    places: tuple[str, ...]  # (n,) the rows' lines: `touches.csv, line 3`.
+    # (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose, and in the rotation
+    # where there are positions alone.
     base_from_flange: FloatArray
+    # (n, j) joint angles [rad], NaN in a row without; None where there are none.
     joints_rad: FloatArray | None
-    kinds: tuple[str, ...]
-    points: tuple[str, ...]
+    kinds: tuple[str, ...]  # (n,) kinds of the touches; empty where not stated.
+    points: tuple[str, ...]  # (n,) names of the touched points; empty where not stated.
 
     def __len__(self) -> int:
         return len(self.labels)

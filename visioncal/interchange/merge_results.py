@@ -40,17 +40,11 @@ def rewrite_result(folder: Path, calibration: Calibration) -> Written:
 
 @dataclass(frozen=True, eq=False)
 class EndangeredFrames:
-    """Frames of a result that a new result without them is about to replace.
+    """Frames of a result that a new result without them is about to replace."""
 
-    Attributes:
-        file: The file in which they are kept.
-        frames: By the transforms that place them.
-        before: The frames that the file holds already.
-    """
-
-    file: Path
-    frames: Mapping[str, Frame]
-    before: Mapping[str, Frame]
+    file: Path  # The file in which they are kept.
+    frames: Mapping[str, Frame]  # By the transforms that place them.
+    before: Mapping[str, Frame]  # The frames that the file holds already.
 
     def keep(self) -> None:
         """Writes them to the file, beside its frames of other names."""

@@ -38,26 +38,17 @@ def review_command(recording: Path) -> str:
 
 @dataclass(frozen=True)
 class FailedDrawing:
-    """A file whose drawing failed: a bug, which does not invalidate the result.
+    """A file whose drawing failed: a bug, which does not invalidate the result."""
 
-    Attributes:
-        file: The file; one of an earlier result was removed.
-        cause: The error and its place in the code.
-    """
-
-    file: Path
-    cause: str
+    file: Path  # The file; one of an earlier result was removed.
+    cause: str  # The error and its place in the code.
 
 
 @dataclass(frozen=True)
 class Written:
-    """Files written into a folder.
+    """Files written into a folder."""
 
-    Attributes:
-        files: The files, the result first.
-    """
-
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # The files, the result first.
     failed_drawings: tuple[FailedDrawing, ...] = ()
 
 

@@ -27,20 +27,13 @@ FRAMES = "frames.json"
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A result with its session and evidence.
-
-    Attributes:
-        session: The session that it was computed from; None where it was not kept.
-        evidence: Evidence of each view; empty where it was not kept.
-        note: Why something is missing, for the user; empty where nothing is.
-        review: The command that opens the recording; empty where there is none.
-    """
+    """A result with its session and evidence."""
 
     calibration: Calibration
-    session: Session | None
-    evidence: tuple[ViewEvidence, ...]
-    note: str = ""
-    review: str = ""
+    session: Session | None  # The session that it was computed from; None where it was not kept.
+    evidence: tuple[ViewEvidence, ...]  # Evidence of each view; empty where it was not kept.
+    note: str = ""  # Why something is missing, for the user; empty where nothing is.
+    review: str = ""  # The command that opens the recording; empty where there is none.
 
 
 def load_calibration(

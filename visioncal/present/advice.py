@@ -20,18 +20,12 @@ _MOST_LISTED = 12
 
 @dataclass(frozen=True)
 class FlaggedViews:
-    """Views that share a finding.
+    """Views that share a finding."""
 
-    Attributes:
-        views: View numbers.
-        used: Whether the fit uses them nevertheless.
-        why: The finding, in words.
-        of: The observing and the observed frame, as `cam_top of target`; empty for one camera.
-    """
-
-    views: tuple[int, ...]
-    used: bool
-    why: str
+    views: tuple[int, ...]  # View numbers.
+    used: bool  # Whether the fit uses them nevertheless.
+    why: str  # The finding, in words.
+    # The observing and the observed frame, as `cam_top of target`; empty for one camera.
     of: str = ""
 
     @property

@@ -21,19 +21,12 @@ _MIN_ROTATION_RAD = np.deg2rad(1.0)
 
 @dataclass(frozen=True, eq=False)
 class PointChart:
-    """Points of views in a plane whose x goes to the right and whose y goes down.
+    """Points of views in a plane whose x goes to the right and whose y goes down."""
 
-    Attributes:
-        name: `image`, `directions` or `rotation_axes`.
-        points: By view, (k, 2).
-        lines: Background lines, (k, 2) each.
-        words: Labels with their positions.
-    """
-
-    name: str
-    points: Mapping[int, FloatArray]
-    lines: Sequence[FloatArray]
-    words: Sequence[tuple[tuple[float, float], str]]
+    name: str  # `image`, `directions` or `rotation_axes`.
+    points: Mapping[int, FloatArray]  # By view, (k, 2).
+    lines: Sequence[FloatArray]  # Background lines, (k, 2) each.
+    words: Sequence[tuple[tuple[float, float], str]]  # Labels with their positions.
 
 
 def image_chart(

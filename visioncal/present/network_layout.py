@@ -17,22 +17,14 @@ _SEERS = ("cam", "instrument")
 
 @dataclass(frozen=True)
 class SeenPair:
-    """All observations of one frame by another.
+    """All observations of one frame by another."""
 
-    Attributes:
-        seer: Observing frame.
-        seen: Observed frame.
-        used: Number of observations that the fit used.
-        left_out: Number of observations that it did not use.
-        rms: Residuals of the used ones; None if there are none.
-        unseen: Their residuals by fits without their stops (cross-validation); None where unknown.
-    """
-
-    seer: str
-    seen: str
-    used: int
-    left_out: int
-    rms: Rms | None
+    seer: str  # Observing frame.
+    seen: str  # Observed frame.
+    used: int  # Number of observations that the fit used.
+    left_out: int  # Number of observations that it did not use.
+    rms: Rms | None  # Residuals of the used ones; None if there are none.
+    # Their residuals by fits without their stops (cross-validation); None where unknown.
     unseen: Rms | None
 
 

@@ -19,17 +19,12 @@ from visioncal.session.frames import CELL
 
 @dataclass(frozen=True, eq=False)
 class FrameHierarchy:
-    """The tree of frames, with the poses that are fixed.
+    """The tree of frames, with the poses that are fixed."""
 
-    Attributes:
-        parents: Parent of each frame; the cell is the root.
-        matrices: (4, 4) `parent_from_frame` of the frames that no robot moves on their parent.
-        robots: Robot name by its flange's frame.
-    """
-
-    parents: Mapping[str, str]
+    parents: Mapping[str, str]  # Parent of each frame; the cell is the root.
+    # (4, 4) `parent_from_frame` of the frames that no robot moves on their parent.
     matrices: Mapping[str, FloatArray]
-    robots: Mapping[str, str]
+    robots: Mapping[str, str]  # Robot name by its flange's frame.
 
 
 @dataclass(frozen=True)

@@ -19,33 +19,22 @@ class Fact:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a table.
+    """A row of a table."""
 
-    Attributes:
-        cells: Its text; a single cell is a heading of the rows below.
-        mark: Kind of highlighting: `taken`, `sure`, `used`, `look` (worth a look), `left-out` or
-            `rejected`; empty for none.
-        anchor: Name that links lead to; empty for none.
-    """
-
-    cells: tuple[str, ...]
+    cells: tuple[str, ...]  # Its text; a single cell is a heading of the rows below.
+    # Kind of highlighting: `taken`, `sure`, `used`, `look` (worth a look), `left-out` or
+    # `rejected`; empty for none.
     mark: str = ""
-    anchor: str = ""
+    anchor: str = ""  # Name that links lead to; empty for none.
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        titles: Column titles.
-        rows: Its rows.
-        words: Indices of columns with text; the others have figures.
-    """
-
-    titles: tuple[str, ...]
-    rows: tuple[TableRow, ...]
-    words: tuple[int, ...] = (0,)
+    titles: tuple[str, ...]  # Column titles.
+    rows: tuple[TableRow, ...]  # Its rows.
+    words: tuple[int, ...] = (0,)  # Indices of columns with text; the others have figures.
 
     @classmethod
     def of(

@@ -27,41 +27,28 @@ StoredRobot = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ArmLevel:
-    """Fit of one level of the arm's model.
+    """Fit of one level of the arm's model."""
 
-    Attributes:
-        level: Its name; `nominal` is the nominal arm.
-        unknowns: Number of free parameters.
-        rms_mm: Residual of the target's position in the fit [mm].
-        rms_deg: Residual of its orientation [deg]; None where only positions were read.
-        held_out_mm: Residual of the position at stops that were left out of the fit [mm].
-        held_out_deg: Residual of the orientation there [deg]; None where only positions were read.
-        likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
-    """
-
-    level: str
-    unknowns: int
-    rms_mm: float
+    level: str  # Its name; `nominal` is the nominal arm.
+    unknowns: int  # Number of free parameters.
+    rms_mm: float  # Residual of the target's position in the fit [mm].
+    # Residual of its orientation [deg]; None where only positions were read.
     rms_deg: float | None = None
-    held_out_mm: float
+    held_out_mm: float  # Residual of the position at stops that were left out of the fit [mm].
+    # Residual of the orientation there [deg]; None where only positions were read.
     held_out_deg: float | None = None
-    likelihood_ratio: float
+    likelihood_ratio: float  # Twice the gain in log-likelihood over the nominal arm.
 
 
 @dataclass(frozen=True)
 class JointBacklash:
-    """Backlash of a joint.
+    """Backlash of a joint."""
 
-    Attributes:
-        joint: The joint's name.
-        deadband_rad: Difference of the joint's angle between approaches from its two sides at the
-            same encoder reading [rad]; negative where the joint overshoots.
-        sigma_rad: Standard deviation of the deadband [rad].
-    """
-
-    joint: str
+    joint: str  # The joint's name.
+    # Difference of the joint's angle between approaches from its two sides at the same encoder
+    # reading [rad]; negative where the joint overshoots.
     deadband_rad: float
-    sigma_rad: float
+    sigma_rad: float  # Standard deviation of the deadband [rad].
 
     @property
     def is_sure(self) -> bool:
@@ -71,23 +58,14 @@ class JointBacklash:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmParameter:
-    """Identified parameter of the arm's kinematic table.
+    """Identified parameter of the arm's kinematic table."""
 
-    Attributes:
-        joint: The joint that it belongs to.
-        name: The parameter with its unit: `theta_rad`, `a_m`; `ratio` has none.
-        nominal: Nominal value [rad or m].
-        identified: Identified value [rad or m].
-        change: Identified minus nominal value [rad or m].
-        sigma: Standard deviation of the change [rad or m]; None where unknown.
-    """
-
-    joint: str
-    name: str
-    nominal: float
-    identified: float
-    change: float
-    sigma: float | None = None
+    joint: str  # The joint that it belongs to.
+    name: str  # The parameter with its unit: `theta_rad`, `a_m`; `ratio` has none.
+    nominal: float  # Nominal value [rad or m].
+    identified: float  # Identified value [rad or m].
+    change: float  # Identified minus nominal value [rad or m].
+    sigma: float | None = None  # Standard deviation of the change [rad or m]; None where unknown.
 
     @property
     def is_sure(self) -> bool:
@@ -115,32 +93,20 @@ class WorkspacePlace:
 
 @dataclass(frozen=True)
 class JointFunction:
-    """Angle-dependent error of a joint, beyond offset and ratio.
+    """Angle-dependent error of a joint, beyond offset and ratio."""
 
-    Attributes:
-        joint: The joint's name.
-        error_mrad: Error at equal steps of one turn from -180 degrees [mrad].
-        sigma_mrad: Its standard deviation [mrad].
-    """
-
-    joint: str
-    error_mrad: tuple[float, ...]
-    sigma_mrad: tuple[float, ...]
+    joint: str  # The joint's name.
+    error_mrad: tuple[float, ...]  # Error at equal steps of one turn from -180 degrees [mrad].
+    sigma_mrad: tuple[float, ...]  # Its standard deviation [mrad].
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointFunctions:
-    """Angle-dependent errors of the joints, as functions with a Gaussian process prior.
+    """Angle-dependent errors of the joints, as functions with a Gaussian process prior."""
 
-    Attributes:
-        size_mrad: Their standard deviation [mrad].
-        length_deg: Their correlation length in the joint's angle [deg].
-        joints: One entry for each joint.
-    """
-
-    size_mrad: float
-    length_deg: float
-    joints: tuple[JointFunction, ...]
+    size_mrad: float  # Their standard deviation [mrad].
+    length_deg: float  # Their correlation length in the joint's angle [deg].
+    joints: tuple[JointFunction, ...]  # One entry for each joint.
 
 
 Region = Literal["box", "ahead", "beside", "behind"]
@@ -154,44 +120,29 @@ _WHERE = {
 
 @dataclass(frozen=True)
 class CarriedRegion:
-    """Predicted errors of calibrated and nominal arm in a region of the workspace.
+    """Predicted errors of calibrated and nominal arm in a region of the workspace."""
 
-    Attributes:
-        region: The box of the stops' flange positions; outside it, the part ahead of, beside or
-            behind the base, the stops being ahead.
-        sigma_mm: Predicted error of the calibrated arm in another session (rms) [mm].
-        nominal_mm: The same of the nominal arm [mm].
-        better: Whether the calibrated arm's is significantly smaller.
-    """
-
+    # The box of the stops' flange positions; outside it, the part ahead of, beside or behind the
+    # base, the stops being ahead.
     region: Region
-    sigma_mm: float
-    nominal_mm: float
-    better: bool
+    sigma_mm: float  # Predicted error of the calibrated arm in another session (rms) [mm].
+    nominal_mm: float  # The same of the nominal arm [mm].
+    better: bool  # Whether the calibrated arm's is significantly smaller.
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarriesOver:
-    """Comparison of calibrated and nominal arm over the workspace.
+    """Comparison of calibrated and nominal arm over the workspace."""
 
-    Attributes:
-        measured_mm: Error of the calibrated arm at stops left out of the fit (rms) [mm].
-        measured_nominal_mm: The same of the nominal arm [mm].
-        sigma_mm: Predicted error of the calibrated arm outside the box of the stops in another
-            session, with noise (rms over the workspace) [mm].
-        nominal_mm: The same of the nominal arm [mm].
-        session_mm: Part of that for another session, as assumed for arms of this size [mm].
-        better_share: Share of the workspace where the calibrated arm is significantly better.
-        regions: One entry for each region.
-    """
-
-    measured_mm: float
-    measured_nominal_mm: float
+    measured_mm: float  # Error of the calibrated arm at stops left out of the fit (rms) [mm].
+    measured_nominal_mm: float  # The same of the nominal arm [mm].
+    # Predicted error of the calibrated arm outside the box of the stops in another session, with
+    # noise (rms over the workspace) [mm].
     sigma_mm: float
-    nominal_mm: float
-    session_mm: float
-    better_share: float
-    regions: tuple[CarriedRegion, ...]
+    nominal_mm: float  # The same of the nominal arm [mm].
+    session_mm: float  # Part of that for another session, as assumed for arms of this size [mm].
+    better_share: float  # Share of the workspace where the calibrated arm is significantly better.
+    regions: tuple[CarriedRegion, ...]  # One entry for each region.
 
     @property
     def words(self) -> str:
@@ -209,44 +160,28 @@ class CarriesOver:
 
 @dataclass(frozen=True)
 class JointRange:
-    """Range of a joint's positions at the stops of the fit.
+    """Range of a joint's positions at the stops of the fit."""
 
-    Attributes:
-        joint: The joint's name.
-        lower: Smallest position [rad or m].
-        upper: Largest position [rad or m].
-    """
-
-    joint: str
-    lower: float
-    upper: float
+    joint: str  # The joint's name.
+    lower: float  # Smallest position [rad or m].
+    upper: float  # Largest position [rad or m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observability:
-    """Observability of the arm's parameters at the stops.
+    """Observability of the arm's parameters at the stops."""
 
-    Attributes:
-        columns: Number of the fit's parameters, redundant ones included.
-        identifiable: Number of identifiable directions, with any stops.
-        determined: Number of directions that these stops determine.
-        condition: Condition number of the scaled Jacobian; None where no direction is determined.
-        o1: Geometric mean of the singular values over the root of the number of stops.
-        o2: Smallest over largest singular value.
-        o3: Smallest singular value.
-        o4: Square of the smallest over the largest singular value.
-        o5: Inverse of the sum of the inverse singular values.
-    """
-
-    columns: int
-    identifiable: int
-    determined: int
+    columns: int  # Number of the fit's parameters, redundant ones included.
+    identifiable: int  # Number of identifiable directions, with any stops.
+    determined: int  # Number of directions that these stops determine.
+    # Condition number of the scaled Jacobian; None where no direction is determined.
     condition: float | None = None
+    # Geometric mean of the singular values over the root of the number of stops.
     o1: float | None = None
-    o2: float | None = None
-    o3: float | None = None
-    o4: float | None = None
-    o5: float | None = None
+    o2: float | None = None  # Smallest over largest singular value.
+    o3: float | None = None  # Smallest singular value.
+    o4: float | None = None  # Square of the smallest over the largest singular value.
+    o5: float | None = None  # Inverse of the sum of the inverse singular values.
 
 
 @dataclass(frozen=True)
@@ -259,20 +194,14 @@ class StopInfluence:
 
 @dataclass(frozen=True, kw_only=True)
 class UnseenView:
-    """Residual of a view that the fit left out, by nominal and calibrated arm.
+    """Residual of a view that the fit left out, by nominal and calibrated arm."""
 
-    Attributes:
-        view: The view's number.
-        nominal_mm: By the nominal arm [mm].
-        mm: By the calibrated arm [mm].
-        nominal_deg: Rotation by the nominal arm [deg]; None where only positions were read.
-        deg: Rotation by the calibrated arm [deg]; None where only positions were read.
-    """
-
-    view: int
-    nominal_mm: float
-    mm: float
+    view: int  # The view's number.
+    nominal_mm: float  # By the nominal arm [mm].
+    mm: float  # By the calibrated arm [mm].
+    # Rotation by the nominal arm [deg]; None where only positions were read.
     nominal_deg: float | None = None
+    # Rotation by the calibrated arm [deg]; None where only positions were read.
     deg: float | None = None
 
 
@@ -282,44 +211,31 @@ class ArmResult(Section):
 
     What follows the levels is present where one other than `nominal` was chosen, `parameters` where
     that frees some.
-
-    Attributes:
-        level: The chosen level; `nominal` where no level improves the fit significantly.
-        levels: All fitted levels, the nominal arm first.
-        robot: The calibrated arm; None at level `nominal`.
-        backlash: Backlash of each joint, where stops were approached from both sides.
-        convention: Convention of the kinematic table.
-        parameters: The identified parameters of the table.
-        workspace_sigma_mm: Predicted sigma of a tool's position over the workspace.
-        workspace_map: The same at each position.
-        measured_map: The same at postures within the ranges of the joints at the stops, where the
-            stops determine more than at other postures with the same flange position.
-        carries_over: Comparison with the nominal arm over the workspace.
-        functions: Angle-dependent errors of the joints, at level `functions`.
-        measured: Ranges of the joints at the stops.
-        observability: Observability of the parameters at the stops.
-        not_determined: Undetermined directions, in words.
-        stops: The stops by influence, largest first.
-        left_out: Residuals of views that were left out of the fit in turn.
-        holdout: Residuals of views that the session holds out of every fit.
     """
 
-    level: str
-    levels: tuple[ArmLevel, ...]
-    robot: StoredRobot | None = None
+    level: str  # The chosen level; `nominal` where no level improves the fit significantly.
+    levels: tuple[ArmLevel, ...]  # All fitted levels, the nominal arm first.
+    robot: StoredRobot | None = None  # The calibrated arm; None at level `nominal`.
+    # Backlash of each joint, where stops were approached from both sides.
     backlash: tuple[JointBacklash, ...] = ()
-    convention: Convention | None = None
-    parameters: tuple[ArmParameter, ...] = ()
+    convention: Convention | None = None  # Convention of the kinematic table.
+    parameters: tuple[ArmParameter, ...] = ()  # The identified parameters of the table.
+    # Predicted sigma of a tool's position over the workspace.
     workspace_sigma_mm: WorkspaceSigma | None = None
-    workspace_map: tuple[WorkspacePlace, ...] = ()
+    workspace_map: tuple[WorkspacePlace, ...] = ()  # The same at each position.
+    # The same at postures within the ranges of the joints at the stops, where the stops determine
+    # more than at other postures with the same flange position.
     measured_map: tuple[WorkspacePlace, ...] = ()
-    carries_over: CarriesOver | None = None
+    carries_over: CarriesOver | None = None  # Comparison with the nominal arm over the workspace.
+    # Angle-dependent errors of the joints, at level `functions`.
     functions: JointFunctions | None = None
-    measured: tuple[JointRange, ...] = ()
-    observability: Observability | None = None
-    not_determined: tuple[str, ...] | None = None
-    stops: tuple[StopInfluence, ...] = ()
+    measured: tuple[JointRange, ...] = ()  # Ranges of the joints at the stops.
+    observability: Observability | None = None  # Observability of the parameters at the stops.
+    not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.
+    stops: tuple[StopInfluence, ...] = ()  # The stops by influence, largest first.
+    # Residuals of views that were left out of the fit in turn.
     left_out: tuple[UnseenView, ...] = ()
+    # Residuals of views that the session holds out of every fit.
     holdout: tuple[UnseenView, ...] = ()
 
     def __post_init__(self) -> None:
@@ -356,53 +272,36 @@ class ArmResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ArmErrorsResult(Section):
-    """Posture-dependent arm errors: `arm_errors` in calibration.json.
+    """Posture-dependent arm errors: `arm_errors` in calibration.json."""
 
-    Attributes:
-        sigma_mm: Standard deviation of a link's lengths, or of the flange's position per axis [mm].
-        sigma_deg: The same of a link's angles, or of the flange's rotation per axis [deg].
-        likelihood_ratio: Twice the gain in log-likelihood over white noise.
-        estimated: Whether they were estimated together with the transforms.
-        of: `flange` where joints are unknown and the sizes are those of the flange's errors, beside
-            its noise; None where they are those of links.
-        away_mm: Position error at postures away from the views (rms), from leaving out parts of the
-            postures in turn; None where unknown [mm].
-        away_deg: The same in rotation [deg].
-        away_predicted_mm: Prediction of `away_mm` [mm].
-        away_predicted_deg: Prediction of `away_deg` [deg].
-    """
-
+    # Standard deviation of a link's lengths, or of the flange's position per axis [mm].
     sigma_mm: float
-    sigma_deg: float
-    likelihood_ratio: float
-    estimated: bool
+    sigma_deg: float  # The same of a link's angles, or of the flange's rotation per axis [deg].
+    likelihood_ratio: float  # Twice the gain in log-likelihood over white noise.
+    estimated: bool  # Whether they were estimated together with the transforms.
+    # `flange` where joints are unknown and the sizes are those of the flange's errors, beside its
+    # noise; None where they are those of links.
     of: Literal["flange"] | None = None
+    # Position error at postures away from the views (rms), from leaving out parts of the postures
+    # in turn; None where unknown [mm].
     away_mm: float | None = None
-    away_deg: float | None = None
-    away_predicted_mm: float | None = None
-    away_predicted_deg: float | None = None
+    away_deg: float | None = None  # The same in rotation [deg].
+    away_predicted_mm: float | None = None  # Prediction of `away_mm` [mm].
+    away_predicted_deg: float | None = None  # Prediction of `away_deg` [deg].
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointSpring:
-    """Compliance of a joint.
+    """Compliance of a joint."""
 
-    Attributes:
-        joint: The joint's name.
-        compliance_rad_per_nm: Compliance, zero or more [rad/(N m)].
-        sigma_rad_per_nm: Its standard deviation; the prior's where the stops do not determine it.
-        determined: Whether the stops determine it; else the joint stays rigid.
-        torque_nm: Smallest and largest torque on it at the stops [N m].
-        stiffness_nm_per_rad: Stiffness [N m/rad]; None where practically rigid.
-        stiffness_sigma_nm_per_rad: Its standard deviation, to first order [N m/rad].
-    """
-
-    joint: str
-    compliance_rad_per_nm: float
+    joint: str  # The joint's name.
+    compliance_rad_per_nm: float  # Compliance, zero or more [rad/(N m)].
+    # Its standard deviation; the prior's where the stops do not determine it.
     sigma_rad_per_nm: float
-    determined: bool
-    torque_nm: tuple[float, float]
-    stiffness_nm_per_rad: float | None = None
+    determined: bool  # Whether the stops determine it; else the joint stays rigid.
+    torque_nm: tuple[float, float]  # Smallest and largest torque on it at the stops [N m].
+    stiffness_nm_per_rad: float | None = None  # Stiffness [N m/rad]; None where practically rigid.
+    # Its standard deviation, to first order [N m/rad].
     stiffness_sigma_nm_per_rad: float | None = None
 
 
@@ -416,47 +315,30 @@ class Sag:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedStop:
-    """Load and deflection at one stop.
+    """Load and deflection at one stop."""
 
-    Attributes:
-        view: Number of its first view.
-        payload_kg: Payload on the flange [kg].
-        sag_mm: Flange deflection under the load [mm].
-        torque_nm: Torques on the joints [N m].
-        bend_mrad: Deflection by joint from this stop alone [mrad], where it determines it.
-    """
-
-    view: int
-    payload_kg: float
-    sag_mm: float
-    torque_nm: tuple[float, ...]
+    view: int  # Number of its first view.
+    payload_kg: float  # Payload on the flange [kg].
+    sag_mm: float  # Flange deflection under the load [mm].
+    torque_nm: tuple[float, ...]  # Torques on the joints [N m].
+    # Deflection by joint from this stop alone [mrad], where it determines it.
     bend_mrad: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticResult(Section):
-    """Joint compliance: `elastic` in calibration.json.
+    """Joint compliance: `elastic` in calibration.json."""
 
-    Attributes:
-        joints: One entry for each joint.
-        not_determined: Joints whose compliance the loads do not determine.
-        weight: Whether the links' weight is from the model's masses, or unknown.
-        payload_kg: Smallest and largest payload [kg].
-        sag_mm: Flange deflection under the loads of the stops.
-        stops: The stops with torques and deflections.
-        weight_moments: (n, 4 n) compliance times unknown masses and first moments of links (see
-            `robot.bent_joints`); None where the masses are known, or have little effect.
-        payload_factor: Ratio of the effective payload and force to the stated ones; None where
-            there was no payload.
-    """
-
-    joints: tuple[JointSpring, ...]
-    not_determined: tuple[str, ...]
-    weight: str
-    payload_kg: tuple[float, float]
-    sag_mm: Sag
-    stops: tuple[LoadedStop, ...]
+    joints: tuple[JointSpring, ...]  # One entry for each joint.
+    not_determined: tuple[str, ...]  # Joints whose compliance the loads do not determine.
+    weight: str  # Whether the links' weight is from the model's masses, or unknown.
+    payload_kg: tuple[float, float]  # Smallest and largest payload [kg].
+    sag_mm: Sag  # Flange deflection under the loads of the stops.
+    stops: tuple[LoadedStop, ...]  # The stops with torques and deflections.
+    # (n, 4 n) compliance times unknown masses and first moments of links (see `robot.bent_joints`);
+    # None where the masses are known, or have little effect.
     weight_moments: Matrix | None = None
+    # Ratio of the effective payload and force to the stated ones; None where there was no payload.
     payload_factor: Factor | None = None
 
     @cached_property
@@ -476,31 +358,20 @@ class ElasticResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrift:
-    """Thermal drift of a joint and the link behind it.
+    """Thermal drift of a joint and the link behind it."""
 
-    Attributes:
-        joint: The joint's name.
-        reference_c: Temperature of the calibrated arm [deg C].
-        growth_per_k: Relative growth of the link [1/K].
-        drift_rad_per_k: Drift of the joint's zero [rad/K].
-        tau_s: Time constant of the link's temperature [s].
-        gain_k_per_a2: Temperature rise over the air per squared motor current [K/A^2]; None where
-            temperatures were measured.
-        growth_sigma_per_k: Standard deviation of the growth [1/K].
-        drift_sigma_rad_per_k: Standard deviation of the drift [rad/K].
-        tau_sigma: Relative standard deviation of the time constant.
-        gain_sigma: Relative standard deviation of the gain; None where there is none.
-    """
-
-    joint: str
-    reference_c: float
-    growth_per_k: float
-    drift_rad_per_k: float
-    tau_s: float
+    joint: str  # The joint's name.
+    reference_c: float  # Temperature of the calibrated arm [deg C].
+    growth_per_k: float  # Relative growth of the link [1/K].
+    drift_rad_per_k: float  # Drift of the joint's zero [rad/K].
+    tau_s: float  # Time constant of the link's temperature [s].
+    # Temperature rise over the air per squared motor current [K/A^2]; None where temperatures were
+    # measured.
     gain_k_per_a2: float | None = None
-    growth_sigma_per_k: float
-    drift_sigma_rad_per_k: float
-    tau_sigma: float
+    growth_sigma_per_k: float  # Standard deviation of the growth [1/K].
+    drift_sigma_rad_per_k: float  # Standard deviation of the drift [rad/K].
+    tau_sigma: float  # Relative standard deviation of the time constant.
+    # Relative standard deviation of the gain; None where there is none.
     gain_sigma: float | None = None
 
 
@@ -514,19 +385,12 @@ class DriftResidual:
 
 @dataclass(frozen=True)
 class DriftPoint:
-    """Predicted drift of the flange at a time, in one posture of the session.
+    """Predicted drift of the flange at a time, in one posture of the session."""
 
-    Attributes:
-        stamp_s: Time on the session's clock [s].
-        drift_mm: Drift of the flange [mm].
-        sigma_mm: Its standard deviation [mm].
-        rise_k: Largest rise of a link's temperature [K].
-    """
-
-    stamp_s: float
-    drift_mm: float
-    sigma_mm: float
-    rise_k: float
+    stamp_s: float  # Time on the session's clock [s].
+    drift_mm: float  # Drift of the flange [mm].
+    sigma_mm: float  # Its standard deviation [mm].
+    rise_k: float  # Largest rise of a link's temperature [K].
 
 
 @dataclass(frozen=True)
@@ -549,35 +413,24 @@ class ViewDrift:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ThermalResult(Section):
-    """Thermal drift of the arm: `thermal` in calibration.json.
+    """Thermal drift of the arm: `thermal` in calibration.json."""
 
-    Attributes:
-        heated_by: Whether joint temperatures or motor currents were recorded.
-        joints: One entry for each joint.
-        covariance: (p, p) of growth and drift of all joints, then tau, and gain where there is one.
-        lengths_m: (n + 1, 3) from each joint's frame to the next, in the earlier one [m].
-        not_determined: Coefficients that the views do not determine: they are the prior's.
-        residual_mm: Residuals without and with drift.
-        likelihood_ratio: Twice the gain in log-likelihood over an arm without drift.
-        rises_k: (n,) range of each link's temperature over the views [K].
-        trained_s: Duration of the views [s].
-        course: Predicted drift over time.
-        seen: Drift observed at stops in the same posture; None in files of earlier versions.
-        views: Drift at each view.
-    """
-
-    heated_by: Kind
-    joints: tuple[JointDrift, ...]
+    heated_by: Kind  # Whether joint temperatures or motor currents were recorded.
+    joints: tuple[JointDrift, ...]  # One entry for each joint.
+    # (p, p) of growth and drift of all joints, then tau, and gain where there is one.
     covariance: Covariance
+    # (n + 1, 3) from each joint's frame to the next, in the earlier one [m].
     lengths_m: Annotated[FloatArray, Array((-1, 3))]
+    # Coefficients that the views do not determine: they are the prior's.
     not_determined: tuple[str, ...]
-    residual_mm: DriftResidual
-    likelihood_ratio: float
-    rises_k: tuple[float, ...]
-    trained_s: float
-    course: tuple[DriftPoint, ...]
+    residual_mm: DriftResidual  # Residuals without and with drift.
+    likelihood_ratio: float  # Twice the gain in log-likelihood over an arm without drift.
+    rises_k: tuple[float, ...]  # (n,) range of each link's temperature over the views [K].
+    trained_s: float  # Duration of the views [s].
+    course: tuple[DriftPoint, ...]  # Predicted drift over time.
+    # Drift observed at stops in the same posture; None in files of earlier versions.
     seen: tuple[ObservedDrift, ...] | None = None
-    views: tuple[ViewDrift, ...]
+    views: tuple[ViewDrift, ...]  # Drift at each view.
 
     def model(self, robot: Robot) -> ThermalModel:
         """Thermal model of the arm; `robot` is the arm at its reference temperatures."""
@@ -596,16 +449,10 @@ class ThermalResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmSections:
-    """Sections on an arm; None where not computed.
+    """Sections on an arm; None where not computed."""
 
-    Attributes:
-        arm_errors: Posture-dependent errors.
-        thermal: Thermal drift.
-        arm: Kinematics, and the choice of the model's level.
-        elastic: Joint compliance.
-    """
-
-    arm_errors: ArmErrorsResult | None = None
-    thermal: ThermalResult | None = None
+    arm_errors: ArmErrorsResult | None = None  # Posture-dependent errors.
+    thermal: ThermalResult | None = None  # Thermal drift.
+    # Kinematics, and the choice of the model's level.
     arm: Annotated[ArmResult | None, Key("kinematics")] = None
-    elastic: ElasticResult | None = None
+    elastic: ElasticResult | None = None  # Joint compliance.

@@ -21,24 +21,15 @@ from visioncal.session.frames import (
 
 @dataclass(frozen=True)
 class Moved:
-    """A frame that moved during the session.
+    """A frame that moved during the session."""
 
-    Attributes:
-        frame: The frame; its transform in the result is the last one.
-        before: Name in the result of its earlier pose.
-        last_stop: Last stop at the earlier pose.
-        first_stop: First stop at the last pose.
-        shift_mm: Displacement of its origin [mm].
-        turn_deg: Rotation angle [deg].
-        rivals: Frames whose motion would explain the observations as well.
-    """
-
-    frame: str
-    before: str
-    last_stop: int
-    first_stop: int
-    shift_mm: float
-    turn_deg: float
+    frame: str  # The frame; its transform in the result is the last one.
+    before: str  # Name in the result of its earlier pose.
+    last_stop: int  # Last stop at the earlier pose.
+    first_stop: int  # First stop at the last pose.
+    shift_mm: float  # Displacement of its origin [mm].
+    turn_deg: float  # Rotation angle [deg].
+    # Frames whose motion would explain the observations as well.
     rivals: Annotated[tuple[str, ...], KEPT] = ()
 
 
@@ -52,36 +43,23 @@ class UnconnectedFrame:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellResult:
-    """Result of a whole cell beside its transforms and views.
+    """Result of a whole cell beside its transforms and views."""
 
-    Attributes:
-        reference: The frame that defines the cell's frame.
-        tree: Parent of each frame, by name.
-        cameras: The cameras by name; one without a name is `camera`.
-        robots: The robots by name, with nominal model and arm sections; one without a name is
-            `robot`.
-        targets: Documents of the targets, by name.
-        noise: Estimated standard deviations, by frame or robot and by name.
-        moved: Frames that moved during the session.
-        untied: Frames that no observation connects to the rest.
-        weakest: The weakest connection, in words.
-        details: Further figures.
-        joint_fit: Parameters of the fit and their covariance, for verification.
-        uncertainty: Uncertainty of the cell.
-    """
-
-    reference: str
-    tree: Mapping[str, str]
-    cameras: Mapping[str, CameraResult]
+    reference: str  # The frame that defines the cell's frame.
+    tree: Mapping[str, str]  # Parent of each frame, by name.
+    cameras: Mapping[str, CameraResult]  # The cameras by name; one without a name is `camera`.
+    # The robots by name, with nominal model and arm sections; one without a name is `robot`.
     robots: Mapping[str, RobotResult]
-    targets: Mapping[str, Mapping[str, Any]]
+    targets: Mapping[str, Mapping[str, Any]]  # Documents of the targets, by name.
+    # Estimated standard deviations, by frame or robot and by name.
     noise: Mapping[str, Mapping[str, float]]
-    moved: tuple[Moved, ...]
-    untied: tuple[UnconnectedFrame, ...]
-    weakest: str
-    details: CellDetails
+    moved: tuple[Moved, ...]  # Frames that moved during the session.
+    untied: tuple[UnconnectedFrame, ...]  # Frames that no observation connects to the rest.
+    weakest: str  # The weakest connection, in words.
+    details: CellDetails  # Further figures.
+    # Parameters of the fit and their covariance, for verification.
     joint_fit: CellJointFit | None = None
-    uncertainty: CellUncertainty | None = None
+    uncertainty: CellUncertainty | None = None  # Uncertainty of the cell.
 
     @property
     def flanges(self) -> dict[str, str]:

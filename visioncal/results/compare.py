@@ -27,15 +27,10 @@ _OTHER_LENS = 0.05
 
 @dataclass(frozen=True)
 class Significance:
-    """Result of a significance test of a difference.
+    """Result of a significance test of a difference."""
 
-    Attributes:
-        p_value: Probability of a difference at least as large by noise alone.
-        limit: A smaller `p_value` is a change.
-    """
-
-    p_value: float
-    limit: float
+    p_value: float  # Probability of a difference at least as large by noise alone.
+    limit: float  # A smaller `p_value` is a change.
 
     @property
     def is_change(self) -> bool:
@@ -45,26 +40,17 @@ class Significance:
 
 @dataclass(frozen=True, eq=False)
 class EdgeChange(PoseSigmas):
-    """Difference of one transform between two calibrations.
+    """Difference of one transform between two calibrations."""
 
-    Attributes:
-        name: Its name, such as `flange_from_cam`. A camera's is compared in the frame of its centre
-            ray, where both calibrations have that (`Calibration.ray_frame`).
-        twist: (6,) rotation [rad] and translation [m] with `second = first * exp(twist)`.
-        covariance: (6, 6) of the twist if nothing changed.
-        moved_mm: Distance between the two origins [mm].
-        moved_deg: Angle between the two orientations [deg].
-        translation: Test of the translation.
-        rotation: Test of the rotation.
-    """
-
+    # Its name, such as `flange_from_cam`. A camera's is compared in the frame of its centre ray,
+    # where both calibrations have that (`Calibration.ray_frame`).
     name: str
-    twist: FloatArray
-    covariance: FloatArray
-    moved_mm: float
-    moved_deg: float
-    translation: Significance
-    rotation: Significance
+    twist: FloatArray  # (6,) rotation [rad] and translation [m] with `second = first * exp(twist)`.
+    covariance: FloatArray  # (6, 6) of the twist if nothing changed.
+    moved_mm: float  # Distance between the two origins [mm].
+    moved_deg: float  # Angle between the two orientations [deg].
+    translation: Significance  # Test of the translation.
+    rotation: Significance  # Test of the rotation.
 
     @property
     def is_change(self) -> bool:
@@ -74,20 +60,14 @@ class EdgeChange(PoseSigmas):
 
 @dataclass(frozen=True, eq=False)
 class LensChange:
-    """Difference of the intrinsics between two calibrations.
+    """Difference of the intrinsics between two calibrations."""
 
-    Attributes:
-        names: fx, fy, cx, cy and the names of the distortion's coefficients.
-        a: (k,) values in the first.
-        b: (k,) values in the second.
-        sigmas: (k,) standard deviations of the differences; None where not both were estimated.
-        significance: Joint test of the differences; None where not both were estimated.
-    """
-
-    names: tuple[str, ...]
-    a: FloatArray
-    b: FloatArray
+    names: tuple[str, ...]  # fx, fy, cx, cy and the names of the distortion's coefficients.
+    a: FloatArray  # (k,) values in the first.
+    b: FloatArray  # (k,) values in the second.
+    # (k,) standard deviations of the differences; None where not both were estimated.
     sigmas: FloatArray | None = None
+    # Joint test of the differences; None where not both were estimated.
     significance: Significance | None = None
 
     @property
@@ -109,30 +89,19 @@ class NoiseChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparison of two calibrations.
+    """Comparison of two calibrations."""
 
-    Attributes:
-        mounts: The camera's mount in each; `whole cell` for one.
-        verdicts: The verdict of each.
-        same_session: Whether both are of the same session, so that they share its noise and are not
-            independent.
-        edges: The transforms that both have.
-        only_in_a: Names of transforms that only the first has.
-        only_in_b: Names of transforms that only the second has.
-        lens: The intrinsics, where both cameras have the same model and resolution.
-        noise: The noise levels.
-        findings: Conclusions, in sentences.
-    """
-
-    mounts: tuple[str, str]
-    verdicts: tuple[VerdictStatus, VerdictStatus]
+    mounts: tuple[str, str]  # The camera's mount in each; `whole cell` for one.
+    verdicts: tuple[VerdictStatus, VerdictStatus]  # The verdict of each.
+    # Whether both are of the same session, so that they share its noise and are not independent.
     same_session: bool
-    edges: tuple[EdgeChange, ...]
-    only_in_a: tuple[str, ...]
-    only_in_b: tuple[str, ...]
+    edges: tuple[EdgeChange, ...]  # The transforms that both have.
+    only_in_a: tuple[str, ...]  # Names of transforms that only the first has.
+    only_in_b: tuple[str, ...]  # Names of transforms that only the second has.
+    # The intrinsics, where both cameras have the same model and resolution.
     lens: LensChange | None
-    noise: tuple[NoiseChange, ...]
-    findings: tuple[str, ...]
+    noise: tuple[NoiseChange, ...]  # The noise levels.
+    findings: tuple[str, ...]  # Conclusions, in sentences.
 
     @property
     def is_change(self) -> bool:
@@ -435,19 +404,12 @@ def _present(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EdgeError:
-    """True error of an edge, and the calibration's sigma.
+    """True error of an edge, and the calibration's sigma."""
 
-    Attributes:
-        mm: Error of its translation [mm].
-        deg: Error of its rotation [deg].
-        sigma_mm: Sigma of its translation [mm].
-        sigma_deg: Sigma of its rotation [deg].
-    """
-
-    mm: float
-    deg: float
-    sigma_mm: float
-    sigma_deg: float
+    mm: float  # Error of its translation [mm].
+    deg: float  # Error of its rotation [deg].
+    sigma_mm: float  # Sigma of its translation [mm].
+    sigma_deg: float  # Sigma of its rotation [deg].
 
 
 def edge_errors(

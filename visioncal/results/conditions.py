@@ -22,17 +22,11 @@ _SIGNIFICANT = 3.0
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition under which a result holds.
+    """A condition under which a result holds."""
 
-    Attributes:
-        kind: Its kind.
-        sentence: What it is, with its figure.
-        do: What follows for whoever uses the result.
-    """
-
-    kind: Literal["calibrated-arm", "own-lens", "load", "temperature"]
-    sentence: str
-    do: str
+    kind: Literal["calibrated-arm", "own-lens", "load", "temperature"]  # Its kind.
+    sentence: str  # What it is, with its figure.
+    do: str  # What follows for whoever uses the result.
 
     @property
     def words(self) -> str:

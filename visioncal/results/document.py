@@ -46,48 +46,27 @@ Edges = Annotated[Mapping[str, StoredEdge], Key("transforms")]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationForm:
-    """calibration.json of one camera and one robot, without its optional sections.
+    """calibration.json of one camera and one robot, without its optional sections."""
 
-    Attributes:
-        schema: Version of the file's form.
-        visioncal: Version of the program.
-        created: Time of creation, ISO 8601.
-        session: The session.
-        mount: How the camera is mounted.
-        edges: Estimated transforms by name.
-        joint_covariance: Joint covariance of all transforms.
-        solvers: Result of every solver.
-        camera: The camera.
-        ray_frame: Its transform with z along the ray of the image's centre.
-        robot: The nominal robot model.
-        noise: Estimated standard deviations per axis, by name.
-        views: One entry for each view of the session.
-        rms: Residuals over the used views.
-        validation: Residuals of views that were left out.
-        verdict: Verdict with its reasons.
-        conditions: What it is valid for.
-        need: Required accuracy of picks, and the probability of meeting it.
-        frames: Tools and fixtures by transform name.
-    """
-
-    schema: Literal[2]
-    visioncal: str = __version__
-    created: str
-    session: SessionForm
-    mount: Mount
-    edges: Edges
-    joint_covariance: JointCovariance
-    solvers: Mapping[str, SolverResult]
-    camera: CameraResult | None = None
-    ray_frame: RayFrame | None = None
-    robot: StoredRobot | None = None
-    noise: Mapping[str, float]
-    views: tuple[ViewResult, ...]
-    rms: Rms
-    validation: Validation
-    verdict: StoredVerdict
-    conditions: tuple[Condition, ...] = ()
-    need: NeedMet | None = None
+    schema: Literal[2]  # Version of the file's form.
+    visioncal: str = __version__  # Version of the program.
+    created: str  # Time of creation, ISO 8601.
+    session: SessionForm  # The session.
+    mount: Mount  # How the camera is mounted.
+    edges: Edges  # Estimated transforms by name.
+    joint_covariance: JointCovariance  # Joint covariance of all transforms.
+    solvers: Mapping[str, SolverResult]  # Result of every solver.
+    camera: CameraResult | None = None  # The camera.
+    ray_frame: RayFrame | None = None  # Its transform with z along the ray of the image's centre.
+    robot: StoredRobot | None = None  # The nominal robot model.
+    noise: Mapping[str, float]  # Estimated standard deviations per axis, by name.
+    views: tuple[ViewResult, ...]  # One entry for each view of the session.
+    rms: Rms  # Residuals over the used views.
+    validation: Validation  # Residuals of views that were left out.
+    verdict: StoredVerdict  # Verdict with its reasons.
+    conditions: tuple[Condition, ...] = ()  # What it is valid for.
+    need: NeedMet | None = None  # Required accuracy of picks, and the probability of meeting it.
+    # Tools and fixtures by transform name.
     frames: Mapping[str, Frame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -97,44 +76,28 @@ class CalibrationForm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellForm:
-    """calibration.json of a whole cell.
+    """calibration.json of a whole cell."""
 
-    Attributes:
-        schema: Version of the file's form.
-        visioncal: Version of the program.
-        created: Time of creation, ISO 8601.
-        session: The session.
-        cell: Cameras, robots and targets by name.
-        edges: Estimated transforms by name.
-        joint_covariance: Joint covariance of all transforms.
-        views: One entry for each observation.
-        rms: Residuals over the used observations.
-        verdict: Verdict with its reasons.
-        conditions: What it is valid for.
-        need: Required accuracy of picks, and the probability of meeting it.
-        validation: Residuals of left-out observations.
-        frames: Tools and fixtures by transform name.
-        boards: Estimated shapes of the boards by name.
-        rigs: Estimated shapes of the rigs of points by name.
-        further: Unknown sections, kept as they are.
-    """
-
-    schema: Literal[2]
-    visioncal: str = __version__
-    created: str
-    session: SessionForm
-    cell: Annotated[CellResult, INLINE]
-    edges: Edges
-    joint_covariance: JointCovariance
-    views: tuple[CellView, ...]
-    rms: Rms
-    verdict: StoredVerdict
-    conditions: tuple[Condition, ...] = ()
-    need: NeedMet | None = None
-    validation: Validation | None = None
+    schema: Literal[2]  # Version of the file's form.
+    visioncal: str = __version__  # Version of the program.
+    created: str  # Time of creation, ISO 8601.
+    session: SessionForm  # The session.
+    cell: Annotated[CellResult, INLINE]  # Cameras, robots and targets by name.
+    edges: Edges  # Estimated transforms by name.
+    joint_covariance: JointCovariance  # Joint covariance of all transforms.
+    views: tuple[CellView, ...]  # One entry for each observation.
+    rms: Rms  # Residuals over the used observations.
+    verdict: StoredVerdict  # Verdict with its reasons.
+    conditions: tuple[Condition, ...] = ()  # What it is valid for.
+    need: NeedMet | None = None  # Required accuracy of picks, and the probability of meeting it.
+    validation: Validation | None = None  # Residuals of left-out observations.
+    # Tools and fixtures by transform name.
     frames: Mapping[str, Frame] = field(default_factory=dict)
+    # Estimated shapes of the boards by name.
     boards: Mapping[str, BoardResult] = field(default_factory=dict)
+    # Estimated shapes of the rigs of points by name.
     rigs: Mapping[str, RigResult] = field(default_factory=dict)
+    # Unknown sections, kept as they are.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
 

@@ -41,14 +41,10 @@ class PoseSigmas:
 
 @dataclass(frozen=True, eq=False)
 class Edge(PoseSigmas):
-    """Estimated edge of the tree of frames.
+    """Estimated edge of the tree of frames."""
 
-    Attributes:
-        matrix: (4, 4) the transform, named `a_from_b` by its owner, exactly as on disk.
-        covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
-    """
-
-    matrix: FloatArray
+    matrix: FloatArray  # (4, 4) the transform, named `a_from_b` by its owner, exactly as on disk.
+    # (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
     covariance: FloatArray
 
     @property
@@ -113,17 +109,11 @@ Covariance = Annotated[FloatArray, Array((-1, -1), _covariance_fault)]
 
 @dataclass(frozen=True, eq=False)
 class PoseForm:
-    """Transform in several redundant forms for readers.
+    """Transform in several redundant forms for readers."""
 
-    Attributes:
-        matrix: (4, 4), its translation in metres.
-        quaternion_xyzw: (4,) its rotation.
-        translation_m: (3,) its translation [m].
-    """
-
-    matrix: Annotated[FloatArray, Array((4, 4))]
-    quaternion_xyzw: Annotated[FloatArray, Array((4,))]
-    translation_m: Annotated[FloatArray, Array((3,))]
+    matrix: Annotated[FloatArray, Array((4, 4))]  # (4, 4), its translation in metres.
+    quaternion_xyzw: Annotated[FloatArray, Array((4,))]  # (4,) its rotation.
+    translation_m: Annotated[FloatArray, Array((3,))]  # (3,) its translation [m].
 
     @classmethod
     def of(cls, matrix: FloatArray) -> "PoseForm":
@@ -163,17 +153,12 @@ class PoseForm:
 
 @dataclass(frozen=True, eq=False)
 class EdgeForm(PoseForm):
-    """Transform with its covariance.
+    """Transform with its covariance."""
 
-    Attributes:
-        covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
-        sigma_mm: Root of the trace of the translation's covariance [mm].
-        sigma_deg: Root of the trace of the rotation's covariance [deg].
-    """
-
+    # (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
     covariance: Annotated[FloatArray, Array((6, 6), _covariance_fault)]
-    sigma_mm: float
-    sigma_deg: float
+    sigma_mm: float  # Root of the trace of the translation's covariance [mm].
+    sigma_deg: float  # Root of the trace of the rotation's covariance [deg].
 
 
 def _edge_form(edge: Edge) -> EdgeForm:

@@ -14,22 +14,15 @@ _SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """Observations and predictions of one view, for report and recording.
+    """Observations and predictions of one view, for report and recording."""
 
-    Attributes:
-        view: The view's number.
-        corners: The detected corners, if any.
-        predicted_px: (n, 2) projection of these corners by the calibrated chain [px].
-        base_from_flange: (4, 4) as reported by the controller, or by the calibrated arm where there
-            is one.
-        cam_from_target: (4, 4) as estimated from this view alone.
-    """
-
-    view: int
-    corners: Corners | None = None
+    view: int  # The view's number.
+    corners: Corners | None = None  # The detected corners, if any.
+    # (n, 2) projection of these corners by the calibrated chain [px].
     predicted_px: FloatArray | None = None
+    # (4, 4) as reported by the controller, or by the calibrated arm where there is one.
     base_from_flange: FloatArray | None = None
-    cam_from_target: FloatArray | None = None
+    cam_from_target: FloatArray | None = None  # (4, 4) as estimated from this view alone.
 
 
 def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:

@@ -31,81 +31,46 @@ _MODEL_SCORE = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRow:
-    """Result of one session of a batch; absent texts are empty and absent figures None.
+    """Result of one session of a batch; absent texts are empty and absent figures None."""
 
-    Attributes:
-        name: Name of the session and of its result's folder.
-        session: Path of the session.
-        state: `done`, `kept` of an earlier run, or `failed`.
-        verdict: good, check or bad.
-        words: The verdict's first sentence, or why there is no result.
-        error: Class of the error.
-        next_step: Remedy of the error.
-        session_sha256: Digest of the session.
-        visioncal: Version that calibrated it.
-        created: Time of creation, ISO 8601.
-        robot: Model of the robot.
-        mount: Mount of the camera.
-        camera: Size of its images.
-        views: Number of views.
-        used: Number of views in the fit.
-        residual_mm: Root mean square residual of these [mm].
-        residual_deg: The same in rotation [deg].
-        residual_px: The same of corners [px].
-        noise_mm: Noise of the robot's position per axis, or of robot and camera combined [mm].
-        noise_deg: The same in rotation [deg].
-        noise_px: Noise of a corner [px].
-        sigma_mm: Sigma of the camera's position [mm].
-        sigma_deg: Sigma of its rotation [deg].
-        radius95_mm: Error of located points that 95 % do not exceed, where the views look [mm].
-        arm_mm: Standard deviation of the arm's link errors [mm].
-        drift_mm: Largest thermal drift of the arm [mm].
-        focal_px: Mean focal length [px].
-        error_mm: True error of the camera's position, in a simulated cell [mm].
-        seconds: Duration of the calibration [s].
-        has_picture: Whether its folder has a picture.
-        has_report: Whether its folder has a report.
-        score: Largest robust standard score among its fleet; 0 within the limit.
-        stands_out: What the score is of, in words.
-        changed: Whether its result differs from an earlier one by more than that one's sigmas.
-        change: What differs, in words.
-    """
-
-    name: str
-    session: str
-    state: State
-    verdict: str = ""
-    words: str = ""
-    error: str = ""
-    next_step: str = ""
-    session_sha256: str = ""
-    visioncal: str = ""
-    created: str = ""
-    robot: str = ""
-    mount: str = ""
-    camera: str = ""
-    views: int | None = None
-    used: int | None = None
-    residual_mm: float | None = None
-    residual_deg: float | None = None
-    residual_px: float | None = None
+    name: str  # Name of the session and of its result's folder.
+    session: str  # Path of the session.
+    state: State  # `done`, `kept` of an earlier run, or `failed`.
+    verdict: str = ""  # good, check or bad.
+    words: str = ""  # The verdict's first sentence, or why there is no result.
+    error: str = ""  # Class of the error.
+    next_step: str = ""  # Remedy of the error.
+    session_sha256: str = ""  # Digest of the session.
+    visioncal: str = ""  # Version that calibrated it.
+    created: str = ""  # Time of creation, ISO 8601.
+    robot: str = ""  # Model of the robot.
+    mount: str = ""  # Mount of the camera.
+    camera: str = ""  # Size of its images.
+    views: int | None = None  # Number of views.
+    used: int | None = None  # Number of views in the fit.
+    residual_mm: float | None = None  # Root mean square residual of these [mm].
+    residual_deg: float | None = None  # The same in rotation [deg].
+    residual_px: float | None = None  # The same of corners [px].
+    # Noise of the robot's position per axis, or of robot and camera combined [mm].
     noise_mm: float | None = None
-    noise_deg: float | None = None
-    noise_px: float | None = None
-    sigma_mm: float | None = None
-    sigma_deg: float | None = None
+    noise_deg: float | None = None  # The same in rotation [deg].
+    noise_px: float | None = None  # Noise of a corner [px].
+    sigma_mm: float | None = None  # Sigma of the camera's position [mm].
+    sigma_deg: float | None = None  # Sigma of its rotation [deg].
+    # Error of located points that 95 % do not exceed, where the views look [mm].
     radius95_mm: float | None = None
-    arm_mm: float | None = None
-    drift_mm: float | None = None
-    focal_px: float | None = None
-    error_mm: float | None = None
-    seconds: float | None = None
-    has_picture: bool = False
-    has_report: bool = False
-    score: float = 0.0
-    stands_out: str = ""
+    arm_mm: float | None = None  # Standard deviation of the arm's link errors [mm].
+    drift_mm: float | None = None  # Largest thermal drift of the arm [mm].
+    focal_px: float | None = None  # Mean focal length [px].
+    error_mm: float | None = None  # True error of the camera's position, in a simulated cell [mm].
+    seconds: float | None = None  # Duration of the calibration [s].
+    has_picture: bool = False  # Whether its folder has a picture.
+    has_report: bool = False  # Whether its folder has a report.
+    score: float = 0.0  # Largest robust standard score among its fleet; 0 within the limit.
+    stands_out: str = ""  # What the score is of, in words.
+    # Whether its result differs from an earlier one by more than that one's sigmas.
     changed: bool | None = None
-    change: str = ""
+    change: str = ""  # What differs, in words.
 
     @property
     def group(self) -> str:
@@ -159,25 +124,15 @@ def camera_edge(calibration: Calibration) -> str:
 
 @dataclass(frozen=True)
 class CellFigures:
-    """Statistics of simulated cells of one group; None where none has a result.
+    """Statistics of simulated cells of one group; None where none has a result."""
 
-    Attributes:
-        name: The group.
-        count: Number of cells.
-        results: Number with a result.
-        good: Number with the verdict good.
-        radius95_mm: Median of the predicted 95 % radius [mm].
-        sigma_mm: Median of the camera position's sigma [mm].
-        error_mm: 95 % quantile of the camera position's true error [mm].
-    """
-
-    name: str
-    count: int
-    results: int
-    good: int
-    radius95_mm: float | None
-    sigma_mm: float | None
-    error_mm: float | None
+    name: str  # The group.
+    count: int  # Number of cells.
+    results: int  # Number with a result.
+    good: int  # Number with the verdict good.
+    radius95_mm: float | None  # Median of the predicted 95 % radius [mm].
+    sigma_mm: float | None  # Median of the camera position's sigma [mm].
+    error_mm: float | None  # 95 % quantile of the camera position's true error [mm].
 
 
 def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
@@ -206,21 +161,13 @@ def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
 
 @dataclass(frozen=True)
 class _Measure:
-    """Figure that is compared among the sessions of a fleet.
+    """Figure that is compared among the sessions of a fleet."""
 
-    Attributes:
-        words: Its name in messages.
-        unit: Its unit.
-        spread: Smallest standard deviation of its logarithm.
-        is_worse_above: Whether only large values are outliers.
-        most: Largest value that is possible, whatever the rest of the fleet has.
-    """
-
-    words: str
-    unit: str
-    spread: float = _SPREAD
-    is_worse_above: bool = True
-    most: float = math.inf
+    words: str  # Its name in messages.
+    unit: str  # Its unit.
+    spread: float = _SPREAD  # Smallest standard deviation of its logarithm.
+    is_worse_above: bool = True  # Whether only large values are outliers.
+    most: float = math.inf  # Largest value that is possible, whatever the rest of the fleet has.
 
 
 _MEASURES: Mapping[str, _Measure] = {

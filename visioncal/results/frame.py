@@ -17,62 +17,38 @@ _SCHEMA = 1
 
 @dataclass(frozen=True)
 class Observation:
-    """One touch, point or view of a frame's fit.
+    """One touch, point or view of a frame's fit."""
 
-    Attributes:
-        name: The row's view number, or the point's name.
-        used: Whether the fit used it.
-        reason: Why it is an outlier or in doubt, in words; else empty.
-        kind: Kind of the touch, as `point`, `z`, `xz`; else empty.
-        residual_mm: Its residual [mm]; None where unknown.
-    """
-
-    name: str
-    used: bool
-    reason: Annotated[str, KEPT] = ""
-    kind: Annotated[str, KEPT] = ""
-    residual_mm: float | None = None
+    name: str  # The row's view number, or the point's name.
+    used: bool  # Whether the fit used it.
+    reason: Annotated[str, KEPT] = ""  # Why it is an outlier or in doubt, in words; else empty.
+    kind: Annotated[str, KEPT] = ""  # Kind of the touch, as `point`, `z`, `xz`; else empty.
+    residual_mm: float | None = None  # Its residual [mm]; None where unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Pose of a tool on the flange, or of a fixture in the base.
+    """Pose of a tool on the flange, or of a fixture in the base."""
 
-    Attributes:
-        edge: `flange_from_tool` or `base_from_fixture`.
-        oriented: Whether the rotation was measured; else it is declared as the parent's, and has no
-            covariance.
-        method: Description of the method.
-        source: Name of the file or session it was estimated from.
-        created: Time of creation, ISO 8601.
-        rms_mm: Root mean square residual of the used observations [mm].
-        noise_mm: Estimated standard deviation of one observation, per axis [mm].
-        observations: One entry for each touch, point or view.
-        verdict: Verdict with its reasons.
-        details: Further figures of the method.
-    """
-
-    edge: Annotated[StoredEdge, INLINE]
+    edge: Annotated[StoredEdge, INLINE]  # `flange_from_tool` or `base_from_fixture`.
+    # Whether the rotation was measured; else it is declared as the parent's, and has no covariance.
     oriented: bool
-    method: str
-    source: str
-    created: str
-    rms_mm: float
-    noise_mm: float
-    observations: tuple[Observation, ...]
-    verdict: StoredVerdict
+    method: str  # Description of the method.
+    source: str  # Name of the file or session it was estimated from.
+    created: str  # Time of creation, ISO 8601.
+    rms_mm: float  # Root mean square residual of the used observations [mm].
+    noise_mm: float  # Estimated standard deviation of one observation, per axis [mm].
+    observations: tuple[Observation, ...]  # One entry for each touch, point or view.
+    verdict: StoredVerdict  # Verdict with its reasons.
+    # Further figures of the method.
     details: Annotated[Mapping[str, Any], KEPT] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFile:
-    """File of frames without a calibration, for a robot without a camera.
+    """File of frames without a calibration, for a robot without a camera."""
 
-    Attributes:
-        frames: The frames by transform name.
-    """
-
-    frames: Mapping[str, Frame]
+    frames: Mapping[str, Frame]  # The frames by transform name.
 
     def save(self, path: Path | str) -> None:
         """Writes the file atomically."""

@@ -47,29 +47,18 @@ class LensField(Section):
 
     A pixel's displacement is linear in m coefficients with unit prior variance, those of the smooth
     field first, then that of breathing: see `estimation.lens_field`.
-
-    Attributes:
-        field_px: Prior standard deviation of the smooth field, per axis [px].
-        length: Its correlation length, as a share of the image's width.
-        breathing: Standard deviation of the relative change of the focal length as the distance
-            doubles.
-        jitter: Standard deviation of its relative change from view to view.
-        distance_m: Mean distance of the views, the reference of breathing [m].
-        coefficients: (m,) estimated coefficients.
-        root: (m, r) square root of their covariance, `root root^T`.
-        intrinsics_covariance: (m, k) cross-covariance with matrix and distortion.
-        edge_covariance: (m, 6 e) cross-covariance with the transforms in the order of
-            `joint_covariance`.
     """
 
-    field_px: float
-    length: float
+    field_px: float  # Prior standard deviation of the smooth field, per axis [px].
+    length: float  # Its correlation length, as a share of the image's width.
+    # Standard deviation of the relative change of the focal length as the distance doubles.
     breathing: float
-    jitter: float
-    distance_m: float
-    coefficients: Vector
-    root: Matrix
-    intrinsics_covariance: Matrix
+    jitter: float  # Standard deviation of its relative change from view to view.
+    distance_m: float  # Mean distance of the views, the reference of breathing [m].
+    coefficients: Vector  # (m,) estimated coefficients.
+    root: Matrix  # (m, r) square root of their covariance, `root root^T`.
+    intrinsics_covariance: Matrix  # (m, k) cross-covariance with matrix and distortion.
+    # (m, 6 e) cross-covariance with the transforms in the order of `joint_covariance`.
     edge_covariance: Matrix
 
     def columns(self, camera: Camera, px: FloatArray, distance_m: float | None) -> FloatArray:
@@ -87,19 +76,12 @@ class LensField(Section):
 
 @dataclass(frozen=True, eq=False)
 class CameraForm:
-    """Intrinsics of a camera.
+    """Intrinsics of a camera."""
 
-    Attributes:
-        model: `brown` or `fisheye`.
-        resolution: Width and height [px].
-        matrix: fx, fy, cx, cy [px].
-        distortion: The coefficients in OpenCV's order.
-    """
-
-    model: CameraKind
-    resolution: tuple[int, int]
-    matrix: Annotated[FloatArray, Array((4,))]
-    distortion: Vector
+    model: CameraKind  # `brown` or `fisheye`.
+    resolution: tuple[int, int]  # Width and height [px].
+    matrix: Annotated[FloatArray, Array((4,))]  # fx, fy, cx, cy [px].
+    distortion: Vector  # The coefficients in OpenCV's order.
 
 
 _StoredCamera = Annotated[
@@ -115,21 +97,16 @@ _StoredCamera = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class CameraResult:
-    """Camera of a result.
+    """Camera of a result."""
 
-    Attributes:
-        camera: The intrinsics.
-        estimated: Whether they were estimated from this session's images.
-        covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
-        edge_covariance: (k, 6 e) cross-covariance of these with the calibration's edges in the
-            order of `joint_covariance`, where both were estimated together.
-        field: Displacement field beyond the lens model; None where it is not significant.
-    """
-
-    camera: _StoredCamera
-    estimated: bool
+    camera: _StoredCamera  # The intrinsics.
+    estimated: bool  # Whether they were estimated from this session's images.
+    # (k, k) of fx, fy, cx, cy and the distortion, where estimated.
     covariance: Covariance | None = None
+    # (k, 6 e) cross-covariance of these with the calibration's edges in the order of
+    # `joint_covariance`, where both were estimated together.
     edge_covariance: Matrix | None = None
+    # Displacement field beyond the lens model; None where it is not significant.
     field: LensField | None = None
 
     def __post_init__(self) -> None:
@@ -218,17 +195,11 @@ class CameraResult:
 
 @dataclass(frozen=True, eq=False)
 class RefittedLens:
-    """Matrix and coefficients that approximate a lens with its field.
+    """Matrix and coefficients that approximate a lens with its field."""
 
-    Attributes:
-        camera: The approximating intrinsics.
-        rms_px: Remaining displacement where the field was observed (rms), per axis [px].
-        most_px: Largest remaining displacement there, per axis [px].
-    """
-
-    camera: Camera
-    rms_px: float = 0.0
-    most_px: float = 0.0
+    camera: Camera  # The approximating intrinsics.
+    rms_px: float = 0.0  # Remaining displacement where the field was observed (rms), per axis [px].
+    most_px: float = 0.0  # Largest remaining displacement there, per axis [px].
 
 
 def fit_coefficients(lens: CameraResult) -> RefittedLens:
@@ -278,15 +249,10 @@ def image_grid(camera: Camera, share: float = 1.0) -> FloatArray:
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """Tilt of the sensor that a lens's decentring stands for.
+    """Tilt of the sensor that a lens's decentring stands for."""
 
-    Attributes:
-        rad: Angle between the optical axes of the lens model and of one with a tilted sensor.
-        sigma_rad: Its standard deviation by that of the decentring; 0 for a given lens.
-    """
-
-    rad: float
-    sigma_rad: float
+    rad: float  # Angle between the optical axes of the lens model and of one with a tilted sensor.
+    sigma_rad: float  # Its standard deviation by that of the decentring; 0 for a given lens.
 
 
 def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
@@ -365,18 +331,13 @@ class RayFrame(Section):
 
     For another lens model of the same camera, the camera's transform is `transform` times the
     inverse of that model's `cam_from_ray`.
-
-    Attributes:
-        name: Name of the transform, such as `flange_from_ray`.
-        px: (2,) the image's centre [px].
-        cam_from_ray: (4, 4) the smallest rotation of the camera's z axis into that pixel's ray.
-        transform: The camera's transform times `cam_from_ray`, with covariance of both.
     """
 
-    name: str
-    px: Annotated[FloatArray, Array((2,))]
+    name: str  # Name of the transform, such as `flange_from_ray`.
+    px: Annotated[FloatArray, Array((2,))]  # (2,) the image's centre [px].
+    # (4, 4) the smallest rotation of the camera's z axis into that pixel's ray.
     cam_from_ray: StoredPose
-    transform: StoredEdge
+    transform: StoredEdge  # The camera's transform times `cam_from_ray`, with covariance of both.
 
 
 def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:

@@ -48,16 +48,11 @@ class SessionForm:
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """Result of one solver with the used views.
+    """Result of one solver with the used views."""
 
-    Attributes:
-        matrices: (4, 4) both edges by name.
-        rms_mm: Scatter of the target's position over the used views [mm].
-        rms_deg: Scatter of its orientation [deg]; None where only positions were read.
-    """
-
-    matrices: Annotated[Mapping[str, StoredPose], REST]
-    rms_mm: float
+    matrices: Annotated[Mapping[str, StoredPose], REST]  # (4, 4) both edges by name.
+    rms_mm: float  # Scatter of the target's position over the used views [mm].
+    # Scatter of its orientation [deg]; None where only positions were read.
     rms_deg: float | None = None
 
     @property
@@ -68,13 +63,9 @@ class SolverResult:
 
 @dataclass(frozen=True, eq=False)
 class RobotResult(ArmSections):
-    """A robot of a whole cell, with the sections on its arm.
+    """A robot of a whole cell, with the sections on its arm."""
 
-    Attributes:
-        model: Its nominal model, where known.
-    """
-
-    model: Annotated[Robot | None, _ROBOT_FORM, REST] = None
+    model: Annotated[Robot | None, _ROBOT_FORM, REST] = None  # Its nominal model, where known.
 
 
 @dataclass(frozen=True)
@@ -88,17 +79,11 @@ class Picker:
 
 @dataclass(frozen=True)
 class NeedMet:
-    """Required accuracy of picks, and the probability of meeting it.
+    """Required accuracy of picks, and the probability of meeting it."""
 
-    Attributes:
-        need: The required accuracy.
-        probability: Probability that a pick meets it; in a whole cell, of the worst pair.
-        pairs: The pairs of camera and robot of a whole cell; else empty.
-    """
-
-    need: Annotated[Need, INLINE]
-    probability: float
-    pairs: tuple[Picker, ...] = ()
+    need: Annotated[Need, INLINE]  # The required accuracy.
+    probability: float  # Probability that a pick meets it; in a whole cell, of the worst pair.
+    pairs: tuple[Picker, ...] = ()  # The pairs of camera and robot of a whole cell; else empty.
 
     def of(self, camera: str, robot: str) -> "NeedMet":
         """The probability of one camera and robot; of all where they are no pair."""
@@ -108,21 +93,14 @@ class NeedMet:
 
 @dataclass(frozen=True, kw_only=True)
 class CauseForm:
-    """Probable cause why a result is not good.
+    """Probable cause why a result is not good."""
 
-    Attributes:
-        cause: Its short, stable name.
-        probability: Its probability.
-        sentence: Description with figures.
-        without_it: The result without this cause, in a sentence; absent where not computed.
-        do: Remedy, with a command where there is one.
-    """
-
-    cause: str
-    probability: float
-    sentence: str
+    cause: str  # Its short, stable name.
+    probability: float  # Its probability.
+    sentence: str  # Description with figures.
+    # The result without this cause, in a sentence; absent where not computed.
     without_it: Annotated[str, DROPPED] = ""
-    do: Annotated[str, DROPPED] = ""
+    do: Annotated[str, DROPPED] = ""  # Remedy, with a command where there is one.
 
     @classmethod
     def of(cls, finding: Finding) -> "CauseForm":
@@ -138,24 +116,17 @@ class CauseForm:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictForm:
-    """Verdict of a result.
+    """Verdict of a result."""
 
-    Attributes:
-        status: good, check or bad.
-        reasons: Its reasons, in sentences.
-        good_for_mm: Smallest need that it would be good for [mm]; absent where there is none.
-        good_for_mm_uncorrected: The same by the controller's own poses, where the arm was
-            calibrated along; `good_for_mm` then is for corrected targets.
-        causes: Probable causes why it is not good, most probable first.
-        findings: The findings behind the reasons.
-    """
-
-    status: VerdictStatus
-    reasons: tuple[str, ...]
+    status: VerdictStatus  # good, check or bad.
+    reasons: tuple[str, ...]  # Its reasons, in sentences.
+    # Smallest need that it would be good for [mm]; absent where there is none.
     good_for_mm: float | None = None
+    # The same by the controller's own poses, where the arm was calibrated along; `good_for_mm` then
+    # is for corrected targets.
     good_for_mm_uncorrected: float | None = None
-    causes: tuple[CauseForm, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    causes: tuple[CauseForm, ...] = ()  # Probable causes why it is not good, most probable first.
+    findings: tuple[Finding, ...] = ()  # The findings behind the reasons.
 
     @classmethod
     def of(cls, verdict: Verdict) -> "VerdictForm":

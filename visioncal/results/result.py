@@ -56,44 +56,28 @@ class Calibration(CalibrationSections):
     One camera, one robot and their targets have no names; those of a whole cell are in `cell`.
 
     It also has all attributes of `CalibrationSections` and `ArmSections`.
-
-    Attributes:
-        session_name: The session's name.
-        session_sha256: Digest of the session's canonical content.
-        created: Time of creation, ISO 8601.
-        mount: Mount of the camera.
-        edges: Estimated transforms by name, in the order of `joint_covariance`.
-        joint_covariance: (6 k, 6 k) joint covariance of all edges, in that order.
-        solvers: Result of every solver.
-        noise: Estimated standard deviations by name.
-        views: One entry for each view of the session.
-        rms: Residuals over the used views.
-        validation: Residuals of left-out views.
-        verdict: Verdict with its reasons.
-        camera: The camera, where the session has one.
-        robot: The nominal robot model, where the session names a known one.
-        frames: Tools and fixtures by transform name, as `flange_from_tool`.
-        cell: Cameras, robots and targets of a whole cell by name; None for one camera and robot.
-            `of` selects one of each.
-        need: Required accuracy of picks, and the probability of meeting it; None where not stated.
     """
 
-    session_name: str
-    session_sha256: str
-    created: str
-    mount: Mount
-    edges: Mapping[str, Edge]
-    joint_covariance: FloatArray
-    solvers: Mapping[str, SolverResult]
-    noise: Mapping[str, float]
-    views: tuple[ViewResult, ...]
-    rms: Rms
-    validation: Validation
-    verdict: Verdict
-    camera: CameraResult | None = None
-    robot: Robot | None = None
+    session_name: str  # The session's name.
+    session_sha256: str  # Digest of the session's canonical content.
+    created: str  # Time of creation, ISO 8601.
+    mount: Mount  # Mount of the camera.
+    edges: Mapping[str, Edge]  # Estimated transforms by name, in the order of `joint_covariance`.
+    joint_covariance: FloatArray  # (6 k, 6 k) joint covariance of all edges, in that order.
+    solvers: Mapping[str, SolverResult]  # Result of every solver.
+    noise: Mapping[str, float]  # Estimated standard deviations by name.
+    views: tuple[ViewResult, ...]  # One entry for each view of the session.
+    rms: Rms  # Residuals over the used views.
+    validation: Validation  # Residuals of left-out views.
+    verdict: Verdict  # Verdict with its reasons.
+    camera: CameraResult | None = None  # The camera, where the session has one.
+    robot: Robot | None = None  # The nominal robot model, where the session names a known one.
+    # Tools and fixtures by transform name, as `flange_from_tool`.
     frames: Mapping[str, Frame] = field(default_factory=dict)
+    # Cameras, robots and targets of a whole cell by name; None for one camera and robot. `of`
+    # selects one of each.
     cell: CellResult | None = None
+    # Required accuracy of picks, and the probability of meeting it; None where not stated.
     need: NeedMet | None = None
 
     @cached_property

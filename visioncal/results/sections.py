@@ -23,44 +23,30 @@ Intervals = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, kw_only=True)
 class ClockResult(Section):
-    """Clock offset between camera and robot: `clock` in calibration.json.
+    """Clock offset between camera and robot: `clock` in calibration.json."""
 
-    Attributes:
-        camera_minus_robot_s: The offset [s].
-        method: `motion`: estimated; `turning`: estimated from rotations alone; `stated` by the
-            session; `rest`: without effect, since the robot stood still.
-        sigma_s: Its standard deviation [s]; None for views at rest.
-        stated_s: The stated offset [s]; None where there is none.
-        frames: Number of frames in motion that it was estimated from; None for none.
-        correlation: Correlation of the rotation angles of camera and robot; None where unknown.
-        shutter: Readout times of an image's rows; None where not estimated.
-    """
-
-    camera_minus_robot_s: float
+    camera_minus_robot_s: float  # The offset [s].
+    # `motion`: estimated; `turning`: estimated from rotations alone; `stated` by the session;
+    # `rest`: without effect, since the robot stood still.
     method: Literal["motion", "turning", "stated", "rest"]
-    sigma_s: float | None = None
-    stated_s: float | None = None
+    sigma_s: float | None = None  # Its standard deviation [s]; None for views at rest.
+    stated_s: float | None = None  # The stated offset [s]; None where there is none.
+    # Number of frames in motion that it was estimated from; None for none.
     frames: int | None = None
+    # Correlation of the rotation angles of camera and robot; None where unknown.
     correlation: float | None = None
-    shutter: Shutter | None = None
+    shutter: Shutter | None = None  # Readout times of an image's rows; None where not estimated.
 
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentResult(Section):
-    """Instrument of the session: `instrument` in calibration.json.
+    """Instrument of the session: `instrument` in calibration.json."""
 
-    Attributes:
-        words: Description of the instrument.
-        reads: `poses`, or `places` for positions.
-        sigma_m: Standard deviation of a coordinate at zero distance [m].
-        sigma_per_m: Its growth with the distance [m/m].
-        sigma_rad: Standard deviation of a rotation [rad]; None where positions were read.
-    """
-
-    words: str
-    reads: Literal["poses", "places"]
-    sigma_m: float
-    sigma_per_m: float
+    words: str  # Description of the instrument.
+    reads: Literal["poses", "places"]  # `poses`, or `places` for positions.
+    sigma_m: float  # Standard deviation of a coordinate at zero distance [m].
+    sigma_per_m: float  # Its growth with the distance [m/m].
+    # Standard deviation of a rotation [rad]; None where positions were read.
     sigma_rad: float | None = None
 
 
@@ -77,21 +63,15 @@ class PointResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardResult(Section):
-    """Estimated shape of a board: `board`, or an entry of `boards`, in calibration.json.
+    """Estimated shape of a board: `board`, or an entry of `boards`, in calibration.json."""
 
-    Attributes:
-        shape: Deviation from the stated shape by the names of `estimation.BOARD_NAMES`: `scale` and
-            `aspect` are relative, `shear` is the deficit of the angle between rows and columns from
-            a right angle [rad], bows are at the board's edge [m].
-        sigma: Standard deviations of the free parameters.
-        estimated: Names of the parameters that were estimated.
-        bend_mm: Range of its corners' depths [mm].
-    """
-
+    # Deviation from the stated shape by the names of `estimation.BOARD_NAMES`: `scale` and `aspect`
+    # are relative, `shear` is the deficit of the angle between rows and columns from a right angle
+    # [rad], bows are at the board's edge [m].
     shape: Mapping[str, float]
-    sigma: Mapping[str, float]
-    estimated: tuple[str, ...]
-    bend_mm: float
+    sigma: Mapping[str, float]  # Standard deviations of the free parameters.
+    estimated: tuple[str, ...]  # Names of the parameters that were estimated.
+    bend_mm: float  # Range of its corners' depths [mm].
 
     def __post_init__(self) -> None:
         for name in BOARD_NAMES:
@@ -121,15 +101,11 @@ class BoardResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigResult(Section):
-    """Estimated shape of a rig of points: `rig`, or an entry of `rigs`, in calibration.json.
+    """Estimated shape of a rig of points: `rig`, or an entry of `rigs`, in calibration.json."""
 
-    Attributes:
-        shape: (n, 3) deviations of its points from the stated positions [m].
-        sigma: (n, 3) their standard deviations [m].
-    """
-
+    # (n, 3) deviations of its points from the stated positions [m].
     shape: Annotated[FloatArray, Array((-1, 3))]
-    sigma: Annotated[FloatArray, Array((-1, 3))]
+    sigma: Annotated[FloatArray, Array((-1, 3))]  # (n, 3) their standard deviations [m].
 
     @property
     def values(self) -> FloatArray:
@@ -139,26 +115,20 @@ class RigResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UncertaintyResult(Section):
-    """Uncertainty of a point located where the views look: `uncertainty` in calibration.json.
+    """Uncertainty of a point located where the views look: `uncertainty` in calibration.json."""
 
-    Attributes:
-        point_cam_m: (3,) the point in the camera's frame [m].
-        distances_m: (2,) least and greatest distance from the camera at which views looked [m];
-            absent where unknown.
-        budget_mm: Standard deviation by source, and their `total` [mm].
-        radius95_mm: Radius that 95 % of errors do not exceed [mm].
-        noise_95: 95 % intervals of the noise levels, by their names in `Calibration.noise`.
-        spectrum: (12,) standard deviations along the principal directions of both transforms,
-            ascending, in units of the largest accepted ones.
-        inflation: Factor on the covariance for the correlation of neighbouring stops' errors.
-    """
-
-    point_cam_m: Annotated[FloatArray, Array((3,))]
-    budget_mm: Mapping[str, float]
-    radius95_mm: float
+    point_cam_m: Annotated[FloatArray, Array((3,))]  # (3,) the point in the camera's frame [m].
+    budget_mm: Mapping[str, float]  # Standard deviation by source, and their `total` [mm].
+    radius95_mm: float  # Radius that 95 % of errors do not exceed [mm].
+    # 95 % intervals of the noise levels, by their names in `Calibration.noise`.
     noise_95: Intervals
+    # (12,) standard deviations along the principal directions of both transforms, ascending, in
+    # units of the largest accepted ones.
     spectrum: Vector
+    # Factor on the covariance for the correlation of neighbouring stops' errors.
     inflation: float = 1.0
+    # (2,) least and greatest distance from the camera at which views looked [m]; absent where
+    # unknown.
     distances_m: Annotated[FloatArray, Array((2,))] | None = None
 
     def __post_init__(self) -> None:
@@ -190,189 +160,129 @@ class UncertaintyResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseIntervals(Section):
-    """`uncertainty` of a part of a whole cell.
+    """`uncertainty` of a part of a whole cell."""
 
-    Attributes:
-        noise_95: See `UncertaintyResult`.
-    """
-
-    noise_95: Intervals
+    noise_95: Intervals  # See `UncertaintyResult`.
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellUncertainty(Section):
-    """Uncertainty of a whole cell: its `uncertainty` in calibration.json.
+    """Uncertainty of a whole cell: its `uncertainty` in calibration.json."""
 
-    Attributes:
-        budget_mm: By transform, the standard deviation of its frame's position by source, and their
-            `total` [mm].
-        noise_95: 95 % intervals of the noise levels, by robot and by name.
-    """
-
+    # By transform, the standard deviation of its frame's position by source, and their `total`
+    # [mm].
     budget_mm: Mapping[str, Mapping[str, float]]
+    # 95 % intervals of the noise levels, by robot and by name.
     noise_95: Mapping[str, Intervals] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedArm:
-    """Arm error parameters of a fit.
+    """Arm error parameters of a fit."""
 
-    Attributes:
-        of: Kind of the parameters: errors of the reported `poses`, of all `links`, or parameters of
-            the calibrated `model`.
-        values: (k,) estimates, zero for the nominal arm.
-        weights: For a model, prior standard deviations by parameter block.
-        flange_from_reported: (4, 4) for a model, the reported frame in its flange's frame.
-        by_stop: (k,) for a model, parameters of errors by the loads of a stop.
-        torque_nm: Torque that `by_stop` is for [N m].
-        yielding: (n,) mask of joints with compliance.
-        weight_functions: (4 n, r) for each joint, a basis of the effect of its links' weight (see
-            `robot.WeightFunctions`).
-    """
-
+    # Kind of the parameters: errors of the reported `poses`, of all `links`, or parameters of the
+    # calibrated `model`.
     of: Literal["poses", "links", "model"]
-    values: Vector
+    values: Vector  # (k,) estimates, zero for the nominal arm.
+    # For a model, prior standard deviations by parameter block.
     weights: Mapping[str, float] | None = None
+    # (4, 4) for a model, the reported frame in its flange's frame.
     flange_from_reported: Annotated[FloatArray, Array((4, 4))] | None = None
-    by_stop: Vector | None = None
-    torque_nm: float | None = None
-    yielding: Annotated[Mask, Array((-1,))] | None = None
+    by_stop: Vector | None = None  # (k,) for a model, parameters of errors by the loads of a stop.
+    torque_nm: float | None = None  # Torque that `by_stop` is for [N m].
+    yielding: Annotated[Mask, Array((-1,))] | None = None  # (n,) mask of joints with compliance.
+    # (4 n, r) for each joint, a basis of the effect of its links' weight (see
+    # `robot.WeightFunctions`).
     weight_functions: tuple[Matrix, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointFit(Section):
-    """Parameters of the fit and their covariance, for verification: `joint_fit`.
+    """Parameters of the fit and their covariance, for verification: `joint_fit`."""
 
-    Attributes:
-        targets: Documents of the targets, by name.
-        boards: Names of the targets that the fit places; empty without a target.
-        looks: Indices of the free parameters of lens and targets.
-        arm: The arm's errors; None where none were estimated.
-        covariance: (k, k) of both transforms, of lens and targets, of further targets' poses
-            relative to the first, and of the arm's errors.
-    """
-
-    targets: Mapping[str, Any]
-    boards: tuple[str, ...]
-    looks: tuple[int, ...]
-    arm: FittedArm | None = None
+    targets: Mapping[str, Any]  # Documents of the targets, by name.
+    boards: tuple[str, ...]  # Names of the targets that the fit places; empty without a target.
+    looks: tuple[int, ...]  # Indices of the free parameters of lens and targets.
+    arm: FittedArm | None = None  # The arm's errors; None where none were estimated.
+    # (k, k) of both transforms, of lens and targets, of further targets' poses relative to the
+    # first, and of the arm's errors.
     covariance: Covariance
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellJointFit(Section):
-    """Parameters of a whole cell's fit and their covariance: its `joint_fit`.
+    """Parameters of a whole cell's fit and their covariance: its `joint_fit`."""
 
-    Attributes:
-        cameras: Indices of each camera's free lens parameters, by name.
-        targets: Indices of each target's free shape parameters, by name.
-        arms: Errors of each calibrated arm, by robot.
-        covariance: (k, k) of the transforms, then of cameras, targets and arms.
-    """
-
+    # Indices of each camera's free lens parameters, by name.
     cameras: Mapping[str, tuple[int, ...]]
+    # Indices of each target's free shape parameters, by name.
     targets: Mapping[str, tuple[int, ...]]
+    # Errors of each calibrated arm, by robot.
     arms: Mapping[str, FittedArm] = field(default_factory=dict)
-    covariance: Covariance
+    covariance: Covariance  # (k, k) of the transforms, then of cameras, targets and arms.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageBlur:
-    """Blur of an image.
+    """Blur of an image."""
 
-    Attributes:
-        view: The view's number.
-        sigma_px: Standard deviation of the blur of lens and defocus [px].
-        motion_px: Length of the motion blur [px].
-        motion_deg: Its direction, from the image's x [deg].
-        pixel_noise: Standard deviation of a pixel, once the image is reduced [grey levels].
-    """
-
-    view: int
-    sigma_px: float
-    motion_px: float
-    motion_deg: float
-    pixel_noise: float
+    view: int  # The view's number.
+    sigma_px: float  # Standard deviation of the blur of lens and defocus [px].
+    motion_px: float  # Length of the motion blur [px].
+    motion_deg: float  # Its direction, from the image's x [deg].
+    pixel_noise: float  # Standard deviation of a pixel, once the image is reduced [grey levels].
 
 
 @dataclass(frozen=True, kw_only=True)
 class DenseResult(Section):
-    """Views whose corners are by all pixels of their images: `dense`.
+    """Views whose corners are by all pixels of their images: `dense`."""
 
-    Attributes:
-        images: Blur of each image.
-    """
-
-    images: tuple[ImageBlur, ...]
+    images: tuple[ImageBlur, ...]  # Blur of each image.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchedPoint(Section):
-    """Point that the camera located and the tool touched.
+    """Point that the camera located and the tool touched."""
 
-    Attributes:
-        name: Name of the point on the board.
-        base_m: (3,) its located position in the base [m].
-        radius95_mm: Predicted gap that 95 % do not exceed [mm].
-        gap_mm: Measured gap between tip and point [mm].
-    """
-
-    name: str
-    base_m: Vector
-    radius95_mm: float
-    gap_mm: float
+    name: str  # Name of the point on the board.
+    base_m: Vector  # (3,) its located position in the base [m].
+    radius95_mm: float  # Predicted gap that 95 % do not exceed [mm].
+    gap_mm: float  # Measured gap between tip and point [mm].
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchTest(Section):
-    """Result of a touch test: `touch_test` in calibration.json.
+    """Result of a touch test: `touch_test` in calibration.json."""
 
-    Attributes:
-        created: Time of creation, ISO 8601.
-        tool: Name of the touching tool.
-        passed: Whether the gaps are as small as predicted.
-        points: The touched points.
-    """
-
-    created: str
-    tool: str
-    passed: bool
-    points: tuple[TouchedPoint, ...]
+    created: str  # Time of creation, ISO 8601.
+    tool: str  # Name of the touching tool.
+    passed: bool  # Whether the gaps are as small as predicted.
+    points: tuple[TouchedPoint, ...]  # The touched points.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationSections(ArmSections):
-    """Optional sections of a result; None or empty where not computed.
+    """Optional sections of a result; None or empty where not computed."""
 
-    Attributes:
-        clock: Clock offset between camera and robot.
-        instrument: The instrument that measured the flange.
-        points: The points on the flange that it measured.
-        board: Estimated shape of the only board, which has no name.
-        boards: Estimated shapes of the boards by name.
-        rig: Estimated shape of the only rig of points, which has no name.
-        rigs: Estimated shapes of the rigs by name.
-        uncertainty: Uncertainty of a point located where the views look.
-        means: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
-        joint_fit: Parameters of the fit and their covariance, for verification.
-        dense: Views whose corners are by all pixels of their images; None where not asked for.
-        touch_test: Result of a touch test.
-        further: Unknown sections, kept as they are.
-    """
-
-    clock: ClockResult | None = None
-    instrument: InstrumentResult | None = None
-    points: tuple[PointResult, ...] = ()
-    board: BoardResult | None = None
+    clock: ClockResult | None = None  # Clock offset between camera and robot.
+    instrument: InstrumentResult | None = None  # The instrument that measured the flange.
+    points: tuple[PointResult, ...] = ()  # The points on the flange that it measured.
+    board: BoardResult | None = None  # Estimated shape of the only board, which has no name.
+    # Estimated shapes of the boards by name.
     boards: Mapping[str, BoardResult] = field(default_factory=dict)
-    rig: RigResult | None = None
+    rig: RigResult | None = None  # Estimated shape of the only rig of points, which has no name.
+    # Estimated shapes of the rigs by name.
     rigs: Mapping[str, RigResult] = field(default_factory=dict)
+    # Uncertainty of a point located where the views look.
     uncertainty: UncertaintyResult | NoiseIntervals | None = None
+    # Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
     means: Mapping[str, float] = field(default_factory=dict)
+    # Parameters of the fit and their covariance, for verification.
     joint_fit: JointFit | None = None
+    # Views whose corners are by all pixels of their images; None where not asked for.
     dense: DenseResult | None = None
-    touch_test: TouchTest | None = None
+    touch_test: TouchTest | None = None  # Result of a touch test.
+    # Unknown sections, kept as they are.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
     @property
@@ -388,10 +298,7 @@ class CalibrationSections(ArmSections):
 
 @dataclass(frozen=True)
 class CellDetails(Section):
-    """Further figures of a whole cell: its `details` in calibration.json.
+    """Further figures of a whole cell: its `details` in calibration.json."""
 
-    Attributes:
-        clocks: Clock offsets by camera and robot, as `CAMERA and robot ROBOT`.
-    """
-
+    # Clock offsets by camera and robot, as `CAMERA and robot ROBOT`.
     clocks: Mapping[str, ClockResult] = field(default_factory=dict)

@@ -18,25 +18,15 @@ from visioncal.session.frames import CELL
 
 @dataclass(frozen=True, eq=False)
 class FrameTree:
-    """Tree of frames with the estimated transforms.
+    """Tree of frames with the estimated transforms."""
 
-    Attributes:
-        reference: The frame that defines the cell's frame.
-        parents: Parent of each frame, by name.
-        flanges: Robot of each flange, by the flange's frame.
-        edges: Estimated transforms by name, as `cell_from_base_b`.
-        joint_covariance: (6 k, 6 k) joint covariance of these, in their order.
-        placed: Tools and fixtures by transform name, as `flange_a_from_tool`.
-        former: Frames at the poses before they moved.
-    """
-
-    reference: str
-    parents: Mapping[str, str]
-    flanges: Mapping[str, str]
-    edges: Mapping[str, Edge]
-    joint_covariance: FloatArray
-    placed: Mapping[str, Frame]
-    former: frozenset[str] = frozenset()
+    reference: str  # The frame that defines the cell's frame.
+    parents: Mapping[str, str]  # Parent of each frame, by name.
+    flanges: Mapping[str, str]  # Robot of each flange, by the flange's frame.
+    edges: Mapping[str, Edge]  # Estimated transforms by name, as `cell_from_base_b`.
+    joint_covariance: FloatArray  # (6 k, 6 k) joint covariance of these, in their order.
+    placed: Mapping[str, Frame]  # Tools and fixtures by transform name, as `flange_a_from_tool`.
+    former: frozenset[str] = frozenset()  # Frames at the poses before they moved.
 
     @property
     def last(self) -> dict[str, str]:

@@ -37,38 +37,28 @@ class Rms:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """Result of one view. A figure that could not be computed is None, and absent on disk.
+    """Result of one view. A figure that could not be computed is None, and absent on disk."""
 
-    Attributes:
-        view: The view's number.
-        used: Whether the fit used it.
-        reason: Why it was not used, in words; empty for a used view.
-        corners: Number of detected corners.
-        rms_px: Reprojection error through the whole chain of frames [px].
-        residual_mm: Distance of the target's position by this view from its mean, or in a whole
-            cell from its prediction by the rest of the cell [mm].
-        residual_deg: The same in rotation [deg]; None where only a position was read.
-        seer: Frame of the camera or instrument; empty where there is only one.
-        seen: Frame of the target or point; empty where there is only one.
-        stop: In a whole cell, its stop, or the view's number where stops are not numbered.
-        left_out_mm: In a whole cell, position residual by a fit without its stop [mm].
-        left_out_deg: The same in rotation [deg].
-        left_out_px: Reprojection error by that fit [px].
-    """
-
-    view: int
-    used: bool
-    reason: Annotated[str, KEPT] = ""
-    corners: int | None = None
-    rms_px: float | None = None
+    view: int  # The view's number.
+    used: bool  # Whether the fit used it.
+    reason: Annotated[str, KEPT] = ""  # Why it was not used, in words; empty for a used view.
+    corners: int | None = None  # Number of detected corners.
+    rms_px: float | None = None  # Reprojection error through the whole chain of frames [px].
+    # Distance of the target's position by this view from its mean, or in a whole cell from its
+    # prediction by the rest of the cell [mm].
     residual_mm: float | None = None
+    # The same in rotation [deg]; None where only a position was read.
     residual_deg: float | None = None
+    # Frame of the camera or instrument; empty where there is only one.
     seer: Annotated[str, DROPPED] = ""
+    # Frame of the target or point; empty where there is only one.
     seen: Annotated[str, DROPPED] = ""
+    # In a whole cell, its stop, or the view's number where stops are not numbered.
     stop: int | None = None
+    # In a whole cell, position residual by a fit without its stop [mm].
     left_out_mm: float | None = None
-    left_out_deg: float | None = None
-    left_out_px: float | None = None
+    left_out_deg: float | None = None  # The same in rotation [deg].
+    left_out_px: float | None = None  # Reprojection error by that fit [px].
 
     @property
     def of_pair(self) -> "ViewResult":
@@ -80,19 +70,12 @@ class ViewResult:
 
 @dataclass(frozen=True, kw_only=True)
 class SeerAndSeen:
-    """Observer and observed object of an observation, by kind and name.
+    """Observer and observed object of an observation, by kind and name."""
 
-    Attributes:
-        camera: Name of the camera; None for an instrument.
-        instrument: Name of the instrument; None for a camera.
-        target: Name of the observed target; None for a point.
-        point: Name of the measured point; None for a target.
-    """
-
-    camera: str | None = None
-    instrument: str | None = None
-    target: str | None = None
-    point: str | None = None
+    camera: str | None = None  # Name of the camera; None for an instrument.
+    instrument: str | None = None  # Name of the instrument; None for a camera.
+    target: str | None = None  # Name of the observed target; None for a point.
+    point: str | None = None  # Name of the measured point; None for a target.
 
     def __post_init__(self) -> None:
         if (self.camera or self.instrument) is None or (self.target or self.point) is None:
@@ -108,15 +91,11 @@ def _names(view: ViewResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class CellView(SeerAndSeen):
-    """Result of one observation of a whole cell, with names instead of frames.
+    """Result of one observation of a whole cell, with names instead of frames."""
 
-    Attributes:
-        robots: The robots between observer and observed object.
-        figures: The other fields.
-    """
-
+    # The robots between observer and observed object.
     robots: Annotated[tuple[str, ...], KEPT] = ()
-    figures: Annotated[ViewResult, INLINE]
+    figures: Annotated[ViewResult, INLINE]  # The other fields.
 
     @classmethod
     def of(cls, tree: Mapping[str, str], view: ViewResult) -> "CellView":
@@ -143,18 +122,12 @@ class PairResiduals(SeerAndSeen):
 
 @dataclass(frozen=True)
 class Validation:
-    """Residuals of views that were not in the fit.
+    """Residuals of views that were not in the fit."""
 
-    Attributes:
-        method: How views were left out, in words.
-        held_out: Residuals of all used views, left out in turn.
-        holdout: Residuals of the views that the session declares as `holdout`.
-        pairs: In a whole cell, residuals of left-out views by camera and target.
-    """
-
-    method: str
-    held_out: Rms
-    holdout: Rms | None = None
+    method: str  # How views were left out, in words.
+    held_out: Rms  # Residuals of all used views, left out in turn.
+    holdout: Rms | None = None  # Residuals of the views that the session declares as `holdout`.
+    # In a whole cell, residuals of left-out views by camera and target.
     pairs: tuple[PairResiduals, ...] = ()
 
     @classmethod

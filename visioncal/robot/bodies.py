@@ -25,27 +25,18 @@ _SHORTEST_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A convex body.
+    """A convex body."""
 
-    Attributes:
-        name: Name for messages.
-        link: The joint with which it moves, from 1; 0 for one fixed to the base.
-        shape: Its shape.
-        size_m: (2,) radius and length of the axis (capsule and cylinder, along z) or (3,) full
-            lengths (box) [m]. A capsule's caps come on top of its length.
-        link_from_body: (4, 4) pose of the body in the joint's frame after its motion, or in the
-            base [m].
-        of_arm: Whether it is a part of the arm itself.
-        uncertainty_m: Additional distance to bodies that are not of the arm, for an uncertain pose
-            [m].
-    """
-
-    name: str
-    link: int
-    shape: Shape
+    name: str  # Name for messages.
+    link: int  # The joint with which it moves, from 1; 0 for one fixed to the base.
+    shape: Shape  # Its shape.
+    # (2,) radius and length of the axis (capsule and cylinder, along z) or (3,) full lengths (box)
+    # [m]. A capsule's caps come on top of its length.
     size_m: FloatArray
+    # (4, 4) pose of the body in the joint's frame after its motion, or in the base [m].
     link_from_body: FloatArray
-    of_arm: bool = False
+    of_arm: bool = False  # Whether it is a part of the arm itself.
+    # Additional distance to bodies that are not of the arm, for an uncertain pose [m].
     uncertainty_m: float = 0.0
 
     @property

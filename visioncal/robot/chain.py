@@ -30,26 +30,19 @@ class Chain:
     `offset + ratio q + sine sin(q) + cosine cos(q)`, with gear ratio and encoder eccentricity
     (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration), and harmonics of
     higher order.
-
-    Attributes:
-        joint_names: The joints from the base to the tip.
-        prismatic: (n,) whether a joint moves along its axis [m] instead of turning about it [rad].
-        axes: (n, 3) unit vectors in the joints' frames.
-        placements: (n + 1, 4, 4) each joint's frame, before its own motion, in the previous
-            joint's (the first in the base), and the tip in the last joint's [m].
-        lower: (n,) lower limits of q [rad or m]; -inf for a joint without limits.
-        upper: (n,) upper limits of q [rad or m]; inf for a joint without limits.
-        functions: (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
-        harmonics: (n, k, 2) sine and cosine [rad] of each joint at orders from 2 on; None for none.
     """
 
-    joint_names: tuple[str, ...]
+    joint_names: tuple[str, ...]  # The joints from the base to the tip.
+    # (n,) whether a joint moves along its axis [m] instead of turning about it [rad].
     prismatic: Mask
-    axes: FloatArray
+    axes: FloatArray  # (n, 3) unit vectors in the joints' frames.
+    # (n + 1, 4, 4) each joint's frame, before its own motion, in the previous joint's (the first in
+    # the base), and the tip in the last joint's [m].
     placements: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    functions: FloatArray
+    lower: FloatArray  # (n,) lower limits of q [rad or m]; -inf for a joint without limits.
+    upper: FloatArray  # (n,) upper limits of q [rad or m]; inf for a joint without limits.
+    functions: FloatArray  # (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
+    # (n, k, 2) sine and cosine [rad] of each joint at orders from 2 on; None for none.
     harmonics: FloatArray | None = None
 
     def __len__(self) -> int:

@@ -41,18 +41,14 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of bodies whose distances are checked.
+    """Pairs of bodies whose distances are checked."""
 
-    Attributes:
-        bodies: (k, 2) indices of the bodies, the one on the later link second; the index after the
-            last body is the floor.
-        needed_m: (k,) required distance [m].
-        levers: (k, n) greatest motion of a point of one, seen from the other, for a unit of each
-            joint's effective position [m].
-    """
-
+    # (k, 2) indices of the bodies, the one on the later link second; the index after the last body
+    # is the floor.
     bodies: IntArray
-    needed_m: FloatArray
+    needed_m: FloatArray  # (k,) required distance [m].
+    # (k, n) greatest motion of a point of one, seen from the other, for a unit of each joint's
+    # effective position [m].
     levers: FloatArray
 
 

@@ -15,17 +15,11 @@ RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 
 @dataclass(frozen=True, eq=False)
 class DriveLimits:
-    """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints.
+    """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints."""
 
-    Attributes:
-        velocity: (n,) greatest speeds [rad/s].
-        acceleration: (n,) greatest accelerations [rad/s^2].
-        torque: (n,) greatest torques [N m].
-    """
-
-    velocity: FloatArray
-    acceleration: FloatArray
-    torque: FloatArray
+    velocity: FloatArray  # (n,) greatest speeds [rad/s].
+    acceleration: FloatArray  # (n,) greatest accelerations [rad/s^2].
+    torque: FloatArray  # (n,) greatest torques [N m].
 
     @classmethod
     def of_rows(cls, rows: Sequence[DocumentTable]) -> "DriveLimits":

@@ -42,14 +42,11 @@ _THIN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Inertias:
-    """The inertial parameters of an arm's n links.
+    """The inertial parameters of an arm's n links."""
 
-    Attributes:
-        values: (n, 10) mass [kg], first moments [kg m] and inertia xx, xy, yy, xz, yz, zz
-            [kg m^2] of all that moves with each joint; in the joint's frame after its motion and
-            about that frame's origin.
-    """
-
+    # (n, 10) mass [kg], first moments [kg m] and inertia xx, xy, yy, xz, yz, zz [kg m^2] of all
+    # that moves with each joint; in the joint's frame after its motion and about that frame's
+    # origin.
     values: FloatArray
 
     @classmethod
@@ -163,13 +160,10 @@ def inertias_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) 
 
 @dataclass(frozen=True, eq=False)
 class LogCholesky:
-    """Log-Cholesky coordinates around n bodies.
+    """Log-Cholesky coordinates around n bodies."""
 
-    Attributes:
-        maps: (n, 10, 10) from the parameters of Pinocchio's coordinates to those of the link, by
-            congruence with the Cholesky factor of the known body.
-    """
-
+    # (n, 10, 10) from the parameters of Pinocchio's coordinates to those of the link, by congruence
+    # with the Cholesky factor of the known body.
     maps: FloatArray
 
     @classmethod

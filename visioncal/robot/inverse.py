@@ -50,21 +50,14 @@ _FLOOR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """A solution of the inverse kinematics, or the nearest posture.
+    """A solution of the inverse kinematics, or the nearest posture."""
 
-    Attributes:
-        positions: (n,) effective positions of the joints [rad or m].
-        off_m: Position error of the flange [m].
-        off_rad: Rotation error of the flange [rad].
-        reached: Whether the pose is reached within the joints' limits.
-        beyond: If not, the joints whose limits alone prevent it; empty where the pose is out of
-            reach without limits, too.
-    """
-
-    positions: FloatArray
-    off_m: float
-    off_rad: float
-    reached: bool
+    positions: FloatArray  # (n,) effective positions of the joints [rad or m].
+    off_m: float  # Position error of the flange [m].
+    off_rad: float  # Rotation error of the flange [rad].
+    reached: bool  # Whether the pose is reached within the joints' limits.
+    # If not, the joints whose limits alone prevent it; empty where the pose is out of reach without
+    # limits, too.
     beyond: tuple[str, ...] = ()
 
 

@@ -29,15 +29,10 @@ _ITERATIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Masses:
-    """Masses of an arm's links.
+    """Masses of an arm's links."""
 
-    Attributes:
-        kg: (n,) mass that moves with each joint [kg].
-        centres_m: (n, 3) its centre, in the joint's frame after its motion [m].
-    """
-
-    kg: FloatArray
-    centres_m: FloatArray
+    kg: FloatArray  # (n,) mass that moves with each joint [kg].
+    centres_m: FloatArray  # (n, 3) its centre, in the joint's frame after its motion [m].
 
     def rows(self) -> list[dict[str, Any]]:
         """Entries of the joints' tables, for a description whose rows end in the joints' frames."""
@@ -47,19 +42,13 @@ class Masses:
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """Payload, external force and direction of approach of an arm at m stops.
+    """Payload, external force and direction of approach of an arm at m stops."""
 
-    Attributes:
-        payload_kg: (m,) mass of the payload [kg].
-        payload_m: (m, 3) its centre, in the flange's frame [m].
-        force_n: (m, 3) external force on the flange's origin, in the base's frame [N].
-        side: (m,) the side from which the joints approached the stop, +1 from above, -1 from below;
-            0 where unknown: the middle of their backlash.
-    """
-
-    payload_kg: FloatArray
-    payload_m: FloatArray
-    force_n: FloatArray
+    payload_kg: FloatArray  # (m,) mass of the payload [kg].
+    payload_m: FloatArray  # (m, 3) its centre, in the flange's frame [m].
+    force_n: FloatArray  # (m, 3) external force on the flange's origin, in the base's frame [N].
+    # (m,) the side from which the joints approached the stop, +1 from above, -1 from below; 0 where
+    # unknown: the middle of their backlash.
     side: FloatArray
 
     @classmethod

@@ -49,26 +49,16 @@ class Robot:
     Joints are those between the base and the tip, in this order; others are held at their neutral
     position. A prismatic joint's "angle" and limits are lengths [m]. All methods of joint angles
     `q`, (m, n) or (n,) [rad], raise DataError where their number differs from the robot's.
-
-    Attributes:
-        name: The robot's name.
-        tip: The frame of its end, called flange here.
-        document: The description that recreates it by `Robot.from_document`.
-        chain: Its geometry.
-        masses: Masses of its links; None where unknown.
-        inertias: Inertial parameters of its links; None where unknown.
-        rates: Limits of its drives.
-        gravity: (3,) gravitational acceleration in the base's frame [m/s^2].
     """
 
-    name: str
-    tip: str
-    document: Mapping[str, Any]
-    chain: Chain
-    masses: Masses | None
-    inertias: Inertias | None
-    rates: DriveLimits
-    gravity: FloatArray
+    name: str  # The robot's name.
+    tip: str  # The frame of its end, called flange here.
+    document: Mapping[str, Any]  # The description that recreates it by `Robot.from_document`.
+    chain: Chain  # Its geometry.
+    masses: Masses | None  # Masses of its links; None where unknown.
+    inertias: Inertias | None  # Inertial parameters of its links; None where unknown.
+    rates: DriveLimits  # Limits of its drives.
+    gravity: FloatArray  # (3,) gravitational acceleration in the base's frame [m/s^2].
     _model: "pin.Model" = field(repr=False)
 
     @classmethod

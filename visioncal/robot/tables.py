@@ -38,42 +38,24 @@ class DHTable:
       parallel, beta_i replaces d_i: the position of their common normal is ill-defined, and the
       plane through the origin normal to axis i is used instead. A d_i of exactly parallel axes is
       kept.
-
-    Attributes:
-        name: The robot's name.
-        tip: The frame at its end.
-        convention: The convention of its rows.
-        joint_names: The joints from the base to the tip.
-        prismatic: (n,) whether q adds to d [m] instead of theta [rad].
-        theta_rad: (n,) rotations about z.
-        d_m: (n,) translations along z.
-        a_m: (n + 1,) translations along x; the first is of X_0.
-        alpha_rad: (n + 1,) rotations about x.
-        beta_rad: (n + 1,) rotations about y; zero but for Hayati's parallel rows.
-        parallel: (n + 1,) mask of the X_i between nearly parallel axes; only in `hayati`.
-        base: (4, 4) the constant before X_0 [m].
-        flange: (4, 4) the constant after X_n [m].
-        lower: (n,) lower limits of q [rad or m], -inf for none.
-        upper: (n,) upper limits of q [rad or m], inf for none.
-        functions: (n, 4) the joints' functions as in `Chain`, their offsets zero.
     """
 
-    name: str
-    tip: str
-    convention: Convention
-    joint_names: tuple[str, ...]
-    prismatic: Mask
-    theta_rad: FloatArray
-    d_m: FloatArray
-    a_m: FloatArray
-    alpha_rad: FloatArray
-    beta_rad: FloatArray
-    parallel: Mask
-    base: FloatArray
-    flange: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    functions: FloatArray
+    name: str  # The robot's name.
+    tip: str  # The frame at its end.
+    convention: Convention  # The convention of its rows.
+    joint_names: tuple[str, ...]  # The joints from the base to the tip.
+    prismatic: Mask  # (n,) whether q adds to d [m] instead of theta [rad].
+    theta_rad: FloatArray  # (n,) rotations about z.
+    d_m: FloatArray  # (n,) translations along z.
+    a_m: FloatArray  # (n + 1,) translations along x; the first is of X_0.
+    alpha_rad: FloatArray  # (n + 1,) rotations about x.
+    beta_rad: FloatArray  # (n + 1,) rotations about y; zero but for Hayati's parallel rows.
+    parallel: Mask  # (n + 1,) mask of the X_i between nearly parallel axes; only in `hayati`.
+    base: FloatArray  # (4, 4) the constant before X_0 [m].
+    flange: FloatArray  # (4, 4) the constant after X_n [m].
+    lower: FloatArray  # (n,) lower limits of q [rad or m], -inf for none.
+    upper: FloatArray  # (n,) upper limits of q [rad or m], inf for none.
+    functions: FloatArray  # (n, 4) the joints' functions as in `Chain`, their offsets zero.
 
     def __len__(self) -> int:
         return len(self.joint_names)

@@ -18,13 +18,10 @@ _POSTURES, _RANK = 200, 1e-8
 
 @dataclass(frozen=True, eq=False)
 class WeightFunctions:
-    """Independent gravity torque functions of each joint.
+    """Independent gravity torque functions of each joint."""
 
-    Attributes:
-        parts: For each joint (4 n, r), the combinations of masses and first moments of its r
-            functions, whose root mean square over postures is 1.
-    """
-
+    # For each joint (4 n, r), the combinations of masses and first moments of its r functions,
+    # whose root mean square over postures is 1.
     parts: tuple[FloatArray, ...]
 
     @classmethod

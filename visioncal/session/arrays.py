@@ -26,21 +26,13 @@ _KEPT_PLACE = (
 
 
 class CellArguments(TypedDict, total=False):
-    """Optional arguments that describe a cell.
+    """Optional arguments that describe a cell."""
 
-    Attributes:
-        mount: Mount of the camera; eye-in-hand by default.
-        camera: Its intrinsics, as in session.toml; estimated by default.
-        robot: The robot's model, by a built-in name.
-        q: (n, j) joint angles [rad].
-        name: The session's name.
-    """
-
-    mount: Mount
-    camera: Camera | Mapping[str, Any]
-    robot: str
-    q: npt.ArrayLike
-    name: str
+    mount: Mount  # Mount of the camera; eye-in-hand by default.
+    camera: Camera | Mapping[str, Any]  # Its intrinsics, as in session.toml; estimated by default.
+    robot: str  # The robot's model, by a built-in name.
+    q: npt.ArrayLike  # (n, j) joint angles [rad].
+    name: str  # The session's name.
 
 
 class AssembleArguments(TypedDict):

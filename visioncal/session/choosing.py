@@ -42,19 +42,12 @@ ANY = Choice()
 
 @dataclass(frozen=True)
 class Chosen:
-    """One camera, robot and target of a cell.
+    """One camera, robot and target of a cell."""
 
-    Attributes:
-        mount: Whether this robot carries the camera.
-        camera: The camera's frame; empty where none is needed.
-        robot: The robot's name in the session.
-        target: The target's frame; empty where none is needed.
-    """
-
-    mount: Mount
-    camera: str
-    robot: str
-    target: str
+    mount: Mount  # Whether this robot carries the camera.
+    camera: str  # The camera's frame; empty where none is needed.
+    robot: str  # The robot's name in the session.
+    target: str  # The target's frame; empty where none is needed.
 
     @property
     def base(self) -> str:

@@ -33,24 +33,17 @@ _FEWEST = 4
 
 @dataclass(frozen=True, eq=False)
 class CornerTable:
-    """Rows of corners.csv, n in all.
+    """Rows of corners.csv, n in all."""
 
-    Attributes:
-        views: (n,) view numbers.
-        points: (n,) point numbers on the target.
-        px: (n, 2) image points [px].
-        targets: (n,) names of the targets; empty where not stated.
-        sigmas_px: (n,) standard deviation per axis [px]; None where not stated.
-        is_file: Whether they are lines of a corners.csv; else they are arrays of a program.
-        lines: (n,) line of each row in its file; None where rows follow the header.
-    """
-
-    views: IntArray
-    points: IntArray
-    px: FloatArray
-    targets: tuple[str, ...]
+    views: IntArray  # (n,) view numbers.
+    points: IntArray  # (n,) point numbers on the target.
+    px: FloatArray  # (n, 2) image points [px].
+    targets: tuple[str, ...]  # (n,) names of the targets; empty where not stated.
+    # (n,) standard deviation per axis [px]; None where not stated.
     sigmas_px: FloatArray | None = None
+    # Whether they are lines of a corners.csv; else they are arrays of a program.
     is_file: bool = True
+    # (n,) line of each row in its file; None where rows follow the header.
     lines: IntArray | None = None
 
     def __len__(self) -> int:

@@ -17,18 +17,12 @@ _FILE = Path(__file__).with_name("instruments.toml")
 
 @dataclass(frozen=True)
 class Instrument:
-    """Noise of an instrument's readings, as standard deviations.
+    """Noise of an instrument's readings, as standard deviations."""
 
-    Attributes:
-        words: Description of the instrument.
-        sigma_m: Of each coordinate of a position, at the instrument's origin [m].
-        sigma_per_m: Its growth with the distance from there [m/m].
-        sigma_rad: Of a probe's rotation about each axis; None where unknown [rad].
-    """
-
-    words: str
-    sigma_m: float
-    sigma_per_m: float = 0.0
+    words: str  # Description of the instrument.
+    sigma_m: float  # Of each coordinate of a position, at the instrument's origin [m].
+    sigma_per_m: float = 0.0  # Its growth with the distance from there [m/m].
+    # Of a probe's rotation about each axis; None where unknown [rad].
     sigma_rad: float | None = None
 
     def sigmas_m(self, places: FloatArray) -> FloatArray:

@@ -24,24 +24,16 @@ LONG_S = 120.0
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One observation of a target or point by a camera or instrument at a stop.
+    """One observation of a target or point by a camera or instrument at a stop."""
 
-    Attributes:
-        view: Its row.
-        station: Number of the cell's state; all rows of a stop share one, unless they give
-            different poses of a robot.
-        seer: The frame of the camera or instrument.
-        seen: The frame of the target or point.
-        robots: The row with the pose of each robot between the two at this stop.
-        missing_robots: The robots between the two without a pose at this stop.
-    """
-
-    view: View
+    view: View  # Its row.
+    # Number of the cell's state; all rows of a stop share one, unless they give different poses of
+    # a robot.
     station: int
-    seer: str
-    seen: str
-    robots: Mapping[str, View]
-    missing_robots: tuple[str, ...] = ()
+    seer: str  # The frame of the camera or instrument.
+    seen: str  # The frame of the target or point.
+    robots: Mapping[str, View]  # The row with the pose of each robot between the two at this stop.
+    missing_robots: tuple[str, ...] = ()  # The robots between the two without a pose at this stop.
 
 
 @dataclass(frozen=True, eq=False)

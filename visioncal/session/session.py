@@ -61,33 +61,24 @@ _NO_VIEWS = TextTable("", ("view",), (), ())
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Recording of a cell. The content is kept as it was read; transforms are derived.
+    """Recording of a cell. The content is kept as it was read; transforms are derived."""
 
-    Attributes:
-        document: Content of session.toml.
-        columns: Columns of views.csv, in its order.
-        views: Rows of views.csv, in its order.
-        target: The printed target, where the session names one; of several, the first.
-        target_document: Content of the target's `.toml`; of several, the contents by name.
-        images: Source of the images.
-        warnings: Suspicious content, in sentences.
-        robot_document: The robot's model for `Robot.from_document`; of several, the models by name.
-            None where the session names no robot or, with a warning, an unknown one.
-        targets: Several printed targets by name, in the session's order; empty for one or none.
-        streams: Time series beside the views, by name.
-        corner_table: Corners by another detector; None where there are none.
-    """
-
-    document: Mapping[str, Any]
-    columns: tuple[str, ...]
-    views: tuple[View, ...]
-    target: Target | None
+    document: Mapping[str, Any]  # Content of session.toml.
+    columns: tuple[str, ...]  # Columns of views.csv, in its order.
+    views: tuple[View, ...]  # Rows of views.csv, in its order.
+    target: Target | None  # The printed target, where the session names one; of several, the first.
+    # Content of the target's `.toml`; of several, the contents by name.
     target_document: Mapping[str, Any] | None
-    images: ImageStore
-    warnings: tuple[str, ...] = ()
+    images: ImageStore  # Source of the images.
+    warnings: tuple[str, ...] = ()  # Suspicious content, in sentences.
+    # The robot's model for `Robot.from_document`; of several, the models by name. None where the
+    # session names no robot or, with a warning, an unknown one.
     robot_document: Mapping[str, Any] | None = None
+    # Several printed targets by name, in the session's order; empty for one or none.
     targets: Mapping[str, Target] = field(default_factory=dict)
+    # Time series beside the views, by name.
     streams: Mapping[str, Stream] = field(default_factory=dict)
+    # Corners by another detector; None where there are none.
     corner_table: CornerTable | None = None
 
     @classmethod

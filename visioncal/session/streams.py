@@ -30,16 +30,11 @@ _MOST_BYTES = 300_000_000
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Time series with named columns.
+    """Time series with named columns."""
 
-    Attributes:
-        columns: Names of the columns; `stamp_s` is one of them.
-        values: (n, c) numbers in the columns' units; NaN where a cell is empty.
-        lines: (n,) line of each row in its file; None where rows follow the header.
-    """
-
-    columns: tuple[str, ...]
-    values: FloatArray
+    columns: tuple[str, ...]  # Names of the columns; `stamp_s` is one of them.
+    values: FloatArray  # (n, c) numbers in the columns' units; NaN where a cell is empty.
+    # (n,) line of each row in its file; None where rows follow the header.
     lines: IntArray | None = None
 
     def __len__(self) -> int:

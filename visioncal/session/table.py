@@ -22,25 +22,16 @@ _OBSERVED = ("cft_x_m", "meas_x_m")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One row of views.csv.
+    """One row of views.csv."""
 
-    Attributes:
-        number: The view's number, unique in its session.
-        image: Path of its image, with forward slashes; empty where it has none.
-        holdout: Whether it is held out of all fits.
-        stop: Number of the robot's stop, if stated.
-        numbers: Filled known numeric columns, in their columns' units.
-        text: Other filled columns.
-        has_corners: Whether corners.csv has rows of it.
-    """
-
-    number: int
-    image: str = ""
-    holdout: bool = False
-    stop: int | None = None
+    number: int  # The view's number, unique in its session.
+    image: str = ""  # Path of its image, with forward slashes; empty where it has none.
+    holdout: bool = False  # Whether it is held out of all fits.
+    stop: int | None = None  # Number of the robot's stop, if stated.
+    # Filled known numeric columns, in their columns' units.
     numbers: Mapping[str, float] = field(default_factory=dict)
-    text: Mapping[str, str] = field(default_factory=dict)
-    has_corners: bool = False
+    text: Mapping[str, str] = field(default_factory=dict)  # Other filled columns.
+    has_corners: bool = False  # Whether corners.csv has rows of it.
 
     @property
     def stamp_s(self) -> float | None:

@@ -29,66 +29,44 @@ class DhArm:
     Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last rotation is
     Hayati's (1983): where two axes are nearly parallel, the other four parameters cannot represent
     their misalignment about y. It is zero in every nominal arm.
-
-    Attributes:
-        name: Name of the model.
-        a: (n,) lengths along the links' x [m].
-        d: (n,) offsets along the joint axes [m].
-        alpha: (n,) twists about x [rad].
-        beta: (n,) Hayati's twists about y [rad].
-        offset: (n,) joint angles at which the encoders read zero [rad].
-        waves: (4, n) periodic joint errors: sine and cosine amplitudes at the joint's angle, from
-            eccentricity, and of the gear's ripple [rad].
-        beyond: (k, n) further joint errors at k angles over a turn [rad]; None for none.
     """
 
-    name: str
-    a: FloatArray
-    d: FloatArray
-    alpha: FloatArray
-    beta: FloatArray
-    offset: FloatArray
+    name: str  # Name of the model.
+    a: FloatArray  # (n,) lengths along the links' x [m].
+    d: FloatArray  # (n,) offsets along the joint axes [m].
+    alpha: FloatArray  # (n,) twists about x [rad].
+    beta: FloatArray  # (n,) Hayati's twists about y [rad].
+    offset: FloatArray  # (n,) joint angles at which the encoders read zero [rad].
+    # (4, n) periodic joint errors: sine and cosine amplitudes at the joint's angle, from
+    # eccentricity, and of the gear's ripple [rad].
     waves: FloatArray
+    # (k, n) further joint errors at k angles over a turn [rad]; None for none.
     beyond: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmErrors:
-    """Standard deviations of a real arm's parameters from the nominal ones.
+    """Standard deviations of a real arm's parameters from the nominal ones."""
 
-    Attributes:
-        dh_sigma_m: Every length a and d [m].
-        dh_sigma_rad: Every alpha, beta and joint offset [rad].
-        offset_sigma_rad: Joint offsets, in addition to `dh_sigma_rad` [rad].
-        eccentricity_sigma_rad: Sine and cosine amplitudes of the joint errors at the joint's angle
-            [rad].
-        ripple_sigma_rad: Likewise for the gear's ripple, many times per turn [rad].
-        function_sigma_rad: Further joint errors as arbitrary functions of the angle [rad].
-        function_length_rad: Correlation length of these functions [rad].
-    """
-
-    dh_sigma_m: float = 0.0
-    dh_sigma_rad: float = 0.0
-    offset_sigma_rad: float = 0.0
+    dh_sigma_m: float = 0.0  # Every length a and d [m].
+    dh_sigma_rad: float = 0.0  # Every alpha, beta and joint offset [rad].
+    offset_sigma_rad: float = 0.0  # Joint offsets, in addition to `dh_sigma_rad` [rad].
+    # Sine and cosine amplitudes of the joint errors at the joint's angle [rad].
     eccentricity_sigma_rad: float = 0.0
-    ripple_sigma_rad: float = 0.0
+    ripple_sigma_rad: float = 0.0  # Likewise for the gear's ripple, many times per turn [rad].
+    # Further joint errors as arbitrary functions of the angle [rad].
     function_sigma_rad: float = 0.0
-    function_length_rad: float = 0.06
+    function_length_rad: float = 0.06  # Correlation length of these functions [rad].
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Result of the inverse kinematics.
+    """Result of the inverse kinematics."""
 
-    Attributes:
-        joints: (m, n) joint angles [rad], valid where `solved`.
-        solved: (m,) whether the pose was reached within the joints' limits.
-        dexterity: (m,) smallest singular value of the Jacobian with lengths in units of the arm's
-            reach; zero in a singular posture.
-    """
-
-    joints: FloatArray
-    solved: npt.NDArray[np.bool_]
+    joints: FloatArray  # (m, n) joint angles [rad], valid where `solved`.
+    solved: npt.NDArray[np.bool_]  # (m,) whether the pose was reached within the joints' limits.
+    # (m,) smallest singular value of the Jacobian with lengths in units of the arm's reach; zero in
+    # a singular posture.
     dexterity: FloatArray
 
 

@@ -9,17 +9,12 @@ from visioncal.core.types import FloatArray, Target
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """A printed target on its plate.
+    """A printed target on its plate."""
 
-    Attributes:
-        target: Target as designed.
-        scale: Printed size over stated size.
-        bow_m: Depth of the pattern's outer corners relative to its centre, positive away from a
-            camera in front of it [m].
-    """
-
-    target: Target
-    scale: float = 1.0
+    target: Target  # Target as designed.
+    scale: float = 1.0  # Printed size over stated size.
+    # Depth of the pattern's outer corners relative to its centre, positive away from a camera in
+    # front of it [m].
     bow_m: float = 0.0
 
 

@@ -23,28 +23,18 @@ from visioncal.simulation.layout import (
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRobot:
-    """A robot of a cell with its true and reported poses at s stops.
+    """A robot of a cell with its true and reported poses at s stops."""
 
-    Attributes:
-        options: Options of the robot.
-        arm: Nominal arm.
-        true_arm: Real arm.
-        joints: (s, n) reported joint angles [rad].
-        base_from_flange: (s, 4, 4) reported poses: the nominal arm at the reported joints.
-        true_base_from_flange: (s, 4, 4) true poses.
-        wrong_stops: Stops with a wrong report, ascending.
-        loads: Payload of each stop; empty without payloads.
-        approach: (s,) side from which each stop was approached, +1 or -1; None without backlash.
-    """
-
-    options: RobotAt
-    arm: DhArm
-    true_arm: DhArm
-    joints: FloatArray
+    options: RobotAt  # Options of the robot.
+    arm: DhArm  # Nominal arm.
+    true_arm: DhArm  # Real arm.
+    joints: FloatArray  # (s, n) reported joint angles [rad].
+    # (s, 4, 4) reported poses: the nominal arm at the reported joints.
     base_from_flange: FloatArray
-    true_base_from_flange: FloatArray
-    wrong_stops: tuple[int, ...] = ()
-    loads: tuple[Payload, ...] = ()
+    true_base_from_flange: FloatArray  # (s, 4, 4) true poses.
+    wrong_stops: tuple[int, ...] = ()  # Stops with a wrong report, ascending.
+    loads: tuple[Payload, ...] = ()  # Payload of each stop; empty without payloads.
+    # (s,) side from which each stop was approached, +1 or -1; None without backlash.
     approach: FloatArray | None = None
 
     def flange_at(self, q: FloatArray, loads: Sequence[Payload] = ()) -> FloatArray:
@@ -72,31 +62,21 @@ class SimulatedRobot:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSight:
-    """A camera's image of a board at a stop.
+    """A camera's image of a board at a stop."""
 
-    Attributes:
-        view: Number of its row.
-        stop: Stop at which it was taken; -1 for images for intrinsics only, and for frames of a
-            sweep after the stops.
-        camera: Camera name.
-        board: Board name.
-        cam_from_target: (4, 4) board pose in the row's image.
-        exact: True corners in that image.
-        corners: Detected corners; the numbering of a symmetric board depends on its orientation in
-            the image.
-        stamp_s: Time stamp in a sweep, by the camera's clock [s]; None at a stop.
-        at_once: Whether all rows of the image are taken at the same time.
-    """
-
-    view: int
+    view: int  # Number of its row.
+    # Stop at which it was taken; -1 for images for intrinsics only, and for frames of a sweep after
+    # the stops.
     stop: int
-    camera: str
-    board: str
-    cam_from_target: FloatArray
-    exact: Corners
+    camera: str  # Camera name.
+    board: str  # Board name.
+    cam_from_target: FloatArray  # (4, 4) board pose in the row's image.
+    exact: Corners  # True corners in that image.
+    # Detected corners; the numbering of a symmetric board depends on its orientation in the image.
     corners: Corners
+    # Time stamp in a sweep, by the camera's clock [s]; None at a stop.
     stamp_s: float | None = None
-    at_once: bool = True
+    at_once: bool = True  # Whether all rows of the image are taken at the same time.
 
     @property
     def is_of_lens(self) -> bool:
@@ -128,35 +108,25 @@ class SimulatedCell:
     """A simulated cell of robots, cameras and boards, with its observations.
 
     A single robot, camera or board has no name; with a single robot, its base is the root frame.
-
-    Attributes:
-        options: Options of the cell.
-        parents: Parent of each frame but the flanges, by its name in a session.
-        mountings: (4, 4) `parent_from_frame` of each of them, before any push.
-        robots: Robots by name.
-        stated: Intrinsics stated in the session, by camera name.
-        sights: Camera observations by ascending view; images for intrinsics only are last.
-        readings: Instrument readings.
-        pose_rows: Rows with only a robot's pose, for stops where no other row has it: (view, stop,
-            robot).
-        wrong_views: Rows with another row's image or, with one robot, with a wrong report;
-            ascending.
-        stamps_s: (s,) time of each stop [s]; None if rows have no time.
-        streams: Robots' states in sweeps, by robot name, and temperatures.
-        facts: Further content of the truth's file.
     """
 
-    options: CellOptions | NetworkOptions
-    parents: Mapping[str, str]
+    options: CellOptions | NetworkOptions  # Options of the cell.
+    parents: Mapping[str, str]  # Parent of each frame but the flanges, by its name in a session.
+    # (4, 4) `parent_from_frame` of each of them, before any push.
     mountings: Mapping[str, FloatArray]
-    robots: Mapping[str, SimulatedRobot]
-    stated: Mapping[str, Camera]
+    robots: Mapping[str, SimulatedRobot]  # Robots by name.
+    stated: Mapping[str, Camera]  # Intrinsics stated in the session, by camera name.
+    # Camera observations by ascending view; images for intrinsics only are last.
     sights: tuple[SimulatedSight, ...] = ()
-    readings: tuple[InstrumentReading, ...] = ()
+    readings: tuple[InstrumentReading, ...] = ()  # Instrument readings.
+    # Rows with only a robot's pose, for stops where no other row has it: (view, stop, robot).
     pose_rows: tuple[tuple[int, int, str], ...] = ()
+    # Rows with another row's image or, with one robot, with a wrong report; ascending.
     wrong_views: tuple[int, ...] = ()
-    stamps_s: FloatArray | None = None
+    stamps_s: FloatArray | None = None  # (s,) time of each stop [s]; None if rows have no time.
+    # Robots' states in sweeps, by robot name, and temperatures.
     streams: Mapping[str, Stream] = field(default_factory=dict)
+    # Further content of the truth's file.
     facts: Mapping[str, object] = field(default_factory=dict)
 
     @property

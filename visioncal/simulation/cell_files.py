@@ -120,15 +120,10 @@ def _table(document: Mapping[str, Any], key: str, label: str) -> Mapping[str, An
 
 @dataclass(frozen=True)
 class _Reader:
-    """Reads tables by the types of the fields they fill.
+    """Reads tables by the types of the fields they fill."""
 
-    Attributes:
-        file: Name of the file, for messages.
-        carriers: Possible values of `on`: the cell, and the robots.
-    """
-
-    file: str
-    carriers: tuple[str, ...]
+    file: str  # Name of the file, for messages.
+    carriers: tuple[str, ...]  # Possible values of `on`: the cell, and the robots.
 
     def read(self, kind: type[_T], row: object, path: str, **given: object) -> _T:
         """One table as a dataclass object."""

@@ -50,21 +50,16 @@ _RECORDING = 1000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawOptions:
-    """Random seed of a cell, and the noise of corners.
+    """Random seed of a cell, and the noise of corners."""
 
-    Attributes:
-        pixel_sigma_px: Noise of simulated detections, per axis [px].
-        seed: Seed of everything random. Each source of randomness has its own stream, so that
-            changing one option does not change the draws of others.
-        draw: Number of the draw of real arms and noise; the cell and the nominal postures are the
-            same for all.
-        recording: Number of the recording of the same cell and arms, with stops and noise of its
-            own.
-    """
-
-    pixel_sigma_px: float = 0.05
+    pixel_sigma_px: float = 0.05  # Noise of simulated detections, per axis [px].
+    # Seed of everything random. Each source of randomness has its own stream, so that changing one
+    # option does not change the draws of others.
     seed: int = 0
+    # Number of the draw of real arms and noise; the cell and the nominal postures are the same for
+    # all.
     draw: int = 0
+    # Number of the recording of the same cell and arms, with stops and noise of its own.
     recording: int = 0
 
     def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:

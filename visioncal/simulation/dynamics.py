@@ -43,17 +43,11 @@ _MOTOR_INERTIA = (1.1, 1.2, 0.9, 0.08, 0.08, 0.07)
 
 @dataclass(frozen=True, eq=False)
 class LinkBody:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        kg: Mass [kg].
-        centre_m: (3,) centre of mass in its frame [m].
-        inertia_kg_m2: (3, 3) inertia about the centre of mass, along that frame's axes.
-    """
-
-    kg: float
-    centre_m: FloatArray
-    inertia_kg_m2: FloatArray
+    kg: float  # Mass [kg].
+    centre_m: FloatArray  # (3,) centre of mass in its frame [m].
+    inertia_kg_m2: FloatArray  # (3, 3) inertia about the centre of mass, along that frame's axes.
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,22 +56,14 @@ class Gears:
 
     `(coulomb + stribeck exp(-(dq / stribeck_speed)^2)) sign(dq) + viscous dq + offset
     + motor_inertia ddq`.
-
-    Attributes:
-        coulomb: (n,) Coulomb friction [N m].
-        viscous: (n,) viscous friction [N m s/rad].
-        offset: (n,) torque offset [N m].
-        stribeck: (n,) static friction in addition to `coulomb` [N m].
-        stribeck_speed: (n,) speed over which it fades [rad/s].
-        motor_inertia: (n,) inertia of the rotors at the joints [kg m^2].
     """
 
-    coulomb: FloatArray
-    viscous: FloatArray
-    offset: FloatArray
-    stribeck: FloatArray
-    stribeck_speed: FloatArray
-    motor_inertia: FloatArray
+    coulomb: FloatArray  # (n,) Coulomb friction [N m].
+    viscous: FloatArray  # (n,) viscous friction [N m s/rad].
+    offset: FloatArray  # (n,) torque offset [N m].
+    stribeck: FloatArray  # (n,) static friction in addition to `coulomb` [N m].
+    stribeck_speed: FloatArray  # (n,) speed over which it fades [rad/s].
+    motor_inertia: FloatArray  # (n,) inertia of the rotors at the joints [kg m^2].
 
     def torques(self, dq: FloatArray, ddq: FloatArray) -> FloatArray:
         """(m, n) torques of friction, offset and rotors [N m]."""

@@ -57,16 +57,12 @@ _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
 
 @dataclass(frozen=True)
 class Payload:
-    """A load on the flange, and a force on it.
+    """A load on the flange, and a force on it."""
 
-    Attributes:
-        kg: Mass [kg].
-        centre_m: Centre of mass in the flange frame [m].
-        force_n: Force on the flange's origin, in the base frame [N].
-    """
-
-    kg: float = 0.0
+    kg: float = 0.0  # Mass [kg].
+    # Centre of mass in the flange frame [m].
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Force on the flange's origin, in the base frame [N].
     force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def row(self) -> dict[str, float]:
@@ -80,17 +76,11 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class JointElasticity:
-    """Compliance and backlash of an arm.
+    """Compliance and backlash of an arm."""
 
-    Attributes:
-        compliance: (n,) compliance of each joint [rad/(N m)].
-        mass_share: Ratio of real to published masses of the links.
-        backlash: (n,) backlash of each joint [rad].
-    """
-
-    compliance: FloatArray
-    mass_share: float
-    backlash: FloatArray
+    compliance: FloatArray  # (n,) compliance of each joint [rad/(N m)].
+    mass_share: float  # Ratio of real to published masses of the links.
+    backlash: FloatArray  # (n,) backlash of each joint [rad].
 
 
 def loaded_joints(
@@ -171,25 +161,17 @@ def load_torques(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmOptions(ArmErrors):
-    """An arm, deviations of the real one, and its payloads.
+    """An arm, deviations of the real one, and its payloads."""
 
-    Attributes:
-        robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
-        robot_sigma_m: Repeatability of the flange's position, per axis [m].
-        robot_sigma_rad: Repeatability of its rotation, per axis [rad].
-        compliance_rad_per_nm: Compliance of each joint; empty for a rigid arm.
-        payloads: Payloads, cycled over the stops; empty for none.
-        mass_share: Ratio of real to published masses of the links.
-        backlash_rad: Backlash of each joint; empty for none. With backlash, stops are approached
-            from alternating sides.
-    """
-
-    robot: str = "ur10e"
-    robot_sigma_m: float = 3e-5
-    robot_sigma_rad: float = 5e-5
+    robot: str = "ur10e"  # `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
+    robot_sigma_m: float = 3e-5  # Repeatability of the flange's position, per axis [m].
+    robot_sigma_rad: float = 5e-5  # Repeatability of its rotation, per axis [rad].
+    # Compliance of each joint; empty for a rigid arm.
     compliance_rad_per_nm: tuple[float, ...] = ()
-    payloads: tuple[Payload, ...] = ()
-    mass_share: float = 1.0
+    payloads: tuple[Payload, ...] = ()  # Payloads, cycled over the stops; empty for none.
+    mass_share: float = 1.0  # Ratio of real to published masses of the links.
+    # Backlash of each joint; empty for none. With backlash, stops are approached from alternating
+    # sides.
     backlash_rad: tuple[float, ...] = ()
 
     @property

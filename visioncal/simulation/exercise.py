@@ -27,21 +27,15 @@ class Exercise:
 
 @dataclass(frozen=True)
 class Senses:
-    """Accuracy of a controller's records.
+    """Accuracy of a controller's records."""
 
-    Attributes:
-        q_rad: Standard deviation of the angles [rad].
-        dq_rad_s: Standard deviation of the speeds [rad/s]; None if they are not recorded.
-        torque_share: Standard deviation of the torques, relative to each joint's rms torque.
-        torque_nm: Constant addition to it [N m].
-        gains_nm_a: (n,) torque constants [N m/A]; if given, currents are recorded instead of
-            torques.
-    """
-
-    q_rad: float = 1e-5
+    q_rad: float = 1e-5  # Standard deviation of the angles [rad].
+    # Standard deviation of the speeds [rad/s]; None if they are not recorded.
     dq_rad_s: float | None = 1e-3
+    # Standard deviation of the torques, relative to each joint's rms torque.
     torque_share: float = 0.03
-    torque_nm: float = 0.0
+    torque_nm: float = 0.0  # Constant addition to it [N m].
+    # (n,) torque constants [N m/A]; if given, currents are recorded instead of torques.
     gains_nm_a: tuple[float, ...] = ()
 
 
@@ -113,34 +107,21 @@ def record(
 
 @dataclass(frozen=True)
 class ExerciseOptions:
-    """Options of a recording for dynamic identification.
+    """Options of a recording for dynamic identification."""
 
-    Attributes:
-        robot: `ur5e` or `ur10e`.
-        load: Load on the flange; None for none.
-        senses: Accuracy of the controller's records.
-        rate_hz: Samples per second.
-        seed: Seed of everything random; the arm is the same with and without a load.
-    """
-
-    robot: str = "ur10e"
-    load: LinkBody | None = None
-    senses: Senses = field(default_factory=Senses)
-    rate_hz: float = 250.0
-    seed: int = 0
+    robot: str = "ur10e"  # `ur5e` or `ur10e`.
+    load: LinkBody | None = None  # Load on the flange; None for none.
+    senses: Senses = field(default_factory=Senses)  # Accuracy of the controller's records.
+    rate_hz: float = 250.0  # Samples per second.
+    seed: int = 0  # Seed of everything random; the arm is the same with and without a load.
 
 
 @dataclass(frozen=True, eq=False)
 class Exercised:
-    """A recording for dynamic identification.
+    """A recording for dynamic identification."""
 
-    Attributes:
-        streams: Motions `excite`, `sweeps` and `fresh`.
-        arm: Real arm, without its load.
-    """
-
-    streams: Mapping[str, Stream]
-    arm: DynamicArm
+    streams: Mapping[str, Stream]  # Motions `excite`, `sweeps` and `fresh`.
+    arm: DynamicArm  # Real arm, without its load.
 
 
 def seed_of(*numbers: int) -> int:

@@ -22,29 +22,19 @@ STEEL_PER_K, ALUMINIUM_PER_K = 12e-6, 23e-6
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """Thermal parameters of a real arm.
+    """Thermal parameters of a real arm."""
 
-    Attributes:
-        duty_a: (n,) rms motor currents at work [A].
-        k_per_a2: (n,) steady temperature rise of a joint over ambient per squared current [K/A^2].
-        tau_s: (n,) time constants of the joints [s].
-        lag_s: Time constant by which the links lag behind their joints' sensors [s].
-        growth_per_k: (n,) thermal expansion of a joint's link [1/K].
-        drift_rad_per_k: (n,) thermal drift of a joint's zero [rad/K].
-        ambient_c: Ambient temperature at the start, which the cold arm has [deg C].
-        ambient_swing_k: Amplitude of the ambient temperature, with a period of six hours [K].
-        sensor_sigma_k: Noise of recorded temperatures [K].
-    """
-
-    duty_a: FloatArray
+    duty_a: FloatArray  # (n,) rms motor currents at work [A].
+    # (n,) steady temperature rise of a joint over ambient per squared current [K/A^2].
     k_per_a2: FloatArray
-    tau_s: FloatArray
-    growth_per_k: FloatArray
-    drift_rad_per_k: FloatArray
-    lag_s: float = 240.0
-    ambient_c: float = 21.0
+    tau_s: FloatArray  # (n,) time constants of the joints [s].
+    growth_per_k: FloatArray  # (n,) thermal expansion of a joint's link [1/K].
+    drift_rad_per_k: FloatArray  # (n,) thermal drift of a joint's zero [rad/K].
+    lag_s: float = 240.0  # Time constant by which the links lag behind their joints' sensors [s].
+    ambient_c: float = 21.0  # Ambient temperature at the start, which the cold arm has [deg C].
+    # Amplitude of the ambient temperature, with a period of six hours [K].
     ambient_swing_k: float = 1.5
-    sensor_sigma_k: float = 0.2
+    sensor_sigma_k: float = 0.2  # Noise of recorded temperatures [K].
 
     @classmethod
     def drawn(cls, seed: int) -> "Heat":
@@ -62,21 +52,13 @@ class Heat:
 
 @dataclass(frozen=True, eq=False)
 class Warming:
-    """Temperatures of an arm over time.
+    """Temperatures of an arm over time."""
 
-    Attributes:
-        stamps_s: (t,) times [s].
-        currents_a: (t, n) recorded currents [A].
-        sensors_c: (t, n) recorded temperatures [deg C].
-        links_c: (t, n) true temperatures of the links [deg C].
-        ambient_c: (t,) ambient temperature [deg C].
-    """
-
-    stamps_s: FloatArray
-    currents_a: FloatArray
-    sensors_c: FloatArray
-    links_c: FloatArray
-    ambient_c: FloatArray
+    stamps_s: FloatArray  # (t,) times [s].
+    currents_a: FloatArray  # (t, n) recorded currents [A].
+    sensors_c: FloatArray  # (t, n) recorded temperatures [deg C].
+    links_c: FloatArray  # (t, n) true temperatures of the links [deg C].
+    ambient_c: FloatArray  # (t,) ambient temperature [deg C].
 
     def at(self, stamps_s: FloatArray) -> FloatArray:
         """(m, n) temperatures of the links at some times [deg C]."""

@@ -16,24 +16,16 @@ from visioncal.simulation.truth import write_truth
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentOptions(ArmOptions):
-    """Options of a simulated session with an instrument.
+    """Options of a simulated session with an instrument."""
 
-    Attributes:
-        stops: Number of stops.
-        points: Positions of the points on the flange [m]; a single one if poses are read.
-        poses: Whether the first point is a probe whose rotation is read as well.
-        sigma_m: Noise of a coordinate [m].
-        sigma_rad: Noise of a probe's rotation [rad].
-        seed: Seed of everything random.
-    """
-
-    stops: int = 30
+    stops: int = 30  # Number of stops.
+    # Positions of the points on the flange [m]; a single one if poses are read.
     points: tuple[tuple[float, float, float], ...] = ((0.03, -0.02, 0.12),)
-    poses: bool = False
-    sigma_m: float = 2e-5
-    sigma_rad: float = 5e-5
+    poses: bool = False  # Whether the first point is a probe whose rotation is read as well.
+    sigma_m: float = 2e-5  # Noise of a coordinate [m].
+    sigma_rad: float = 5e-5  # Noise of a probe's rotation [rad].
     robot_sigma_rad: float = 3e-5
-    seed: int = 0
+    seed: int = 0  # Seed of everything random.
 
 
 THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
@@ -41,25 +33,16 @@ THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
 
 @dataclass(frozen=True, eq=False)
 class InstrumentRecord:
-    """Ground truth and readings.
+    """Ground truth and readings."""
 
-    Attributes:
-        options: Options of the session.
-        arm: Nominal arm.
-        true_arm: Real arm.
-        base_from_instrument: (4, 4) pose of the instrument.
-        flange_from_probe: (4, 4) pose of the probe; the first point, without rotation, if only
-            positions are read.
-        joints: (s, n) joint angles [rad].
-        rows: Readings: stop, point, and (4, 4) pose in the instrument's frame.
-    """
-
-    options: InstrumentOptions
-    arm: DhArm
-    true_arm: DhArm
-    base_from_instrument: FloatArray
+    options: InstrumentOptions  # Options of the session.
+    arm: DhArm  # Nominal arm.
+    true_arm: DhArm  # Real arm.
+    base_from_instrument: FloatArray  # (4, 4) pose of the instrument.
+    # (4, 4) pose of the probe; the first point, without rotation, if only positions are read.
     flange_from_probe: FloatArray
-    joints: FloatArray
+    joints: FloatArray  # (s, n) joint angles [rad].
+    # Readings: stop, point, and (4, 4) pose in the instrument's frame.
     rows: tuple[tuple[int, int, FloatArray], ...]
 
 

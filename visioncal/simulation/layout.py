@@ -24,72 +24,45 @@ _TWO_BOARDS = ("first", "second")
 
 @dataclass(frozen=True)
 class RobotAt(ArmOptions):
-    """A robot in the cell, facing the centre.
+    """A robot in the cell, facing the centre."""
 
-    Attributes:
-        name: Name in the session.
-        place_m: Position of its base in the cell [m].
-        warms_up: Whether it is cold at the first stop and warms up while it works.
-        wrong_stops: Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
-    """
-
-    name: str
-    place_m: tuple[float, float, float]
+    name: str  # Name in the session.
+    place_m: tuple[float, float, float]  # Position of its base in the cell [m].
     robot: str = field(default="ur5e", kw_only=True)
-    warms_up: bool = False
-    wrong_stops: int = 0
+    warms_up: bool = False  # Whether it is cold at the first stop and warms up while it works.
+    wrong_stops: int = 0  # Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
 
 
 @dataclass(frozen=True, eq=False)
 class CameraAt(CameraOptions):
-    """A camera on a robot's flange, or fixed in the cell.
+    """A camera on a robot's flange, or fixed in the cell."""
 
-    Attributes:
-        name: Name in the session.
-        on: The robot that carries it, or `cell`.
-        place_m: Position in the cell, if fixed [m].
-        looks_at_m: Point that a fixed one looks at [m].
-        at_stops: Whether it takes images at the robots' stops, and not only in sweeps.
-    """
-
-    name: str
-    on: str = CELL
-    place_m: tuple[float, float, float] = (0.0, -1.0, 1.1)
-    looks_at_m: tuple[float, float, float] = MIDDLE_M
-    at_stops: bool = True
+    name: str  # Name in the session.
+    on: str = CELL  # The robot that carries it, or `cell`.
+    place_m: tuple[float, float, float] = (0.0, -1.0, 1.1)  # Position in the cell, if fixed [m].
+    looks_at_m: tuple[float, float, float] = MIDDLE_M  # Point that a fixed one looks at [m].
+    at_stops: bool = True  # Whether it takes images at the robots' stops, and not only in sweeps.
 
 
 @dataclass(frozen=True)
 class BoardAt(Sheet):
-    """A board on a robot's flange, or fixed in the cell.
+    """A board on a robot's flange, or fixed in the cell."""
 
-    Attributes:
-        name: Name in the session.
-        on: The robot that carries it, or `cell`.
-        place_m: Position of its centre in the cell, if fixed [m].
-        tilt_rad: Tilt towards the centre of the cell [rad].
-    """
-
-    name: str
-    on: str = CELL
+    name: str  # Name in the session.
+    on: str = CELL  # The robot that carries it, or `cell`.
+    # Position of its centre in the cell, if fixed [m].
     place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tilt_rad: float = 0.0
+    tilt_rad: float = 0.0  # Tilt towards the centre of the cell [rad].
     target: Target = field(default=BOARDS["charuco"], kw_only=True)
 
 
 @dataclass(frozen=True)
 class PointAt:
-    """A point read by instruments, on a flange or in the cell.
+    """A point read by instruments, on a flange or in the cell."""
 
-    Attributes:
-        name: Name in the session.
-        on: The robot that carries it, or `cell`.
-        place_m: Position in the frame of that flange, or of the cell [m].
-    """
-
-    name: str
-    on: str
-    place_m: tuple[float, float, float]
+    name: str  # Name in the session.
+    on: str  # The robot that carries it, or `cell`.
+    place_m: tuple[float, float, float]  # Position in the frame of that flange, or of the cell [m].
 
 
 @dataclass(frozen=True)
@@ -97,52 +70,32 @@ class InstrumentAt:
     """An upright instrument in the cell that reads every point at every stop.
 
     If it also reads rotations, points are probes, with the axes of the flange.
-
-    Attributes:
-        name: Name in the session.
-        place_m: Position in the cell [m].
-        turn_rad: Rotation about the vertical [rad].
-        sigma_m: Noise of readings, per axis [m].
-        sigma_rad: Noise of rotation readings [rad]; 0 if it reads no rotations.
     """
 
-    name: str
-    place_m: tuple[float, float, float]
-    turn_rad: float = 0.0
-    sigma_m: float = 1.5e-5
-    sigma_rad: float = 0.0
+    name: str  # Name in the session.
+    place_m: tuple[float, float, float]  # Position in the cell [m].
+    turn_rad: float = 0.0  # Rotation about the vertical [rad].
+    sigma_m: float = 1.5e-5  # Noise of readings, per axis [m].
+    sigma_rad: float = 0.0  # Noise of rotation readings [rad]; 0 if it reads no rotations.
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A component that is pushed during the recording.
+    """A component that is pushed during the recording."""
 
-    Attributes:
-        frame: Frame that moves on its parent, as `target_floor` or `cam_left`.
-        from_stop: First stop after the push; None for half way.
-        shift_m: Length of the displacement, in a random direction [m].
-        turn_rad: Angle of the rotation, about a random axis [rad].
-    """
-
-    frame: str
-    from_stop: int | None = None
-    shift_m: float = 0.005
-    turn_rad: float = 0.01
+    frame: str  # Frame that moves on its parent, as `target_floor` or `cam_left`.
+    from_stop: int | None = None  # First stop after the push; None for half way.
+    shift_m: float = 0.005  # Length of the displacement, in a random direction [m].
+    turn_rad: float = 0.01  # Angle of the rotation, about a random axis [rad].
 
 
 @dataclass(frozen=True)
 class Swept(SweepOptions):
-    """A camera that observes a target during a robot's motion, which carries one of the two.
+    """A camera that observes a target during a robot's motion, which carries one of the two."""
 
-    Attributes:
-        camera: The camera.
-        robot: The robot, which moves smoothly through its stops.
-        target: The target.
-    """
-
-    camera: str
-    robot: str
-    target: str
+    camera: str  # The camera.
+    robot: str  # The robot, which moves smoothly through its stops.
+    target: str  # The target.
     stops: int = field(default=10, kw_only=True)
     frames_hz: float = field(default=10.0, kw_only=True)
 
@@ -152,43 +105,33 @@ class NetworkOptions(DrawOptions):
     """A simulated cell of several robots, cameras and boards; by default two, two and three.
 
     All poses deviate slightly from the stated ones. There is no occlusion.
-
-    Attributes:
-        robots: The robots.
-        cameras: The cameras.
-        boards: The boards.
-        instruments: The instruments.
-        points: Points that these read.
-        stops: Number of stops, common to all robots.
-        pace_s: Time between stops [s]; 0 for rows without a time.
-        share_seen: Share of the possible observations that is recorded, at random.
-        lens_views: Number of images of each camera for its intrinsics only, with a hand-held board.
-        moved: Components that are pushed during the recording.
-        sweeps: Sweeps after the stops.
-        swapped_rows: Number of pairs of rows of one camera and board whose images are exchanged.
-        stray_images: Number of rows whose image is from another stop.
     """
 
+    # The robots.
     robots: tuple[RobotAt, ...] = (RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02)))
+    # The cameras.
     cameras: tuple[CameraAt, ...] = (
         CameraAt("left", place_m=(0.0, -1.0, 1.1)),
         CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
     )
+    # The boards.
     boards: tuple[BoardAt, ...] = (
         BoardAt("floor", place_m=(0.0, 0.0, 0.05)),
         BoardAt("plate_a", "a", target=BOARDS["checkerboard"]),
         BoardAt("plate_b", "b"),
     )
-    instruments: tuple[InstrumentAt, ...] = ()
-    points: tuple[PointAt, ...] = ()
-    stops: int = 30
-    pace_s: float = 0.0
-    share_seen: float = 1.0
+    instruments: tuple[InstrumentAt, ...] = ()  # The instruments.
+    points: tuple[PointAt, ...] = ()  # Points that these read.
+    stops: int = 30  # Number of stops, common to all robots.
+    pace_s: float = 0.0  # Time between stops [s]; 0 for rows without a time.
+    share_seen: float = 1.0  # Share of the possible observations that is recorded, at random.
+    # Number of images of each camera for its intrinsics only, with a hand-held board.
     lens_views: int = 0
-    moved: tuple[Moved, ...] = ()
-    sweeps: tuple[Swept, ...] = ()
+    moved: tuple[Moved, ...] = ()  # Components that are pushed during the recording.
+    sweeps: tuple[Swept, ...] = ()  # Sweeps after the stops.
+    # Number of pairs of rows of one camera and board whose images are exchanged.
     swapped_rows: int = 0
-    stray_images: int = 0
+    stray_images: int = 0  # Number of rows whose image is from another stop.
 
     def __post_init__(self) -> None:
         if self.stops < 1:
@@ -233,17 +176,13 @@ class NetworkOptions(DrawOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Second(Sheet):
-    """A second board of a cell, at which every other stop aims; it is observed whenever in view.
-
-    Attributes:
-        turn_rad: Angle around the base from the first board (eye-in-hand), or direction of its
-            offset on the flange (eye-to-hand) [rad].
-        tilt_rad: Tilt: towards the base, or sideways [rad].
-    """
+    """A second board of a cell, at which every other stop aims; it is observed whenever in view."""
 
     target: Target = BOARDS["checkerboard"]
+    # Angle around the base from the first board (eye-in-hand), or direction of its offset on the
+    # flange (eye-to-hand) [rad].
     turn_rad: float = 1.4
-    tilt_rad: float = 0.3
+    tilt_rad: float = 0.3  # Tilt: towards the base, or sideways [rad].
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -251,41 +190,32 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
     """A simulated cell of one robot and one camera at random poses.
 
     The defaults are a well-maintained cell.
-
-    Attributes:
-        mount: Where the camera is.
-        views: Number of views.
-        target: Board as its file describes it.
-        distance_m: Range of the camera's distance from the board's centre [m]; None for a range in
-            which the board fills the image well, limited to 0.7 to 1.2 m for a fixed camera.
-        tilt_rad: Range of the angle between view and board normal [rad].
-        roll_rad: Largest rotation about the optical axis, either way [rad].
-        motion: `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
-            `translation` only.
-        branches: Whether elbow, shoulder and wrist configurations vary between views; else all
-            postures are close to each other, as an operator would teach them.
-        cut_views: Share of views in which the image's edge may cut a ChArUco board.
-        wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
-        board_scale: Printed size over stated size.
-        board_bow_m: Depth of the board's corners relative to its centre, away from the camera [m].
-        second: Second board; None for a single board.
-        camera_moved_m: Displacement of the camera from its usual pose in this cell [m].
     """
 
-    mount: Mount = "eye-in-hand"
-    views: int = 20
-    target: Target = BOARDS["charuco"]
+    mount: Mount = "eye-in-hand"  # Where the camera is.
+    views: int = 20  # Number of views.
+    target: Target = BOARDS["charuco"]  # Board as its file describes it.
+    # Range of the camera's distance from the board's centre [m]; None for a range in which the
+    # board fills the image well, limited to 0.7 to 1.2 m for a fixed camera.
     distance_m: tuple[float, float] | None = None
+    # Range of the angle between view and board normal [rad].
     tilt_rad: tuple[float, float] = Viewpoints.tilt_rad
+    # Largest rotation about the optical axis, either way [rad].
     roll_rad: float = Viewpoints.roll_rad
+    # `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
+    # `translation` only.
     motion: Motion = Viewpoints.motion
+    # Whether elbow, shoulder and wrist configurations vary between views; else all postures are
+    # close to each other, as an operator would teach them.
     branches: bool = False
+    # Share of views in which the image's edge may cut a ChArUco board.
     cut_views: float = Viewpoints.cut_views
-    wrong_views: int = 0
-    board_scale: float = 1.0
+    wrong_views: int = 0  # Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
+    board_scale: float = 1.0  # Printed size over stated size.
+    # Depth of the board's corners relative to its centre, away from the camera [m].
     board_bow_m: float = 0.0
-    second: Second | None = None
-    camera_moved_m: float = 0.0
+    second: Second | None = None  # Second board; None for a single board.
+    camera_moved_m: float = 0.0  # Displacement of the camera from its usual pose in this cell [m].
 
     def __post_init__(self) -> None:
         check_fields(self)

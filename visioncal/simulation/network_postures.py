@@ -105,21 +105,13 @@ def _board(board: BoardAt, rng: np.random.Generator) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Aim:
-    """A possible aim of a robot: a camera that sees a board, one of which it carries.
+    """A possible aim of a robot: a camera that sees a board, one of which it carries."""
 
-    Attributes:
-        camera: The camera.
-        board: The board.
-        carries_camera: Whether the robot carries the camera.
-        other: Robot that carries the other of the two; `cell` for none.
-        views: Viewpoints of this camera towards this board.
-    """
-
-    camera: CameraAt
-    board: BoardAt
-    carries_camera: bool
-    other: str
-    views: Viewpoints
+    camera: CameraAt  # The camera.
+    board: BoardAt  # The board.
+    carries_camera: bool  # Whether the robot carries the camera.
+    other: str  # Robot that carries the other of the two; `cell` for none.
+    views: Viewpoints  # Viewpoints of this camera towards this board.
 
 
 def _aims(options: NetworkOptions, robot: RobotAt, stand: Sequence[str]) -> list[_Aim]:

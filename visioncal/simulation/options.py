@@ -74,25 +74,16 @@ TARGETS: Mapping[str, Target] = {board.name: board for board in BOARDS.values()}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraOptions:
-    """A camera with its stated intrinsics and the quality of its images.
+    """A camera with its stated intrinsics and the quality of its images."""
 
-    Attributes:
-        camera: True optics.
-        state_intrinsics: Whether the session states the intrinsics.
-        lens_mismatch_px: Error of the stated intrinsics, as root mean square over the image [px].
-        blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
-        image_noise: Noise of rendered images [grey levels].
-        vignetting: Relative loss of light in the image's corners.
-        jpeg_quality: 1 to 100; None writes lossless PNG.
-    """
-
-    camera: Camera = field(default_factory=wide_camera)
-    state_intrinsics: bool = True
+    camera: Camera = field(default_factory=wide_camera)  # True optics.
+    state_intrinsics: bool = True  # Whether the session states the intrinsics.
+    # Error of the stated intrinsics, as root mean square over the image [px].
     lens_mismatch_px: float = 0.0
-    blur_px: float = 0.7
-    image_noise: float = 2.0
-    vignetting: float = 0.2
-    jpeg_quality: int | None = None
+    blur_px: float = 0.7  # Defocus of rendered images, as a Gaussian's sigma [px].
+    image_noise: float = 2.0  # Noise of rendered images [grey levels].
+    vignetting: float = 0.2  # Relative loss of light in the image's corners.
+    jpeg_quality: int | None = None  # 1 to 100; None writes lossless PNG.
 
     def stated(self, rng: np.random.Generator) -> Camera:
         """The intrinsics as the session states them."""
@@ -101,28 +92,19 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
-    """Timing and noise of a sweep.
+    """Timing and noise of a sweep."""
 
-    Attributes:
-        stops: Number of postures on its path.
-        pace_s: Time between postures [s].
-        robot_hz: Samples of the controller per second.
-        frames_hz: Frames of the camera per second.
-        readout_s: Time from an image's first row to its last, with the stamp at the middle [s]; 0
-            for a global shutter.
-        camera_minus_robot_s: Offset of the camera's clock relative to the controller's [s].
-        jitter_s: Standard deviation of the camera's stamps [s].
-        encoder_sigma_rad: Noise of the reported joint angles [rad].
-    """
-
-    stops: int = 12
-    pace_s: float = 1.7
-    robot_hz: float = 125.0
-    frames_hz: float = 30.0
+    stops: int = 12  # Number of postures on its path.
+    pace_s: float = 1.7  # Time between postures [s].
+    robot_hz: float = 125.0  # Samples of the controller per second.
+    frames_hz: float = 30.0  # Frames of the camera per second.
+    # Time from an image's first row to its last, with the stamp at the middle [s]; 0 for a global
+    # shutter.
     readout_s: float = 0.0
+    # Offset of the camera's clock relative to the controller's [s].
     camera_minus_robot_s: float = 0.0
-    jitter_s: float = 0.0
-    encoder_sigma_rad: float = 2e-6
+    jitter_s: float = 0.0  # Standard deviation of the camera's stamps [s].
+    encoder_sigma_rad: float = 2e-6  # Noise of the reported joint angles [rad].
 
     def __post_init__(self) -> None:
         if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:

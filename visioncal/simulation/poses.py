@@ -28,26 +28,18 @@ LEAST_SHARE = 0.6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Viewpoints:
-    """Range of viewpoints of a camera towards a board.
+    """Range of viewpoints of a camera towards a board."""
 
-    Attributes:
-        camera: Optics of the camera.
-        board: The board.
-        distance_m: Range of the camera's distance from the board's centre [m].
-        tilt_rad: Range of the angle between view and board normal [rad].
-        roll_rad: Largest rotation about the optical axis, either way [rad].
-        motion: `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
-            `translation` only.
-        cut_views: Share of views in which the image's edge may cut a board that can be detected in
-            part.
-    """
-
-    camera: Camera
-    board: Sheet
-    distance_m: tuple[float, float]
+    camera: Camera  # Optics of the camera.
+    board: Sheet  # The board.
+    distance_m: tuple[float, float]  # Range of the camera's distance from the board's centre [m].
+    # Range of the angle between view and board normal [rad].
     tilt_rad: tuple[float, float] = (0.1, 0.75)
-    roll_rad: float = 1.3
+    roll_rad: float = 1.3  # Largest rotation about the optical axis, either way [rad].
+    # `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
+    # `translation` only.
     motion: Motion = "free"
+    # Share of views in which the image's edge may cut a board that can be detected in part.
     cut_views: float = 0.1
 
     def mean(self) -> FloatArray:

@@ -38,47 +38,29 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class _Spline:
-    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any point.
+    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any point."""
 
-    Attributes:
-        coefficients: (k, k) operator from values at the knots to spline coefficients.
-        first: (n,) first of the four splines at each sub-pixel.
-        weights: (n, 4) values of the four splines there.
-    """
-
-    coefficients: FloatArray
-    first: IntArray
-    weights: Float32Array
+    coefficients: FloatArray  # (k, k) operator from values at the knots to spline coefficients.
+    first: IntArray  # (n,) first of the four splines at each sub-pixel.
+    weights: Float32Array  # (n, 4) values of the four splines there.
 
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """Rays at the knots of a grid over a patch, and their interpolation to sub-pixels.
+    """Rays at the knots of a grid over a patch, and their interpolation to sub-pixels."""
 
-    Attributes:
-        px: (a, b, 2) knots [px].
-        directions: (a, b, 3) unit vectors in the camera frame.
-        down: Splines along columns of pixels.
-        across: Splines along rows of pixels.
-    """
-
-    px: FloatArray
-    directions: FloatArray
-    down: _Spline
-    across: _Spline
+    px: FloatArray  # (a, b, 2) knots [px].
+    directions: FloatArray  # (a, b, 3) unit vectors in the camera frame.
+    down: _Spline  # Splines along columns of pixels.
+    across: _Spline  # Splines along rows of pixels.
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Values of a grid at all sub-pixel columns, as spline coefficients along the columns.
+    """Values of a grid at all sub-pixel columns, as spline coefficients along the columns."""
 
-    Attributes:
-        mean: Mean of the values, subtracted to preserve single precision.
-        coefficients: (a, columns).
-    """
-
-    mean: np.float32
-    coefficients: Float32Array
+    mean: np.float32  # Mean of the values, subtracted to preserve single precision.
+    coefficients: Float32Array  # (a, columns).
 
 
 def trace(camera: Camera, patch: Patch, samples: int) -> Raster:

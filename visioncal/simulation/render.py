@@ -46,48 +46,28 @@ _SHADES = 18
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """A plane behind the board with a periodic texture, under a lamp.
+    """A plane behind the board with a periodic texture, under a lamp."""
 
-    Attributes:
-        texture: Image of the plane.
-        texel_m: Side of a texel [m].
-        depth_m: Distance of the plane below the board (a table), or from the camera (a wall).
-        lamp_m: Radius of the lamp's spot [m].
-        moves: Whether it moves with the board, as a table does, and not with the camera.
-    """
-
-    texture: Image
-    texel_m: float
-    depth_m: float
-    lamp_m: float
-    moves: bool
+    texture: Image  # Image of the plane.
+    texel_m: float  # Side of a texel [m].
+    depth_m: float  # Distance of the plane below the board (a table), or from the camera (a wall).
+    lamp_m: float  # Radius of the lamp's spot [m].
+    moves: bool  # Whether it moves with the board, as a table does, and not with the camera.
 
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """Data shared by all images of one board by one camera.
+    """Data shared by all images of one board by one camera."""
 
-    Attributes:
-        camera: The camera.
-        board: Printed board.
-        sheet: Texture of the board.
-        backdrop: Background.
-        sights: Observations of the camera.
-        arm: Arm that holds the board before a fixed camera; None if not visible.
-        joints: (s, n) postures of the arm at the stops [rad].
-        cam_from_base: (4, 4) pose of the arm's base.
-        noise: Random generator by view.
-    """
-
-    camera: CameraOptions
-    board: Sheet
-    sheet: SheetTexture
-    backdrop: Backdrop
-    sights: Sequence[SimulatedSight]
-    arm: DhArm | None
-    joints: FloatArray
-    cam_from_base: FloatArray
-    noise: Callable[[int], np.random.Generator]
+    camera: CameraOptions  # The camera.
+    board: Sheet  # Printed board.
+    sheet: SheetTexture  # Texture of the board.
+    backdrop: Backdrop  # Background.
+    sights: Sequence[SimulatedSight]  # Observations of the camera.
+    arm: DhArm | None  # Arm that holds the board before a fixed camera; None if not visible.
+    joints: FloatArray  # (s, n) postures of the arm at the stops [rad].
+    cam_from_base: FloatArray  # (4, 4) pose of the arm's base.
+    noise: Callable[[int], np.random.Generator]  # Random generator by view.
 
 
 def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = None) -> RenderScene:

@@ -35,19 +35,12 @@ _ROUNDS = 5
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A smooth joint path through a robot's stops, and its sampling times.
+    """A smooth joint path through a robot's stops, and its sampling times."""
 
-    Attributes:
-        options: Options of the sweep.
-        path: Joint path (k, n) [rad] over k times [s], with continuous acceleration.
-        robot_s: Times of the controller's reports, by its own clock [s].
-        taken_s: Times of the frames' middle rows, by that clock [s].
-    """
-
-    options: SweepOptions
-    path: CubicSpline
-    robot_s: FloatArray
-    taken_s: FloatArray
+    options: SweepOptions  # Options of the sweep.
+    path: CubicSpline  # Joint path (k, n) [rad] over k times [s], with continuous acceleration.
+    robot_s: FloatArray  # Times of the controller's reports, by its own clock [s].
+    taken_s: FloatArray  # Times of the frames' middle rows, by that clock [s].
 
     @classmethod
     def through(cls, stops: FloatArray, options: SweepOptions) -> "Passage":

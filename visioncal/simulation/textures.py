@@ -22,17 +22,13 @@ _SHADOW_STRENGTH = 0.7
 
 @dataclass(frozen=True, eq=False)
 class SheetTexture:
-    """Frontal image of the sheet at halving resolutions.
+    """Frontal image of the sheet at halving resolutions."""
 
-    Attributes:
-        origin_m: (2,) outer corner of texel (0, 0) in the flat, unscaled target frame [m].
-        texel_m: Side of a texel at each level [m], ascending.
-        levels: (h, w, 2) images at each level: brightness times coverage, and coverage. Where
-            coverage is partial, the background shows through.
-    """
-
+    # (2,) outer corner of texel (0, 0) in the flat, unscaled target frame [m].
     origin_m: FloatArray
-    texel_m: tuple[float, ...]
+    texel_m: tuple[float, ...]  # Side of a texel at each level [m], ascending.
+    # (h, w, 2) images at each level: brightness times coverage, and coverage. Where coverage is
+    # partial, the background shows through.
     levels: tuple[Image, ...]
 
 

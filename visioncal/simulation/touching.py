@@ -43,36 +43,22 @@ _TRIES = 40
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """Touches of one table.
+    """Touches of one table."""
 
-    Attributes:
-        columns: Further columns of the rows, beside pose and joints.
-        base_from_flange: (n, 4, 4) reported poses.
-        joints: (n, k) reported joint angles [rad].
-    """
-
-    columns: Mapping[str, tuple[str, ...]]
-    base_from_flange: FloatArray
-    joints: FloatArray
+    columns: Mapping[str, tuple[str, ...]]  # Further columns of the rows, beside pose and joints.
+    base_from_flange: FloatArray  # (n, 4, 4) reported poses.
+    joints: FloatArray  # (n, k) reported joint angles [rad].
 
 
 @dataclass(frozen=True, eq=False)
 class Touching:
-    """Touches by the arm of a cell.
+    """Touches by the arm of a cell."""
 
-    Attributes:
-        flange_from_tool: (4, 4) pose of the tool; its tip is the origin.
-        base_from_fixture: (4, 4) pose of the fixture.
-        tip: Touches of one point, to calibrate the tool.
-        features: Touches of the fixture's origin, x axis and xy plane.
-        points: Touches of the drawing's points.
-    """
-
-    flange_from_tool: FloatArray
-    base_from_fixture: FloatArray
-    tip: Touched
-    features: Touched
-    points: Touched
+    flange_from_tool: FloatArray  # (4, 4) pose of the tool; its tip is the origin.
+    base_from_fixture: FloatArray  # (4, 4) pose of the fixture.
+    tip: Touched  # Touches of one point, to calibrate the tool.
+    features: Touched  # Touches of the fixture's origin, x axis and xy plane.
+    points: Touched  # Touches of the drawing's points.
 
     def transforms(self, robot: str = "") -> dict[str, FloatArray]:
         """Poses of tool and fixture by the names of a result, for a robot by name."""

@@ -17,26 +17,17 @@ from visioncal.simulation.layout import CellOptions
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Ground truth of a simulated session.
+    """Ground truth of a simulated session."""
 
-    Attributes:
-        transforms: True edges by their names in results, each (4, 4).
-        camera: True intrinsics.
-        base_from_flange: (m, 4, 4) true flange poses.
-        cam_from_target: (m, 4, 4) true board poses.
-        wrong_views: Views with a wrong report.
-        arm: Real arm: Denavit-Hartenberg parameters by name; a, d [m], alpha, beta, offset [rad],
-            each (n,).
-        options: Options of the cell as plain values, including noise levels.
-    """
-
-    transforms: Mapping[str, FloatArray]
-    camera: Camera
-    base_from_flange: FloatArray
-    cam_from_target: FloatArray
-    wrong_views: tuple[int, ...]
+    transforms: Mapping[str, FloatArray]  # True edges by their names in results, each (4, 4).
+    camera: Camera  # True intrinsics.
+    base_from_flange: FloatArray  # (m, 4, 4) true flange poses.
+    cam_from_target: FloatArray  # (m, 4, 4) true board poses.
+    wrong_views: tuple[int, ...]  # Views with a wrong report.
+    # Real arm: Denavit-Hartenberg parameters by name; a, d [m], alpha, beta, offset [rad], each
+    # (n,).
     arm: Mapping[str, FloatArray]
-    options: Mapping[str, Any]
+    options: Mapping[str, Any]  # Options of the cell as plain values, including noise levels.
 
 
 def truth_path(folder: Path | str) -> Path:

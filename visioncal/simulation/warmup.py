@@ -14,21 +14,13 @@ from visioncal.simulation.observing import observed, simulate
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """Schedule of views during a warm-up.
+    """Schedule of views during a warm-up."""
 
-    Attributes:
-        first: Number of different views at the start, before the arm is warm.
-        references: Number of them that are repeated.
-        every_s: Time between repetitions [s].
-        minutes: Duration of the repetitions [min].
-        pace_s: Time between views [s].
-    """
-
-    first: int = 24
-    references: int = 6
-    every_s: float = 300.0
-    minutes: float = 100.0
-    pace_s: float = 5.0
+    first: int = 24  # Number of different views at the start, before the arm is warm.
+    references: int = 6  # Number of them that are repeated.
+    every_s: float = 300.0  # Time between repetitions [s].
+    minutes: float = 100.0  # Duration of the repetitions [min].
+    pace_s: float = 5.0  # Time between views [s].
 
     def schedule(self) -> tuple[FloatArray, Sequence[int]]:
         """(m,) times [s], and indices of the views."""
@@ -43,21 +35,13 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class WarmUpOptions:
-    """Options of a cell whose arm warms up.
+    """Options of a cell whose arm warms up."""
 
-    Attributes:
-        cell: The cell.
-        heat: Thermal parameters of the arm; None draws them by the cell's seed.
-        round: Schedule of views.
-        hours: Duration of the temperature record [h].
-        temperatures: Whether the controller reports temperatures; otherwise currents.
-    """
-
-    cell: CellOptions = field(default_factory=CellOptions)
-    heat: Heat | None = None
-    round: Round = field(default_factory=Round)
-    hours: float = 5.0
-    temperatures: bool = True
+    cell: CellOptions = field(default_factory=CellOptions)  # The cell.
+    heat: Heat | None = None  # Thermal parameters of the arm; None draws them by the cell's seed.
+    round: Round = field(default_factory=Round)  # Schedule of views.
+    hours: float = 5.0  # Duration of the temperature record [h].
+    temperatures: bool = True  # Whether the controller reports temperatures; otherwise currents.
 
     @property
     def heats(self) -> Heat:

@@ -17,17 +17,12 @@ _INVERSE_ITERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Projected points and their Jacobians.
+    """Projected points and their Jacobians."""
 
-    Attributes:
-        px: (n, 2) pixels.
-        jacobian_point: (n, 2, 3) Jacobian with respect to the point in the camera's frame [px/m].
-        jacobian_intrinsics: (n, 2, 4 + k) Jacobian with respect to fx, fy, cx, cy and the k
-            coefficients.
-    """
-
-    px: FloatArray
+    px: FloatArray  # (n, 2) pixels.
+    # (n, 2, 3) Jacobian with respect to the point in the camera's frame [px/m].
     jacobian_point: FloatArray
+    # (n, 2, 4 + k) Jacobian with respect to fx, fy, cx, cy and the k coefficients.
     jacobian_intrinsics: FloatArray
 
 

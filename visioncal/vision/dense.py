@@ -57,23 +57,15 @@ _SEARCHES = ((320, 0.0), (320, 1.5), (640, 0.0), (640, 2.0), (640, 3.0), (640, 6
 
 @dataclass(frozen=True, eq=False)
 class DenseCorners:
-    """Corners of one image, and what blurs it.
+    """Corners of one image, and what blurs it."""
 
-    Attributes:
-        ids: (n,) corner ids, ascending.
-        px: (n, 2) positions [px].
-        sigma_px: (n,) standard deviation of a coordinate, from the residuals [px].
-        blur_px: Sigma of the Gaussian [px].
-        motion_px: (2,) motion along u and v during the exposure; its sign is arbitrary [px].
-        noise: Standard deviation of a pixel of the reduced image [grey levels].
-    """
-
-    ids: IntArray
-    px: FloatArray
-    sigma_px: FloatArray
-    blur_px: float
+    ids: IntArray  # (n,) corner ids, ascending.
+    px: FloatArray  # (n, 2) positions [px].
+    sigma_px: FloatArray  # (n,) standard deviation of a coordinate, from the residuals [px].
+    blur_px: float  # Sigma of the Gaussian [px].
+    # (2,) motion along u and v during the exposure; its sign is arbitrary [px].
     motion_px: FloatArray
-    noise: float
+    noise: float  # Standard deviation of a pixel of the reduced image [grey levels].
 
     @property
     def width_px(self) -> float:
@@ -124,26 +116,17 @@ class _Fit:
 
     The parameters are the homography from normalised pixels to squares (8), the lens (1), s and m
     (3), and o and g with their slopes (6).
-
-    Attributes:
-        target: The board.
-        factor: By how much the image is reduced.
-        image: (h, w) the part; NaN outside the image.
-        places: (h, w, 2) pixels relative to the middle of the image, in half its diagonal.
-        unit_px: (3,) middle and half the diagonal of the reduced image [px].
-        texture: The print, light being 1.
-        start: (8,) homography to start from.
-        side_px: Side of a square [px].
     """
 
-    target: Target
-    factor: int
-    image: FloatArray
+    target: Target  # The board.
+    factor: int  # By how much the image is reduced.
+    image: FloatArray  # (h, w) the part; NaN outside the image.
+    # (h, w, 2) pixels relative to the middle of the image, in half its diagonal.
     places: FloatArray
-    unit_px: FloatArray
-    texture: FloatArray
-    start: FloatArray
-    side_px: float
+    unit_px: FloatArray  # (3,) middle and half the diagonal of the reduced image [px].
+    texture: FloatArray  # The print, light being 1.
+    start: FloatArray  # (8,) homography to start from.
+    side_px: float  # Side of a square [px].
 
     @classmethod
     def of(cls, image: Image, target: Target, board: FloatArray, px: FloatArray) -> Self:

@@ -14,18 +14,12 @@ _SQUARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """A grid of dark and light cells.
+    """A grid of dark and light cells."""
 
-    Attributes:
-        corner_m: (2,) outer corner of the first cell in the target's frame [m].
-        cell_m: Side of a cell [m].
-        dark: (rows, columns) mask of dark cells.
-        turn: (2, 2) rotation, with the directions of the grid's columns and rows as columns.
-    """
-
-    corner_m: FloatArray
-    cell_m: float
-    dark: Mask
+    corner_m: FloatArray  # (2,) outer corner of the first cell in the target's frame [m].
+    cell_m: float  # Side of a cell [m].
+    dark: Mask  # (rows, columns) mask of dark cells.
+    # (2, 2) rotation, with the directions of the grid's columns and rows as columns.
     turn: FloatArray = field(default_factory=lambda: np.eye(2))
 
 

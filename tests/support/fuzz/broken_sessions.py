@@ -28,20 +28,14 @@ _CELL = replace(CellOptions(), views=15, seed=11)
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake, and what the first sentence about it has to name.
+    """A mistake, and what the first sentence about it has to name."""
 
-    Attributes:
-        plant: Breaks a sound session's folder.
-        names: Words (a regular expression) of which one tells the cause; - where all is to be well.
-        options: What the cell is otherwise like.
-        joints: Whether its table has joint angles, and its session.toml a robot.
-        is_mended: Whether the fix can be typed here; what takes a new recording is only advised.
-    """
-
-    plant: Callable[[Path], None]
+    plant: Callable[[Path], None]  # Breaks a sound session's folder.
+    # Words (a regular expression) of which one tells the cause; - where all is to be well.
     names: str
-    options: CellOptions = _CELL
-    joints: bool = False
+    options: CellOptions = _CELL  # What the cell is otherwise like.
+    joints: bool = False  # Whether its table has joint angles, and its session.toml a robot.
+    # Whether the fix can be typed here; what takes a new recording is only advised.
     is_mended: bool = True
 
 

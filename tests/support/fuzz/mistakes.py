@@ -20,27 +20,18 @@ HALF_TURNS = [np.diag([*pair, 1.0]) for pair in ((1, 1, 1), (1, -1, -1), (-1, 1,
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of a cell as they are told, and as they are.
+    """Poses of a cell as they are told, and as they are."""
 
-    Attributes:
-        robot: The robot's numbers, as told.
-        camera: The camera's.
-        mount: The mount, as told.
-        true_robot: (n, 4, 4) `base_from_flange`, NaN in rows that no reading can give back.
-        true_mount: The mount.
-        true_scale: What the board's size is to be multiplied with.
-        chain: (n, 4, 4) the poses through the robot's model, where the session has joints.
-        is_measured: Whether the camera's poses come from images.
-    """
-
-    robot: PoseNumbers
-    camera: PoseNumbers
-    mount: Mount
+    robot: PoseNumbers  # The robot's numbers, as told.
+    camera: PoseNumbers  # The camera's.
+    mount: Mount  # The mount, as told.
+    # (n, 4, 4) `base_from_flange`, NaN in rows that no reading can give back.
     true_robot: FloatArray
-    true_mount: Mount
-    true_scale: float = 1.0
+    true_mount: Mount  # The mount.
+    true_scale: float = 1.0  # What the board's size is to be multiplied with.
+    # (n, 4, 4) the poses through the robot's model, where the session has joints.
     chain: FloatArray | None = None
-    is_measured: bool = True
+    is_measured: bool = True  # Whether the camera's poses come from images.
 
 
 Plant = Callable[[Poses, np.random.Generator], Poses]

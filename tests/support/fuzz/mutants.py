@@ -45,24 +45,16 @@ _NAMED = re.compile(r"\[(.+?)\]")
 
 @dataclass(frozen=True)
 class Reading:
-    """How a command is called on an input.
+    """How a command is called on an input."""
 
-    Attributes:
-        command: As typed after `visioncal`.
-        input: The sound input that is broken: a name of `sound_inputs.MAKERS`.
-        words: The arguments: IT is what is broken, OUT an earlier result's folder, NEW a path
-            where nothing is, and [name] another sound input.
-        typed: Whether `sound_inputs.typed` is typed into it.
-        is_kept: Whether what it had written before it failed stays, on purpose.
-        sound: The exit status while nothing is broken.
-    """
-
-    command: str
-    input: str
+    command: str  # As typed after `visioncal`.
+    input: str  # The sound input that is broken: a name of `sound_inputs.MAKERS`.
+    # The arguments: IT is what is broken, OUT an earlier result's folder, NEW a path where nothing
+    # is, and [name] another sound input.
     words: str
-    typed: bool = False
-    is_kept: bool = False
-    sound: int = 0
+    typed: bool = False  # Whether `sound_inputs.typed` is typed into it.
+    is_kept: bool = False  # Whether what it had written before it failed stays, on purpose.
+    sound: int = 0  # The exit status while nothing is broken.
 
 
 def _each(command: str, words: str, *inputs: str) -> tuple[Reading, ...]:
@@ -216,31 +208,18 @@ EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "touches.csv", "frames.
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended on a broken input.
+    """How a command ended on a broken input."""
 
-    Attributes:
-        number: The mutant's.
-        reading: What was called.
-        kind: What was broken: a key of `mutators.KINDS`, or `file system`.
-        change: What was done to it.
-        status: The exit status; -1 where it was killed.
-        message: What it wrote to stderr.
-        faults: What must not be.
-        seconds: How long it took.
-        peak_bytes: Most memory, of the whole process.
-        notes: What libraries wrote past the command.
-    """
-
-    number: int
-    reading: Reading
-    kind: str
-    change: str
-    status: int
-    message: str
-    faults: tuple[str, ...]
-    seconds: float
-    peak_bytes: int
-    notes: tuple[str, ...] = ()
+    number: int  # The mutant's.
+    reading: Reading  # What was called.
+    kind: str  # What was broken: a key of `mutators.KINDS`, or `file system`.
+    change: str  # What was done to it.
+    status: int  # The exit status; -1 where it was killed.
+    message: str  # What it wrote to stderr.
+    faults: tuple[str, ...]  # What must not be.
+    seconds: float  # How long it took.
+    peak_bytes: int  # Most memory, of the whole process.
+    notes: tuple[str, ...] = ()  # What libraries wrote past the command.
 
     def __str__(self) -> str:
         words = f"{self.number}: {self.reading.command} {self.reading.words} [{self.reading.input}]"

@@ -27,21 +27,14 @@ BEFORE = {"ur3e": "ur3", "ur5e": "ur5", "ur10e": "ur10"}
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """What a session tells of its robot.
+    """What a session tells of its robot."""
 
-    Attributes:
-        cell: What was seen.
-        joints: (m, n) joint angles as told.
-        poses: (m, 4, 4) `base_from_flange` as told; None where joints are all there is.
-        robot: The model's description; None where none is named.
-        words: What has to be said about it; empty where nothing is wrong.
-    """
-
-    cell: SimulatedCell
-    joints: FloatArray
+    cell: SimulatedCell  # What was seen.
+    joints: FloatArray  # (m, n) joint angles as told.
+    # (m, 4, 4) `base_from_flange` as told; None where joints are all there is.
     poses: FloatArray | None
-    robot: Mapping[str, Any] | None
-    words: str = ""
+    robot: Mapping[str, Any] | None  # The model's description; None where none is named.
+    words: str = ""  # What has to be said about it; empty where nothing is wrong.
 
     @classmethod
     def of(cls, cell: SimulatedCell, *, with_poses: bool) -> "Identifiability":

@@ -15,25 +15,15 @@ ROUNDS, SETTLED = 40, 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A serial arm as it is declared.
+    """A serial arm as it is declared."""
 
-    Attributes:
-        model: What session.toml says: a built-in name, or the name of the file beside it.
-        text: The content of that file; empty for a built-in arm.
-        before: (n, 4, 4) the constant before each joint, about whose z it turns.
-        last: (4, 4) the constant behind the last joint.
-        lower: (n,) limits [rad].
-        upper: (n,) limits [rad].
-        tip: The frame at its end.
-    """
-
-    model: str
-    text: str
-    before: np.ndarray
-    last: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    tip: str
+    model: str  # What session.toml says: a built-in name, or the name of the file beside it.
+    text: str  # The content of that file; empty for a built-in arm.
+    before: np.ndarray  # (n, 4, 4) the constant before each joint, about whose z it turns.
+    last: np.ndarray  # (4, 4) the constant behind the last joint.
+    lower: np.ndarray  # (n,) limits [rad].
+    upper: np.ndarray  # (n,) limits [rad].
+    tip: str  # The frame at its end.
 
     def frames(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(m, n, 4, 4) the joints' frames after their motion, and (m, 4, 4) the tips, at (m, n)."""

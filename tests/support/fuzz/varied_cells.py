@@ -61,49 +61,28 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A cell: what is declared of it, and what is true.
+    """A cell: what is declared of it, and what is true."""
 
-    Attributes:
-        seed: What it was drawn from.
-        facts: Its traits in words, to be counted.
-        mount: Where the camera is.
-        lens: The true lens.
-        camera: `[camera]`, or None.
-        boards: What is printed, by name; an only one's is "".
-        arm: The robot, where it has joints.
-        robot: `[robot]`, or None.
-        camera_edge: (4, 4) flange_from_cam or base_from_cam.
-        board_edges: (4, 4) base_from_target or flange_from_target, by board.
-        start: (n,) joints about which the stops lie, where there is an arm.
-        together: Whether the boards stand side by side and are seen in one image.
-        views: How many stops.
-        sigma: Standard deviations of the robot (rad, m).
-        seen_sigma: Those of measured poses of the board, where no image is taken; else None.
-        light: How images are exposed.
-        rows: What rows tell of the robot: poses, joints or both.
-        square_px: How large a square is in the image.
-        axis: Whether the camera turns about one axis alone.
-    """
-
-    seed: int
-    facts: dict[str, str]
-    mount: str
-    lens: Lens
-    camera: dict | None
-    boards: dict[str, Print]
-    arm: Arm | None
-    robot: dict | None
-    camera_edge: np.ndarray
-    board_edges: dict[str, np.ndarray]
-    start: np.ndarray | None
-    together: bool
-    views: int
-    sigma: tuple[float, float]
+    seed: int  # What it was drawn from.
+    facts: dict[str, str]  # Its traits in words, to be counted.
+    mount: str  # Where the camera is.
+    lens: Lens  # The true lens.
+    camera: dict | None  # `[camera]`, or None.
+    boards: dict[str, Print]  # What is printed, by name; an only one's is "".
+    arm: Arm | None  # The robot, where it has joints.
+    robot: dict | None  # `[robot]`, or None.
+    camera_edge: np.ndarray  # (4, 4) flange_from_cam or base_from_cam.
+    board_edges: dict[str, np.ndarray]  # (4, 4) base_from_target or flange_from_target, by board.
+    start: np.ndarray | None  # (n,) joints about which the stops lie, where there is an arm.
+    together: bool  # Whether the boards stand side by side and are seen in one image.
+    views: int  # How many stops.
+    sigma: tuple[float, float]  # Standard deviations of the robot (rad, m).
+    # Those of measured poses of the board, where no image is taken; else None.
     seen_sigma: tuple[float, float] | None
-    light: Light
-    rows: str
-    square_px: float
-    axis: bool
+    light: Light  # How images are exposed.
+    rows: str  # What rows tell of the robot: poses, joints or both.
+    square_px: float  # How large a square is in the image.
+    axis: bool  # Whether the camera turns about one axis alone.
 
     @property
     def truth(self) -> dict[str, np.ndarray]:

@@ -47,15 +47,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Error:
-    """The error of a result in units of its own sigma.
+    """The error of a result in units of its own sigma."""
 
-    Attributes:
-        per_dof: Mean square over all free directions, which is 1 where the covariance tells it.
-        sigmas: The same as the deviation of one normal number that is as unlikely.
-    """
-
+    # Mean square over all free directions, which is 1 where the covariance tells it.
     per_dof: float
-    sigmas: float
+    sigmas: float  # The same as the deviation of one normal number that is as unlikely.
 
 
 @dataclass

@@ -27,21 +27,13 @@ _UNKNOWNS, _PER_VIEW = 12, 6
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Both edges by the views that agree best, and the residual of every view.
+    """Both edges by the views that agree best, and the residual of every view."""
 
-    Attributes:
-        x: (4, 4) X of `robot * x * camera = z`, in the poses' units.
-        z: (4, 4) Z.
-        shift: (n,) distance of each view's target from Z, in the poses' units.
-        angle: (n,) its rotation relative to Z [rad].
-        lever: Typical distance between camera and target, in the poses' units.
-    """
-
-    x: FloatArray
-    z: FloatArray
-    shift: FloatArray
-    angle: FloatArray
-    lever: float
+    x: FloatArray  # (4, 4) X of `robot * x * camera = z`, in the poses' units.
+    z: FloatArray  # (4, 4) Z.
+    shift: FloatArray  # (n,) distance of each view's target from Z, in the poses' units.
+    angle: FloatArray  # (n,) its rotation relative to Z [rad].
+    lever: float  # Typical distance between camera and target, in the poses' units.
 
     @cached_property
     def residuals(self) -> FloatArray:

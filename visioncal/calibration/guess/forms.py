@@ -32,18 +32,12 @@ class Forms:
 
 @dataclass(frozen=True)
 class Pairing:
-    """A form of the robot's rotations, one of the camera's, and a shift between their rows.
+    """A form of the robot's rotations, one of the camera's, and a shift between their rows."""
 
-    Attributes:
-        robot: Index of the robot's form.
-        camera: Index of the camera's form.
-        shift: As in `Hypothesis`.
-        mismatch_rad: Low quantile of the differences between the angles of relative motions [rad].
-    """
-
-    robot: int
-    camera: int
-    shift: int
+    robot: int  # Index of the robot's form.
+    camera: int  # Index of the camera's form.
+    shift: int  # As in `Hypothesis`.
+    # Low quantile of the differences between the angles of relative motions [rad].
     mismatch_rad: float
 
 

@@ -34,19 +34,15 @@ _ORDERS = {
 
 @dataclass(frozen=True)
 class Turns:
-    """How the numbers of a rotation are read.
+    """How the numbers of a rotation are read."""
 
-    Attributes:
-        form: A name among `ROTATION_FORMS`.
-        written: Where the recorded numbers came from misreading others: the form in which those
-            were misread. Writing the rotations in it gets them back, and they are read as `form`.
-        is_beyond: Whether the middle angles so got back are replaced by those beyond 90 degrees:
-            angles about three axes are written up to 90, those about two axes, as of a tool that
-            points down, reach 180.
-    """
-
-    form: str
+    form: str  # A name among `ROTATION_FORMS`.
+    # Where the recorded numbers came from misreading others: the form in which those were misread.
+    # Writing the rotations in it gets them back, and they are read as `form`.
     written: str = ""
+    # Whether the middle angles so got back are replaced by those beyond 90 degrees: angles about
+    # three axes are written up to 90, those about two axes, as of a tool that points down, reach
+    # 180.
     is_beyond: bool = False
 
     def numbers(self, numbers: PoseNumbers) -> FloatArray:
@@ -66,25 +62,16 @@ class Turns:
 
 @dataclass(frozen=True)
 class SideReading:
-    """How one side's numbers, the robot's or the camera's, are read.
+    """How one side's numbers, the robot's or the camera's, are read."""
 
-    Attributes:
-        turns: How rotations are read.
-        unit: The positions' unit, a name among `UNITS_M`.
-        inverse: Whether the numbers give the inverse of the wanted pose.
-        transposed: Whether rotations are transposed while positions are not those of an inverse.
-        signs: Which axis has the wrong sign.
-        half_turned: Whether the base has to be turned by 180 degrees about its z.
-        scale: Further factor of distances, for a target of another size than stated.
-    """
-
-    turns: Turns
-    unit: str
-    inverse: bool = False
+    turns: Turns  # How rotations are read.
+    unit: str  # The positions' unit, a name among `UNITS_M`.
+    inverse: bool = False  # Whether the numbers give the inverse of the wanted pose.
+    # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
-    signs: Signs = ""
-    half_turned: bool = False
-    scale: float = 1.0
+    signs: Signs = ""  # Which axis has the wrong sign.
+    half_turned: bool = False  # Whether the base has to be turned by 180 degrees about its z.
+    scale: float = 1.0  # Further factor of distances, for a target of another size than stated.
 
     @classmethod
     def as_declared(cls, reading: Reading) -> "SideReading":
@@ -158,23 +145,14 @@ ROW_ORDERS: dict[str, Callable[[int], IntArray]] = {
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One reading of a whole recording.
+    """One reading of a whole recording."""
 
-    Attributes:
-        robot: How the robot's numbers are read.
-        camera: How the camera's are read.
-        mount: How the camera is mounted.
-        shift: The robot's row `i + shift` belongs to the camera's row `i`.
-        swap: Two of the robot's rows that are exchanged; empty for none.
-        order: Order of the rows, a name among `ROW_ORDERS`; empty for that of the views.
-    """
-
-    robot: SideReading
-    camera: SideReading
-    mount: Mount
-    shift: int = 0
-    swap: tuple[int, ...] = ()
-    order: str = ""
+    robot: SideReading  # How the robot's numbers are read.
+    camera: SideReading  # How the camera's are read.
+    mount: Mount  # How the camera is mounted.
+    shift: int = 0  # The robot's row `i + shift` belongs to the camera's row `i`.
+    swap: tuple[int, ...] = ()  # Two of the robot's rows that are exchanged; empty for none.
+    order: str = ""  # Order of the rows, a name among `ROW_ORDERS`; empty for that of the views.
 
     def rows(self, count: int) -> IntArray:
         """(count,) the robot's row for each of the camera's rows; -1 for none."""

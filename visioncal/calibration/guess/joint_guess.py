@@ -74,16 +74,12 @@ class FittedJoints:
 
 @dataclass(frozen=True, eq=False)
 class JointGuess:
-    """The reading of the joints that is right, and its rivals.
+    """The reading of the joints that is right, and its rivals."""
 
-    Attributes:
-        declared: The joints as recorded.
-        best: The reading that explains the poses; the declared one where none stands out.
-        rivals: Other readings that explain them as well and are as simple.
-    """
-
-    declared: FittedJoints
+    declared: FittedJoints  # The joints as recorded.
+    # The reading that explains the poses; the declared one where none stands out.
     best: FittedJoints
+    # Other readings that explain them as well and are as simple.
     rivals: tuple[JointReading, ...] = ()
 
     @property

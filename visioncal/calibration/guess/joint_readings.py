@@ -16,25 +16,16 @@ _COUPLED = (1, 2)
 
 @dataclass(frozen=True, eq=False)
 class JointReading:
-    """One reading of a session's joint angles.
+    """One reading of a session's joint angles."""
 
-    Attributes:
-        robot: The model.
-        mixing: (n, n) the true angles are `mixing @ recorded + zeros`.
-        zeros: (n,) correction of each joint's zero [rad].
-        words: The difference from the declared reading; empty for the declared reading itself.
-        fix: What the user can do about it.
-        columns: The columns concerned, numbered from 0; empty for all.
-        cost: Number of mistakes it implies; a lost zero counts more than one.
-    """
-
-    robot: Robot
-    mixing: FloatArray
-    zeros: FloatArray
+    robot: Robot  # The model.
+    mixing: FloatArray  # (n, n) the true angles are `mixing @ recorded + zeros`.
+    zeros: FloatArray  # (n,) correction of each joint's zero [rad].
+    # The difference from the declared reading; empty for the declared reading itself.
     words: str = ""
-    fix: str = ""
-    columns: tuple[int, ...] = ()
-    cost: float = 0.0
+    fix: str = ""  # What the user can do about it.
+    columns: tuple[int, ...] = ()  # The columns concerned, numbered from 0; empty for all.
+    cost: float = 0.0  # Number of mistakes it implies; a lost zero counts more than one.
 
     @property
     def is_zero(self) -> bool:

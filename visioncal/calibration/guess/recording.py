@@ -74,23 +74,16 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A hypothesis with its fit.
+    """A hypothesis with its fit."""
 
-    Attributes:
-        hypothesis: The reading.
-        fit: Its fit.
-        rows: The camera's rows in the fit.
-        labels: Equivalent readings that close the chain in the same way: the simplest ones; of the
-            declared reading, those with a more plausible cell.
-        cost: See `Recording.cost`.
-        other_mount: An equally plausible label with the other mount; None without one.
-    """
-
-    hypothesis: Hypothesis
-    fit: Fit
-    rows: IntArray
+    hypothesis: Hypothesis  # The reading.
+    fit: Fit  # Its fit.
+    rows: IntArray  # The camera's rows in the fit.
+    # Equivalent readings that close the chain in the same way: the simplest ones; of the declared
+    # reading, those with a more plausible cell.
     labels: tuple[Hypothesis, ...] = ()
-    cost: float = 0.0
+    cost: float = 0.0  # See `Recording.cost`.
+    # An equally plausible label with the other mount; None without one.
     other_mount: Hypothesis | None = None
 
     @property

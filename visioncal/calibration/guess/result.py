@@ -14,31 +14,18 @@ _LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A reading of the poses, and how well it closes the chain.
+    """A reading of the poses, and how well it closes the chain."""
 
-    Attributes:
-        hypothesis: The reading.
-        declared: The declared reading.
-        differences: Words for each difference from the declared reading.
-        rms_mm: Scatter of the target's position over the kept views [mm].
-        rms_deg: Scatter of its orientation [deg].
-        score: Both in one figure without unit, by which readings are compared.
-        agreeing: Number of views that agree with each other.
-        rows: Number of views in the fit.
-        is_board: Whether the camera's poses were measured from images.
-        other_mount: Differences of an equally good and likely reading with the other mount; empty
-            without one.
-    """
-
-    hypothesis: Hypothesis
-    declared: Hypothesis
-    differences: tuple[str, ...]
-    rms_mm: float
-    rms_deg: float
-    score: float
-    agreeing: int
-    rows: int
-    is_board: bool = False
+    hypothesis: Hypothesis  # The reading.
+    declared: Hypothesis  # The declared reading.
+    differences: tuple[str, ...]  # Words for each difference from the declared reading.
+    rms_mm: float  # Scatter of the target's position over the kept views [mm].
+    rms_deg: float  # Scatter of its orientation [deg].
+    score: float  # Both in one figure without unit, by which readings are compared.
+    agreeing: int  # Number of views that agree with each other.
+    rows: int  # Number of views in the fit.
+    is_board: bool = False  # Whether the camera's poses were measured from images.
+    # Differences of an equally good and likely reading with the other mount; empty without one.
     other_mount: tuple[str, ...] = ()
 
     @property
@@ -86,21 +73,13 @@ def _short(value: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """The reading of the poses that is right, and its rivals.
+    """The reading of the poses that is right, and its rivals."""
 
-    Attributes:
-        declared: The declared reading.
-        candidates: The best readings, best first, with the declared one; each represents all
-            readings that residuals cannot distinguish from it.
-        best: The reading that stands out; the declared one where none does.
-        stands_out: Whether another reading than the declared one is clearly right.
-        sentence: The finding, with its figures.
-        notes: What residuals cannot show here, in sentences.
-    """
-
-    declared: Candidate
+    declared: Candidate  # The declared reading.
+    # The best readings, best first, with the declared one; each represents all readings that
+    # residuals cannot distinguish from it.
     candidates: tuple[Candidate, ...]
-    best: Candidate
-    stands_out: bool
-    sentence: str
-    notes: tuple[str, ...] = ()
+    best: Candidate  # The reading that stands out; the declared one where none does.
+    stands_out: bool  # Whether another reading than the declared one is clearly right.
+    sentence: str  # The finding, with its figures.
+    notes: tuple[str, ...] = ()  # What residuals cannot show here, in sentences.

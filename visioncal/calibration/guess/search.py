@@ -87,20 +87,13 @@ class Variant:
 
     The inverse of both sides is the same chain with its unknown edges exchanged, so that the
     camera's positions can stay as they are.
-
-    Attributes:
-        carried: Whether the robot's are those of the inverse pose: rotated and negated.
-        signs: As in `SideReading`.
-        ratio: The robot's unit over the camera's.
-        changes: Number of differences from the declared reading.
-        scale: Further factor of the camera's positions.
     """
 
-    carried: bool
-    signs: Signs
-    ratio: float
-    changes: int
-    scale: float = 1.0
+    carried: bool  # Whether the robot's are those of the inverse pose: rotated and negated.
+    signs: Signs  # As in `SideReading`.
+    ratio: float  # The robot's unit over the camera's.
+    changes: int  # Number of differences from the declared reading.
+    scale: float = 1.0  # Further factor of the camera's positions.
 
 
 def solve_turn(

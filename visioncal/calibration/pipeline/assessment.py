@@ -54,34 +54,21 @@ from visioncal.results.arm import UnseenView
 
 @dataclass(frozen=True, eq=False)
 class FitAssessment:
-    """A fit with its covariance and diagnosis.
+    """A fit with its covariance and diagnosis."""
 
-    Attributes:
-        cell_fit: The fit.
-        problem: The problem of its inliers.
-        covariance: (p, p) of its unknowns, from noise and all other sources.
-        covariance_by_source: (p, p) covariances from sources other than noise, by source.
-        lenses: Lens errors beyond the camera models, by camera.
-        residual_tests: Tests of the residuals of each robot's stops.
-        arms: Results on the arms, by robot.
-        held_out: Residuals of observations that were left out of the fit in turn.
-        moved: Frames that moved, in the order of time.
-        faults: Wrong poses and images that explain outliers.
-        views: Result of each observation.
-        sigmas: Estimated standard deviations, by frame or robot and by name.
-    """
-
-    cell_fit: CellFit
-    problem: Problem
-    covariance: FloatArray
+    cell_fit: CellFit  # The fit.
+    problem: Problem  # The problem of its inliers.
+    covariance: FloatArray  # (p, p) of its unknowns, from noise and all other sources.
+    # (p, p) covariances from sources other than noise, by source.
     covariance_by_source: Mapping[str, FloatArray]
-    lenses: Mapping[str, LensErrors]
-    residual_tests: Mapping[str, ResidualTest]
-    arms: Mapping[str, IdentifiedArm]
-    held_out: HeldOutResiduals
-    moved: tuple[Moved, ...]
-    faults: tuple[PoseFault, ...]
-    views: tuple[ViewResult, ...]
+    lenses: Mapping[str, LensErrors]  # Lens errors beyond the camera models, by camera.
+    residual_tests: Mapping[str, ResidualTest]  # Tests of the residuals of each robot's stops.
+    arms: Mapping[str, IdentifiedArm]  # Results on the arms, by robot.
+    held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
+    moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
+    faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.
+    views: tuple[ViewResult, ...]  # Result of each observation.
+    # Estimated standard deviations, by frame or robot and by name.
     sigmas: Mapping[str, Mapping[str, float]]
 
     @property
@@ -302,17 +289,11 @@ def _residuals(solved: CellFit) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """The held-back observations, at the lenses and boards of the fit.
+    """The held-back observations, at the lenses and boards of the fit."""
 
-    Attributes:
-        rows: The h observations.
-        views: Their poses.
-        problem: Their problem, with the unknowns of the fit.
-    """
-
-    rows: tuple[ObservationRow, ...]
-    views: tuple[ViewPoses, ...]
-    problem: Problem
+    rows: tuple[ObservationRow, ...]  # The h observations.
+    views: tuple[ViewPoses, ...]  # Their poses.
+    problem: Problem  # Their problem, with the unknowns of the fit.
 
 
 def held_back(solved: CellFit, observed: Observed) -> Held | None:

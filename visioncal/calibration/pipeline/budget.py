@@ -76,21 +76,16 @@ def _root_trace(covariance: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class WorkAccuracy:
-    """Accuracy of a point that one camera and one robot locate where their views look.
+    """Accuracy of a point that one camera and one robot locate where their views look."""
 
-    Attributes:
-        point_cam: (3,) the target's middle in the camera's frame, mean over the views [m].
-        distances_m: (2,) least and greatest distance of the middle from the camera [m].
-        budget_mm: Standard deviation of that point's position, by source and as a `total` [mm].
-        radius95_mm: 95 % error radius of its position [mm].
-        spectrum: (12,) standard deviations along the principal directions of both edges, ascending,
-            in units of the largest accepted ones (5 mm, 0.5 deg).
-    """
-
+    # (3,) the target's middle in the camera's frame, mean over the views [m].
     point_cam: FloatArray
-    distances_m: FloatArray
+    distances_m: FloatArray  # (2,) least and greatest distance of the middle from the camera [m].
+    # Standard deviation of that point's position, by source and as a `total` [mm].
     budget_mm: Mapping[str, float]
-    radius95_mm: float
+    radius95_mm: float  # 95 % error radius of its position [mm].
+    # (12,) standard deviations along the principal directions of both edges, ascending, in units of
+    # the largest accepted ones (5 mm, 0.5 deg).
     spectrum: FloatArray
 
 

@@ -24,31 +24,20 @@ from visioncal.estimation.problem_parts import Effect, State
 
 @dataclass(frozen=True, eq=False)
 class CellFit:
-    """The fit of a cell.
+    """The fit of a cell."""
 
-    Attributes:
-        cell: The cell; its rows are the observations in the fit's order.
-        inlier_fit: The inliers, their fit, and the frames that moved.
-        linearised_corners: Linearised corners of lenses and boards; None without images.
-        poses: The pose chosen for each row.
-        unconnected: Frames that no observation links to the rest.
-        arms: The robots' arms, as far as they were calibrated.
-        level: The requested calibration level of the arms.
-        clock_effects: The errors of clocks, as effects.
-        turned: How images of outliers were turned or mirrored, by view.
-        solver: The solver of the edges.
-    """
-
-    cell: Cell
-    inlier_fit: InlierFit
+    cell: Cell  # The cell; its rows are the observations in the fit's order.
+    inlier_fit: InlierFit  # The inliers, their fit, and the frames that moved.
+    # Linearised corners of lenses and boards; None without images.
     linearised_corners: LinearisedCorners | None
-    poses: tuple[ViewPoses, ...]
-    unconnected: tuple[str, ...]
-    arms: Mapping[str, RobotArm]
-    level: str
-    clock_effects: tuple[Effect, ...]
+    poses: tuple[ViewPoses, ...]  # The pose chosen for each row.
+    unconnected: tuple[str, ...]  # Frames that no observation links to the rest.
+    arms: Mapping[str, RobotArm]  # The robots' arms, as far as they were calibrated.
+    level: str  # The requested calibration level of the arms.
+    clock_effects: tuple[Effect, ...]  # The errors of clocks, as effects.
+    # How images of outliers were turned or mirrored, by view.
     turned: Mapping[int, ImageTurn] = field(default_factory=dict)
-    solver: str = "joint"
+    solver: str = "joint"  # The solver of the edges.
 
     @property
     def inlier_problem(self) -> Problem:

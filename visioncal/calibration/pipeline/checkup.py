@@ -48,17 +48,11 @@ _NO_FAULT = ("unused",)
 
 @dataclass(frozen=True)
 class Checkup:
-    """Result of checking a session.
+    """Result of checking a session."""
 
-    Attributes:
-        session: The session's name.
-        seen: Its contents, in a few words each.
-        findings: Its faults, the likeliest cause first, each with a remedy.
-    """
-
-    session: str
-    seen: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    session: str  # The session's name.
+    seen: tuple[str, ...]  # Its contents, in a few words each.
+    findings: tuple[Finding, ...]  # Its faults, the likeliest cause first, each with a remedy.
 
     @property
     def is_sound(self) -> bool:

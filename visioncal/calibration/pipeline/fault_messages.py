@@ -44,34 +44,21 @@ _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CAL
 
 @dataclass(frozen=True)
 class PoseFault:
-    """A fault of poses or images that explains outliers.
+    """A fault of poses or images that explains outliers."""
 
-    Attributes:
-        found: The finding.
-        rows: The observations that it explains.
-        short: The fault as a clause, for each of these; empty where the finding suffices.
-    """
-
-    found: Finding
-    rows: tuple[int, ...]
-    short: str = ""
+    found: Finding  # The finding.
+    rows: tuple[int, ...]  # The observations that it explains.
+    short: str = ""  # The fault as a clause, for each of these; empty where the finding suffices.
 
 
 @dataclass(frozen=True)
 class Version:
-    """A frame during a part of the session, in which it did not move.
+    """A frame during a part of the session, in which it did not move."""
 
-    Attributes:
-        key: Its name in the problem.
-        frame: The name of the frame.
-        name: Its name in the result: the frame's own for the last.
-        start: The first station of it; -1 for the first version.
-    """
-
-    key: str
-    frame: str
-    name: str
-    start: int
+    key: str  # Its name in the problem.
+    frame: str  # The name of the frame.
+    name: str  # Its name in the result: the frame's own for the last.
+    start: int  # The first station of it; -1 for the first version.
 
     @property
     def is_last(self) -> bool:

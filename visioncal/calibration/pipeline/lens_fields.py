@@ -26,21 +26,14 @@ _CLEARLY = 3.0
 
 @dataclass(frozen=True)
 class LensErrors:
-    """Errors of one lens beyond its model.
+    """Errors of one lens beyond its model."""
 
-    Attributes:
-        levels: Their sizes, in units of `noise_px`.
-        noise_px: Standard deviation of a corner's coordinate [px].
-        is_of_lens: Whether errors depend on the position in the image, not on the board's corner.
-        distance_m: The mean distance of the views [m].
-        focal_px: The focal length [px].
-    """
-
-    levels: LensLevels
-    noise_px: float
+    levels: LensLevels  # Their sizes, in units of `noise_px`.
+    noise_px: float  # Standard deviation of a corner's coordinate [px].
+    # Whether errors depend on the position in the image, not on the board's corner.
     is_of_lens: bool
-    distance_m: float
-    focal_px: float
+    distance_m: float  # The mean distance of the views [m].
+    focal_px: float  # The focal length [px].
 
     @property
     def field_px(self) -> float:

@@ -21,21 +21,16 @@ from visioncal.session import frame_name
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoses(Observed):
-    """Observations with given lens, boards and arm, none of which is estimated here.
+    """Observations with given lens, boards and arm, none of which is estimated here."""
 
-    Attributes:
-        boards: Which of the session's boards the problem contains, the reference board first.
-        frames: (4, 4) edges of the camera and the boards, by frame.
-        used: The views in the problem, in the session's order.
-        free: Lens and boards with their free values; None without corners.
-        calibrated: The robot's calibrated arm; None for the nominal one.
-    """
-
+    # Which of the session's boards the problem contains, the reference board first.
     boards: tuple[int, ...] = (0,)
+    # (4, 4) edges of the camera and the boards, by frame.
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
-    used: tuple[int, ...] = ()
+    used: tuple[int, ...] = ()  # The views in the problem, in the session's order.
+    # Lens and boards with their free values; None without corners.
     free: LensBoardParameters | None = None
-    calibrated: RobotArm | None = None
+    calibrated: RobotArm | None = None  # The robot's calibrated arm; None for the nominal one.
 
     @classmethod
     def of(cls, observed: Observed) -> Self:

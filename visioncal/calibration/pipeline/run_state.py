@@ -28,30 +28,21 @@ class RunState(Observed):
     """State of a run between two stages; None for results of stages still to come.
 
     The properties `cell`, `fitted` and `solved` raise a RuntimeError before their stage has run.
-
-    Attributes:
-        solver: The requested solver, for one robot and one camera.
-        level: How far arms are calibrated: a key of `stages.kinematics.ASKED`.
-        convention: Joint table convention of calibrated arms; None for the stated one.
-        given_corners: Corners by view that were detected before this run.
-        readings: The readings of an instrument, where these are all that was observed.
-        cell_or_none: The cell as the session states it.
-        cell_fit_or_none: The fit of the cell.
-        assessment_or_none: The fit with its covariance and diagnosis.
-        findings: Input of the verdict.
-        verdict: The verdict on the result.
     """
 
-    solver: SolverName = "joint"
-    level: str = "auto"
+    solver: SolverName = "joint"  # The requested solver, for one robot and one camera.
+    level: str = "auto"  # How far arms are calibrated: a key of `stages.kinematics.ASKED`.
+    # Joint table convention of calibrated arms; None for the stated one.
     convention: Convention | None = None
+    # Corners by view that were detected before this run.
     given_corners: Mapping[int, Corners] | None = None
+    # The readings of an instrument, where these are all that was observed.
     readings: Readings | None = None
-    cell_or_none: Cell | None = None
-    cell_fit_or_none: CellFit | None = None
-    assessment_or_none: FitAssessment | None = None
-    findings: Findings | None = None
-    verdict: Verdict | None = None
+    cell_or_none: Cell | None = None  # The cell as the session states it.
+    cell_fit_or_none: CellFit | None = None  # The fit of the cell.
+    assessment_or_none: FitAssessment | None = None  # The fit with its covariance and diagnosis.
+    findings: Findings | None = None  # Input of the verdict.
+    verdict: Verdict | None = None  # The verdict on the result.
 
     @property
     def mount(self) -> Mount | None:

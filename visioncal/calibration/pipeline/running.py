@@ -44,16 +44,11 @@ _ARM = re.compile(r"\bAdd (?:stops|views in which the arm)\b")
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A calibration with its evidence.
+    """A calibration with its evidence."""
 
-    Attributes:
-        calibration: The result.
-        evidence: One entry for each view of the session.
-        left_out: Residual of each view, by a fit without its stop [m], [px].
-    """
-
-    calibration: Calibration
-    evidence: tuple[ViewEvidence, ...]
+    calibration: Calibration  # The result.
+    evidence: tuple[ViewEvidence, ...]  # One entry for each view of the session.
+    # Residual of each view, by a fit without its stop [m], [px].
     left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     def with_paths(self, session: Path | str, out: Path | str) -> "Run":

@@ -26,21 +26,13 @@ _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of a fit.
+    """Start of a fit."""
 
-    Attributes:
-        cell: The connected part of the cell; its rows are in the fit's order.
-        poses: The pose chosen for each row.
-        problem: The problem of these.
-        state: The initial frames.
-        untied: Frames that no observation links to the rest.
-    """
-
-    cell: Cell
-    poses: tuple[ViewPoses, ...]
-    problem: Problem
-    state: State
-    untied: tuple[str, ...]
+    cell: Cell  # The connected part of the cell; its rows are in the fit's order.
+    poses: tuple[ViewPoses, ...]  # The pose chosen for each row.
+    problem: Problem  # The problem of these.
+    state: State  # The initial frames.
+    untied: tuple[str, ...]  # Frames that no observation links to the rest.
 
 
 def _with_poses(cell: Cell, observed: Observed) -> Cell:

@@ -59,52 +59,37 @@ _PLACES = 200
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimate of one parameter of the arm's table, [rad or m].
+    """Estimate of one parameter of the arm's table, [rad or m]."""
 
-    Attributes:
-        parameter: The parameter.
-        nominal: Its nominal value.
-        identified: Its estimate.
-        sigma: Standard deviation of the estimate. A parameter that the stops do not determine
-            stays close to its nominal value and keeps its prior sigma.
-    """
-
-    parameter: Parameter
-    nominal: float
-    identified: float
+    parameter: Parameter  # The parameter.
+    nominal: float  # Its nominal value.
+    identified: float  # Its estimate.
+    # Standard deviation of the estimate. A parameter that the stops do not determine stays close to
+    # its nominal value and keeps its prior sigma.
     sigma: float
 
 
 @dataclass(frozen=True, eq=False)
 class ArmIdentifiability:
-    """Identifiability of the arm's parameters.
+    """Identifiability of the arm's parameters."""
 
-    Attributes:
-        convention: Convention of the table whose parameters are estimated.
-        estimates: Its free parameters.
-        counts: Numbers of parameters: identifiable by any stops, determined by these.
-        indices: Observability indices; None where the stops determine nothing of the arm.
-        not_determined: Undetermined combinations in words, first those that no stops determine.
-        advice: Which stops to add; empty where none would determine more.
-        influence: (m,) share by which the mean predicted variance at `places` would grow without
-            each stop, lens and board held.
-        places: (k, 3) positions of the flange over the workspace, in the base frame [m].
-        sigmas_m: (k,) predicted position sigma of what the flange carries there [m].
-        near: (l, 3) positions of the flange at random postures within the stops' joint ranges [m].
-        near_sigmas_m: (l,) the same sigma there [m].
-    """
-
-    convention: Convention
-    estimates: tuple[Estimate, ...]
+    convention: Convention  # Convention of the table whose parameters are estimated.
+    estimates: tuple[Estimate, ...]  # Its free parameters.
+    # Numbers of parameters: identifiable by any stops, determined by these.
     counts: Identifiability
+    # Observability indices; None where the stops determine nothing of the arm.
     indices: Indices | None
+    # Undetermined combinations in words, first those that no stops determine.
     not_determined: tuple[str, ...]
-    advice: str
+    advice: str  # Which stops to add; empty where none would determine more.
+    # (m,) share by which the mean predicted variance at `places` would grow without each stop, lens
+    # and board held.
     influence: FloatArray
-    places: FloatArray
-    sigmas_m: FloatArray
+    places: FloatArray  # (k, 3) positions of the flange over the workspace, in the base frame [m].
+    sigmas_m: FloatArray  # (k,) predicted position sigma of what the flange carries there [m].
+    # (l, 3) positions of the flange at random postures within the stops' joint ranges [m].
     near: FloatArray
-    near_sigmas_m: FloatArray
+    near_sigmas_m: FloatArray  # (l,) the same sigma there [m].
 
     def add_to(
         self, result: ArmResult, robot: Robot, views: Sequence[int], lost: JointReading | None

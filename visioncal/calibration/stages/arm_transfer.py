@@ -26,19 +26,13 @@ _AHEAD, _BEHIND = np.pi / 3, 2 * np.pi / 3
 
 @dataclass(frozen=True, eq=False)
 class PredictedAccuracy:
-    """Predicted accuracy at k postures over the workspace.
+    """Predicted accuracy at k postures over the workspace."""
 
-    Attributes:
-        places: (k, 3) positions of the flange in the base frame [m].
-        sigmas_m: (k,) position sigma of what the calibrated arm carries, in another session [m].
-        nominal_m: (k,) the same for the nominal arm [m].
-        session_m: Contribution of the change of session to `sigmas_m` [m].
-    """
-
-    places: FloatArray
+    places: FloatArray  # (k, 3) positions of the flange in the base frame [m].
+    # (k,) position sigma of what the calibrated arm carries, in another session [m].
     sigmas_m: FloatArray
-    nominal_m: FloatArray
-    session_m: float
+    nominal_m: FloatArray  # (k,) the same for the nominal arm [m].
+    session_m: float  # Contribution of the change of session to `sigmas_m` [m].
 
 
 def carries_over(arm: ArmData, kinematics: SelectedArmLevel) -> CarriesOver:

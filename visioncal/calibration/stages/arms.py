@@ -62,25 +62,18 @@ _ROUNDING = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedArm:
-    """Identified properties of an arm.
+    """Identified properties of an arm."""
 
-    Attributes:
-        identifiability: Identifiability of its parameters; None for a nominal arm.
-        springs: Joint compliances; None for a rigid arm.
-        backlash: Backlash of the joints; empty where stops were not approached from both sides.
-        drift: Drift with temperature; None without one.
-        carries_over: Where the calibrated arm beats the nominal one; None for a nominal arm.
-        functions: Joint error functions; None without any.
-        measured: Joint ranges of the stops.
-    """
-
+    # Identifiability of its parameters; None for a nominal arm.
     identifiability: ArmIdentifiability | None = None
-    springs: Elastic | None = None
+    springs: Elastic | None = None  # Joint compliances; None for a rigid arm.
+    # Backlash of the joints; empty where stops were not approached from both sides.
     backlash: tuple[JointBacklash, ...] = ()
-    drift: ThermalResult | None = None
+    drift: ThermalResult | None = None  # Drift with temperature; None without one.
+    # Where the calibrated arm beats the nominal one; None for a nominal arm.
     carries_over: CarriesOver | None = None
-    functions: JointFunctions | None = None
-    measured: tuple[JointRange, ...] = ()
+    functions: JointFunctions | None = None  # Joint error functions; None without any.
+    measured: tuple[JointRange, ...] = ()  # Joint ranges of the stops.
 
     def notes(self) -> Iterator[str]:
         """Remarks that are no reason for doubt."""
@@ -100,32 +93,23 @@ class IdentifiedArm:
 
 @dataclass(frozen=True, eq=False)
 class RobotArm:
-    """A robot's arm at the s stops of a cell.
+    """A robot's arm at the s stops of a cell."""
 
-    Attributes:
-        robot: Name of the robot in the problem.
-        reported: (s, 4, 4) reported `base_from_flange`; NaN where unknown.
-        has_pose: (s,) mask of the m stops with a pose of this robot.
-        joints_rad: (m, n) joints at these; None where they are missing or belong to no model.
-        loads: Loads at these.
-        matched: Model, matched with poses and joints; None where none is known.
-        heat: Heat inputs; None where joints are not known.
-        thermal: Thermal drift fit; None where it was not requested or is impossible.
-        errors: Posture-dependent errors, where they are likely.
-        kinematics: Compared levels; None where none were requested or possible.
-        model: Arm with the errors of the chosen level; None for a nominal arm.
-    """
-
-    robot: str
-    reported: FloatArray
-    has_pose: Mask
+    robot: str  # Name of the robot in the problem.
+    reported: FloatArray  # (s, 4, 4) reported `base_from_flange`; NaN where unknown.
+    has_pose: Mask  # (s,) mask of the m stops with a pose of this robot.
+    # (m, n) joints at these; None where they are missing or belong to no model.
     joints_rad: FloatArray | None
-    loads: Loads
+    loads: Loads  # Loads at these.
+    # Model, matched with poses and joints; None where none is known.
     matched: MatchedJoints | None = None
-    heat: Heat | None = None
+    heat: Heat | None = None  # Heat inputs; None where joints are not known.
+    # Thermal drift fit; None where it was not requested or is impossible.
     thermal: ThermalFit | None = None
-    errors: ArmErrors | None = None
+    errors: ArmErrors | None = None  # Posture-dependent errors, where they are likely.
+    # Compared levels; None where none were requested or possible.
     kinematics: SelectedArmLevel | None = None
+    # Arm with the errors of the chosen level; None for a nominal arm.
     model: ArmModel | None = None
 
     @classmethod

@@ -48,15 +48,10 @@ _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence behind a kind of finding.
+    """Evidence behind a kind of finding."""
 
-    Attributes:
-        chance: False-alarm probability of its test in a sound session.
-        misfit: The misfit that it explains; causes of one misfit compete.
-    """
-
-    chance: float
-    misfit: str = ""
+    chance: float  # False-alarm probability of its test in a sound session.
+    misfit: str = ""  # The misfit that it explains; causes of one misfit compete.
 
 
 # Misfit of the kinematic chain: views disagree, or the flange is off.

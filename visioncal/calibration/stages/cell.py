@@ -38,27 +38,20 @@ class ObservationRow:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A session as a whole cell.
+    """A session as a whole cell."""
 
-    Attributes:
-        session: The session.
-        tree: Tree of frames; the base of one robot, or one other frame, is the cell's frame.
-        poses: (s, 4, 4) `base_from_flange` by robot and station; NaN where unknown.
-        rows: The usable observations.
-        reasons: Why other views are not usable, by view.
-        stops: Number of each station in the session: its stop, or its first view.
-        priors: Priors of frames.
-        held: Usable observations that the session holds back from every fit.
-    """
-
-    session: Session
-    tree: Tree
+    session: Session  # The session.
+    tree: Tree  # Tree of frames; the base of one robot, or one other frame, is the cell's frame.
     reference: str
+    # (s, 4, 4) `base_from_flange` by robot and station; NaN where unknown.
     poses: Mapping[str, FloatArray]
-    rows: tuple[ObservationRow, ...]
+    rows: tuple[ObservationRow, ...]  # The usable observations.
+    # Why other views are not usable, by view.
     reasons: Mapping[int, str] = field(default_factory=dict)
+    # Number of each station in the session: its stop, or its first view.
     stops: tuple[int, ...] = ()
-    priors: tuple[FramePrior, ...] = ()
+    priors: tuple[FramePrior, ...] = ()  # Priors of frames.
+    # Usable observations that the session holds back from every fit.
     held: tuple[ObservationRow, ...] = ()
 
     def start_words(self, station: int) -> str:

@@ -56,21 +56,14 @@ ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 @dataclass(frozen=True, eq=False)
 class DelayEstimate:
-    """Estimated delay within images, such as that of a rolling shutter.
-
-    Attributes:
-        time_s: The delay [s].
-        sigma_s: Its standard deviation [s].
-        is_clear: Whether it is significant, and was corrected.
-        resolution: Resolution of the images [px].
-        jacobian: (6,) Jacobian of each view's `cam_from_target` by the delay, by view.
-    """
+    """Estimated delay within images, such as that of a rolling shutter."""
 
     of: Delay
-    time_s: float
-    sigma_s: float
-    is_clear: bool
-    resolution: tuple[int, int]
+    time_s: float  # The delay [s].
+    sigma_s: float  # Its standard deviation [s].
+    is_clear: bool  # Whether it is significant, and was corrected.
+    resolution: tuple[int, int]  # Resolution of the images [px].
+    # (6,) Jacobian of each view's `cam_from_target` by the delay, by view.
     jacobian: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def effect(self, views: Sequence[int], name: str = "") -> Effect:
@@ -120,15 +113,11 @@ def find_delays(
 
 @dataclass(frozen=True, eq=False)
 class CorrectedViews:
-    """Views with corners corrected to the image's stamp.
+    """Views with corners corrected to the image's stamp."""
 
-    Attributes:
-        poses: The views' poses by the corrected corners; ambiguous ones stay as they are.
-        jacobian: (6, k) Jacobian of each by the k delays, by view.
-    """
-
+    # The views' poses by the corrected corners; ambiguous ones stay as they are.
     poses: Mapping[int, ViewPoses]
-    jacobian: Mapping[int, FloatArray]
+    jacobian: Mapping[int, FloatArray]  # (6, k) Jacobian of each by the k delays, by view.
 
 
 def correct_corners(
@@ -189,28 +178,20 @@ def _with_corners(
 
 @dataclass(frozen=True, eq=False)
 class ClockOffset:
-    """Offset of the camera's clock ahead of the robot's, and its source.
+    """Offset of the camera's clock ahead of the robot's, and its source."""
 
-    Attributes:
-        camera_minus_robot_s: The offset [s].
-        sigma_s: Its standard deviation [s]; 0 where views at rest make it immaterial.
-        method: Estimated from the motion, or from its rotation alone; stated by the session; or
-            immaterial for views at rest.
-        stated_s: Offset stated by the session [s]; None without one.
-        frames: Number of frames in motion that determined it.
-        correlation: Correlation of the rotation angles of camera and robot; None without any.
-        speeds: (6,) twist of the flange by view, in its own frame [rad/s, m/s].
-        delays: Delays within the images.
-    """
-
-    camera_minus_robot_s: float
-    sigma_s: float
+    camera_minus_robot_s: float  # The offset [s].
+    sigma_s: float  # Its standard deviation [s]; 0 where views at rest make it immaterial.
+    # Estimated from the motion, or from its rotation alone; stated by the session; or immaterial
+    # for views at rest.
     method: ClockMethod
-    stated_s: float | None
-    frames: int
+    stated_s: float | None  # Offset stated by the session [s]; None without one.
+    frames: int  # Number of frames in motion that determined it.
+    # Correlation of the rotation angles of camera and robot; None without any.
     correlation: float | None
+    # (6,) twist of the flange by view, in its own frame [rad/s, m/s].
     speeds: Mapping[int, FloatArray]
-    delays: tuple[DelayEstimate, ...] = ()
+    delays: tuple[DelayEstimate, ...] = ()  # Delays within the images.
 
     def prior_sigma_s(self, *, erring: bool = False) -> float:
         """Prior sigma of the offset in the fit of the used views [s].

@@ -98,45 +98,30 @@ class ClockPair:
 
 @dataclass(frozen=True, eq=False)
 class ClockedViews:
-    """Views with the robot's poses at their time.
+    """Views with the robot's poses at their time."""
 
-    Attributes:
-        clock: The offset.
-        views: Those that have a pose now, or had one before, in the session's order.
-        rejections: Those without a pose, and why.
-        spared: Why redundant views are not needed, by view.
-        poses: Target poses by corners that were corrected for delays.
-        warnings: Findings against the clock.
-        notes: Remarks for the user.
-    """
-
-    clock: ClockOffset
+    clock: ClockOffset  # The offset.
+    # Those that have a pose now, or had one before, in the session's order.
     views: tuple[View, ...]
-    rejections: tuple[Rejection, ...]
-    spared: Mapping[int, str]
-    warnings: tuple[Finding, ...]
-    notes: tuple[str, ...]
+    rejections: tuple[Rejection, ...]  # Those without a pose, and why.
+    spared: Mapping[int, str]  # Why redundant views are not needed, by view.
+    warnings: tuple[Finding, ...]  # Findings against the clock.
+    notes: tuple[str, ...]  # Remarks for the user.
+    # Target poses by corners that were corrected for delays.
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraSweep:
-    """Observations of one camera while one robot moved.
+    """Observations of one camera while one robot moved."""
 
-    Attributes:
-        motion: The robot's stream.
-        mount: Mount of the camera.
-        views: The rows; those that have a time and no pose of the robot wait for the clock.
-        stated_s: The stated offset [s]; None without one.
-        camera: The camera's intrinsics; None where unknown.
-        positions: (c, 3) corners of all boards, numbered consecutively [m].
-    """
-
-    motion: RobotMotion
-    mount: Mount
+    motion: RobotMotion  # The robot's stream.
+    mount: Mount  # Mount of the camera.
+    # The rows; those that have a time and no pose of the robot wait for the clock.
     views: tuple[View, ...]
-    stated_s: float | None
-    camera: Camera | None = None
+    stated_s: float | None  # The stated offset [s]; None without one.
+    camera: Camera | None = None  # The camera's intrinsics; None where unknown.
+    # (c, 3) corners of all boards, numbered consecutively [m].
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> ImageTimes:
@@ -173,23 +158,14 @@ def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> ClockedView
 
 @dataclass(frozen=True, eq=False)
 class _Matched:
-    """Evidence of the motion on the offset of the clocks.
+    """Evidence of the motion on the offset of the clocks."""
 
-    Attributes:
-        views: The views that wait for a pose, sorted by time.
-        frames: Observations of those that are not held back.
-        matches: Offsets at which camera and robot turn alike.
-        sound: The significant ones.
-        fits: Fits started from these.
-        fit: The clear one; None without one.
-    """
-
-    views: Sequence[View]
-    frames: ImageTimes
-    matches: Sequence[Match]
-    sound: Sequence[Match]
-    fits: Sequence[ClockFit]
-    fit: ClockFit | None
+    views: Sequence[View]  # The views that wait for a pose, sorted by time.
+    frames: ImageTimes  # Observations of those that are not held back.
+    matches: Sequence[Match]  # Offsets at which camera and robot turn alike.
+    sound: Sequence[Match]  # The significant ones.
+    fits: Sequence[ClockFit]  # Fits started from these.
+    fit: ClockFit | None  # The clear one; None without one.
 
 
 def _match(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> _Matched:

@@ -49,32 +49,22 @@ _LAYOUT_SAMPLE, _MOST_SEARCHED = 3, 12
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Detected corners by view, in the session's order, and rejected views.
-
-    Attributes:
-        resolution: The camera's (width, height) [px].
-        other_sizes: The (width, height) of images of another size, by view [px].
-    """
+    """Detected corners by view, in the session's order, and rejected views."""
 
     corners: Mapping[int, Corners]
     rejections: tuple[Rejection, ...]
-    resolution: tuple[int, int]
+    resolution: tuple[int, int]  # The camera's (width, height) [px].
+    # The (width, height) of images of another size, by view [px].
     other_sizes: Mapping[int, tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """Result of searching one image.
+    """Result of searching one image."""
 
-    Attributes:
-        found: The corners, or why there are none.
-        size: (width, height) of the image [px]; None where it cannot be read.
-        misfit: Whether markers were seen whose layout is not the target's.
-    """
-
-    found: Corners | Rejection
-    size: tuple[int, int] | None
-    misfit: bool = False
+    found: Corners | Rejection  # The corners, or why there are none.
+    size: tuple[int, int] | None  # (width, height) of the image [px]; None where it cannot be read.
+    misfit: bool = False  # Whether markers were seen whose layout is not the target's.
 
 
 class _MemoryBudget:

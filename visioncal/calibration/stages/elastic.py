@@ -30,28 +30,20 @@ _SURE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Elastic:
-    """Compliances of an arm's joints, with the loads and deflections at the stops.
+    """Compliances of an arm's joints, with the loads and deflections at the stops."""
 
-    Attributes:
-        springs: The springs, joint by joint.
-        torques_nm: (m, n) torques on the joints at the stops [N m].
-        bends_rad: (m, n) deflection of each joint by each stop alone [rad]; NaN where undetermined.
-        sag_mm: (m,) flange deflection under the loads of each stop [mm].
-        payload_kg: (m,) payload at each stop [kg].
-        payload: Ratio of the deflection under load to that expected from the stated load; None
-            without any load on the flange.
-        weighs: Whether the model of the arm states the masses of its links.
-        weight_moments: (n, 4 n) compliance of the joints to the weight of links of unknown mass
-            (see `bent_joints`); None where masses are known, or hardly matter.
-    """
-
-    springs: tuple[JointSpring, ...]
-    torques_nm: FloatArray
+    springs: tuple[JointSpring, ...]  # The springs, joint by joint.
+    torques_nm: FloatArray  # (m, n) torques on the joints at the stops [N m].
+    # (m, n) deflection of each joint by each stop alone [rad]; NaN where undetermined.
     bends_rad: FloatArray
-    sag_mm: FloatArray
-    payload_kg: FloatArray
+    sag_mm: FloatArray  # (m,) flange deflection under the loads of each stop [mm].
+    payload_kg: FloatArray  # (m,) payload at each stop [kg].
+    # Ratio of the deflection under load to that expected from the stated load; None without any
+    # load on the flange.
     payload: Factor | None
-    weighs: bool
+    weighs: bool  # Whether the model of the arm states the masses of its links.
+    # (n, 4 n) compliance of the joints to the weight of links of unknown mass (see `bent_joints`);
+    # None where masses are known, or hardly matter.
     weight_moments: FloatArray | None
 
     @property

@@ -14,21 +14,15 @@ from visioncal.session.frames import object_name
 
 @dataclass(frozen=True)
 class JudgedPair:
-    """Views of one target by one camera or instrument.
+    """Views of one target by one camera or instrument."""
 
-    Attributes:
-        views: Result of each view.
-        outliers: Outliers: views whose robot pose and image do not belong together.
-        name: Names of both; empty for a single pair.
-        noise: Expected residuals by the sensor's own noise.
-        weighted_held_out: `held_out` with the weights of `noise`; None where all views have equal
-            weights.
-    """
-
-    views: Sequence[ViewResult]
+    views: Sequence[ViewResult]  # Result of each view.
+    # Outliers: views whose robot pose and image do not belong together.
     outliers: Sequence[Rejection] = ()
-    name: str = ""
+    name: str = ""  # Names of both; empty for a single pair.
+    # Expected residuals by the sensor's own noise.
     noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
+    # `held_out` with the weights of `noise`; None where all views have equal weights.
     weighted_held_out: Rms | None = None
 
     @property
@@ -44,76 +38,47 @@ class JudgedPair:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A camera or an instrument.
+    """A camera or an instrument."""
 
-    Attributes:
-        used: Number of its used views.
-        lost: Rejected views, without those held back on purpose.
-        outliers: The outliers among these.
-        pixel_px: Noise of a corner's coordinate; None without images [px].
-        level: Ratio of the scatter of its poses to their predicted noise.
-        spared: Number of redundant views that were not needed.
-        name: Its frame; empty for a single sensor.
-        holds_lens: Whether its lens is held and counts in the covariance.
-        has_lens_sigma: Whether the session states how well its matrix is known.
-    """
-
-    used: int
-    lost: Sequence[Rejection] = ()
-    outliers: Sequence[int] = ()
-    pixel_px: float | None = None
-    level: float = 1.0
-    spared: int = 0
-    name: str = ""
-    holds_lens: bool = False
-    has_lens_sigma: bool = False
+    used: int  # Number of its used views.
+    lost: Sequence[Rejection] = ()  # Rejected views, without those held back on purpose.
+    outliers: Sequence[int] = ()  # The outliers among these.
+    pixel_px: float | None = None  # Noise of a corner's coordinate; None without images [px].
+    level: float = 1.0  # Ratio of the scatter of its poses to their predicted noise.
+    spared: int = 0  # Number of redundant views that were not needed.
+    name: str = ""  # Its frame; empty for a single sensor.
+    holds_lens: bool = False  # Whether its lens is held and counts in the covariance.
+    has_lens_sigma: bool = False  # Whether the session states how well its matrix is known.
 
 
 @dataclass(frozen=True)
 class JudgedArm:
-    """A robot.
+    """A robot."""
 
-    Attributes:
-        stops: Number of its stops in the fit.
-        noise_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
-        noise_deg: The same in rotation [deg].
-        lower_bounds: Lower ends of their 95 % intervals [mm, deg]; None for the estimates
-            themselves.
-        has_posture_errors: Whether it has posture-dependent errors, which have a finding of their
-            own.
-        workspace_mm: Median predicted position sigma of a calibrated arm's tool over the workspace;
-            None for a nominal arm [mm].
-        modelled: Whether its model is known.
-        by_functions: Whether joint error functions were fitted to the stops.
-        can_tilt: Whether its flange turns about more than one direction.
-        name: Its name; empty for a single robot.
-    """
-
-    stops: int
+    stops: int  # Number of its stops in the fit.
+    # Noise of its flange; None where that cannot be separated from the cameras' [mm].
     noise_mm: float | None = None
-    noise_deg: float | None = None
+    noise_deg: float | None = None  # The same in rotation [deg].
+    # Lower ends of their 95 % intervals [mm, deg]; None for the estimates themselves.
     lower_bounds: tuple[float, float] | None = None
+    # Whether it has posture-dependent errors, which have a finding of their own.
     has_posture_errors: bool = False
+    # Median predicted position sigma of a calibrated arm's tool over the workspace; None for a
+    # nominal arm [mm].
     workspace_mm: float | None = None
-    modelled: bool = False
-    by_functions: bool = False
-    can_tilt: bool = True
-    name: str = ""
+    modelled: bool = False  # Whether its model is known.
+    by_functions: bool = False  # Whether joint error functions were fitted to the stops.
+    can_tilt: bool = True  # Whether its flange turns about more than one direction.
+    name: str = ""  # Its name; empty for a single robot.
 
 
 @dataclass(frozen=True)
 class PointAccuracy:
-    """Accuracy of a point of interest.
+    """Accuracy of a point of interest."""
 
-    Attributes:
-        words: The point in words.
-        budget_mm: Its standard deviation by source, and as a `total` [mm].
-        radius95_mm: Radius of 95 % probability [mm].
-    """
-
-    words: str
-    budget_mm: Mapping[str, float]
-    radius95_mm: float
+    words: str  # The point in words.
+    budget_mm: Mapping[str, float]  # Its standard deviation by source, and as a `total` [mm].
+    radius95_mm: float  # Radius of 95 % probability [mm].
 
 
 @dataclass(frozen=True)
@@ -126,36 +91,26 @@ class StandingTie:
 
 @dataclass(frozen=True)
 class Findings:
-    """Inputs of the verdict.
-
-    Attributes:
-        worst: Directions of the unknown edges with the largest sigmas; the first is named in a good
-            verdict. Edges that absorb undetermined errors of a calibrated arm are left out.
-        places: Accuracy of points of interest, without the same edges.
-        warnings: Findings of earlier stages.
-        notes: Their remarks that are no reason for doubt.
-        mount: Mount of the sensor.
-        need: Required accuracy; None where it is not stated.
-        picks: Error budgets of picks by camera and robot, with targets that are corrected where the
-            arm was calibrated; empty where they are not predicted.
-        tie: The only connection of the worst frame; None where there are more.
-        corrects_targets: Whether targets are corrected for a calibrated arm.
-        use: How a good result is used.
-    """
+    """Inputs of the verdict."""
 
     pairs: Sequence[JudgedPair]
     sensors: Sequence[Sensor]
     arms: Sequence[JudgedArm]
+    # Directions of the unknown edges with the largest sigmas; the first is named in a good verdict.
+    # Edges that absorb undetermined errors of a calibrated arm are left out.
     worst: Sequence[Direction]
-    places: Sequence[PointAccuracy]
-    warnings: Sequence[Finding] = ()
-    notes: Sequence[str] = ()
-    mount: Mount = "eye-in-hand"
-    need: Need | None = None
+    places: Sequence[PointAccuracy]  # Accuracy of points of interest, without the same edges.
+    warnings: Sequence[Finding] = ()  # Findings of earlier stages.
+    notes: Sequence[str] = ()  # Their remarks that are no reason for doubt.
+    mount: Mount = "eye-in-hand"  # Mount of the sensor.
+    need: Need | None = None  # Required accuracy; None where it is not stated.
+    # Error budgets of picks by camera and robot, with targets that are corrected where the arm was
+    # calibrated; empty where they are not predicted.
     picks: Sequence[Picks] = ()
+    # The only connection of the worst frame; None where there are more.
     tie: StandingTie | None = None
-    corrects_targets: bool = False
-    use: Remedy | None = None
+    corrects_targets: bool = False  # Whether targets are corrected for a calibrated arm.
+    use: Remedy | None = None  # How a good result is used.
 
     @property
     def judged_picks(self) -> tuple[Picks, ...]:

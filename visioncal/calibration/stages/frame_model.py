@@ -25,25 +25,15 @@ from visioncal.estimation.solve import (
 
 @dataclass(frozen=True, eq=False)
 class CellFrameModel:
-    """Part of the joint fit beside corners, lenses and boards; see `joint.FrameModel`.
+    """Part of the joint fit beside corners, lenses and boards; see `joint.FrameModel`."""
 
-    Attributes:
-        observed: All n observations.
-        used: (n,) the inliers, which are fitted.
-        views: (n,) the view of each.
-        arms: The robots' arms, with the errors that were found.
-        effects: All effects but lenses, boards and arms.
-        noise: Its levels to start from; None for those from above.
-        frees_all_errors: Whether all errors that were found are free, rather than only the
-            estimated ones.
-    """
-
-    observed: Problem
-    used: Mask
-    views: Sequence[int]
-    arms: Mapping[str, RobotArm]
-    effects: Sequence[Effect] = ()
-    noise: Noise | None = None
+    observed: Problem  # All n observations.
+    used: Mask  # (n,) the inliers, which are fitted.
+    views: Sequence[int]  # (n,) the view of each.
+    arms: Mapping[str, RobotArm]  # The robots' arms, with the errors that were found.
+    effects: Sequence[Effect] = ()  # All effects but lenses, boards and arms.
+    noise: Noise | None = None  # Its levels to start from; None for those from above.
+    # Whether all errors that were found are free, rather than only the estimated ones.
     frees_all_errors: bool = False
 
     @property

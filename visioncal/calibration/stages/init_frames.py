@@ -36,17 +36,13 @@ from visioncal.vision.targets import rotation_transforms
 
 @dataclass(frozen=True, eq=False)
 class ConnectedFrames:
-    """Initial poses of the frames that are connected to the tree.
+    """Initial poses of the frames that are connected to the tree."""
 
-    Attributes:
-        edges: (4, 4) `parent_from_frame` of the unknown frames that are connected.
-        untied: The unknown frames that are not.
-        ambiguous: Frames that are connected only through boards that look the same turned, so that
-            other poses fit as well.
-    """
-
+    # (4, 4) `parent_from_frame` of the unknown frames that are connected.
     edges: Mapping[str, FloatArray]
-    untied: tuple[str, ...]
+    untied: tuple[str, ...]  # The unknown frames that are not.
+    # Frames that are connected only through boards that look the same turned, so that other poses
+    # fit as well.
     ambiguous: tuple[str, ...]
 
 
@@ -151,18 +147,13 @@ def _robot_and_candidates(
 
 @dataclass(frozen=True, eq=False)
 class InitialFrames:
-    """Initial poses of the frames, and one pose of each view.
+    """Initial poses of the frames, and one pose of each view."""
 
-    Attributes:
-        connected: The frames.
-        views: The unambiguous views, with one pose each; where a turned pose was chosen, the
-            corners are renumbered to match.
-        rejections: The ambiguous views.
-    """
-
-    connected: ConnectedFrames
+    connected: ConnectedFrames  # The frames.
+    # The unambiguous views, with one pose each; where a turned pose was chosen, the corners are
+    # renumbered to match.
     views: tuple[ViewPoses, ...]
-    rejections: tuple[Rejection, ...]
+    rejections: tuple[Rejection, ...]  # The ambiguous views.
 
 
 def init_frames(

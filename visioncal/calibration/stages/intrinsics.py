@@ -34,21 +34,13 @@ _TILT_SPREAD_DEG, _DISTANCE_SPREAD, _GRID = 10.0, 1.2, 3
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """Estimated intrinsics.
+    """Estimated intrinsics."""
 
-    Attributes:
-        camera: The intrinsics.
-        covariance: (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
-        sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
-        rejections: Outlier views.
-        warnings: What the views do not determine.
-    """
-
-    camera: Camera
-    covariance: FloatArray
-    sigma_px: float
-    rejections: tuple[Rejection, ...]
-    warnings: tuple[Finding, ...]
+    camera: Camera  # The intrinsics.
+    covariance: FloatArray  # (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
+    sigma_px: float  # Standard deviation of a corner's coordinate, stated or by the residuals [px].
+    rejections: tuple[Rejection, ...]  # Outlier views.
+    warnings: tuple[Finding, ...]  # What the views do not determine.
 
 
 def estimate_intrinsics(

@@ -44,27 +44,20 @@ EXPORT_ARM = "visioncal export OUT --to robot-urdf -o robot.urdf"
 
 @dataclass(frozen=True, eq=False)
 class MatchedJoints:
-    """Joint angles of a session, matched with its reported poses.
+    """Joint angles of a session, matched with its reported poses."""
 
-    Attributes:
-        robot: The model, its base in the frame of the poses.
-        joints_rad: (n,) by view, those that belong to it [rad].
-        flange_from_reported: (4, 4) the poses' frame in the model's flange.
-        zero: The reading with the joint whose zero is shifted, by the poses; None for none.
-        misread: What is wrong with the angles or the model, and the fix; empty for nothing.
-        contradicting: What is wrong with the angles, unless the pose is, by view.
-        warnings: Findings to be mended.
-        notes: Remarks.
-    """
-
-    robot: Robot
+    robot: Robot  # The model, its base in the frame of the poses.
+    # (n,) by view, those that belong to it [rad].
     joints_rad: Mapping[int, FloatArray] = field(default_factory=dict)
+    # (4, 4) the poses' frame in the model's flange.
     flange_from_reported: FloatArray = field(default_factory=lambda: np.eye(4))
+    # The reading with the joint whose zero is shifted, by the poses; None for none.
     zero: JointReading | None = None
-    misread: str = ""
+    misread: str = ""  # What is wrong with the angles or the model, and the fix; empty for nothing.
+    # What is wrong with the angles, unless the pose is, by view.
     contradicting: Mapping[int, str] = field(default_factory=dict)
-    warnings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()  # Findings to be mended.
+    notes: tuple[str, ...] = ()  # Remarks.
 
     @property
     def arm(self) -> Robot:

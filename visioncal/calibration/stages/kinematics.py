@@ -52,23 +52,15 @@ _AUTOMATIC = ("auto", "thermal")
 
 @dataclass(frozen=True, eq=False)
 class SelectedArmLevel:
-    """The level of the arm's model that the views support.
+    """The level of the arm's model that the views support."""
 
-    Attributes:
-        level: Its name; `nominal` where none explains more than chance.
-        fits: All fits, the nominal arm's first.
-        was_asked: Whether the user named the level.
-        views: (m,) the view of each residual of these.
-        functions: Functions of the joints; None where these are not significant.
-        diverged: Levels whose fits diverged, so that they were not compared.
-    """
-
-    level: str
-    fits: Mapping[str, LevelFit]
-    was_asked: bool
-    views: tuple[int, ...] = ()
+    level: str  # Its name; `nominal` where none explains more than chance.
+    fits: Mapping[str, LevelFit]  # All fits, the nominal arm's first.
+    was_asked: bool  # Whether the user named the level.
+    views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
+    # Functions of the joints; None where these are not significant.
     functions: JointFunctions | None = None
-    diverged: tuple[str, ...] = ()
+    diverged: tuple[str, ...] = ()  # Levels whose fits diverged, so that they were not compared.
 
     @property
     def nominal(self) -> LevelFit:

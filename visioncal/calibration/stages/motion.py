@@ -28,19 +28,13 @@ _LEVER_M = 0.3
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """Motion of a robot by its stream.
+    """Motion of a robot by its stream."""
 
-    Attributes:
-        name: The stream's name.
-        flange: `base_from_flange` over the robot's time.
-        joints: Sampling times of joint angles, and (n, j) these [rad]; None where not sampled.
-        reported: Whether the poses were reported, rather than computed from the joints.
-    """
-
-    name: str
-    flange: Trajectory
+    name: str  # The stream's name.
+    flange: Trajectory  # `base_from_flange` over the robot's time.
+    # Sampling times of joint angles, and (n, j) these [rad]; None where not sampled.
     joints: tuple[Samples, FloatArray] | None
-    reported: bool
+    reported: bool  # Whether the poses were reported, rather than computed from the joints.
 
     def numbers(self, at_s: FloatArray) -> list[dict[str, float]]:
         """Values of views.csv's robot columns at (m,) covered times."""

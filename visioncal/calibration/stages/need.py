@@ -55,27 +55,19 @@ _MOST_PAIRS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Predicted errors of picks by one robot of what one camera sees.
+    """Predicted errors of picks by one robot of what one camera sees."""
 
-    Attributes:
-        camera: The camera's frame.
-        robot: The robot.
-        parts: (k, 6, 6) covariance by source, of rotation [rad] and position [m] in the robot's
-            base,
-            at k positions.
-        freedom: Degrees of freedom of the noise estimate.
-        distance_m: Mean distance of the positions from the camera.
-        offsets: (k, 6) known error, of the controller's own poses; None for targets that are
-            corrected, or need not be.
-        uncorrected: The same picks by the controller's own poses; None where the arm is nominal.
-    """
-
-    camera: str
-    robot: str
+    camera: str  # The camera's frame.
+    robot: str  # The robot.
+    # (k, 6, 6) covariance by source, of rotation [rad] and position [m] in the robot's base, at k
+    # positions.
     parts: Mapping[str, FloatArray]
-    freedom: float
-    distance_m: float
+    freedom: float  # Degrees of freedom of the noise estimate.
+    distance_m: float  # Mean distance of the positions from the camera.
+    # (k, 6) known error, of the controller's own poses; None for targets that are corrected, or
+    # need not be.
     offsets: FloatArray | None = None
+    # The same picks by the controller's own poses; None where the arm is nominal.
     uncorrected: "Picks | None" = None
 
     @property
@@ -156,33 +148,22 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
 
 @dataclass(frozen=True, eq=False)
 class PickInputs:
-    """Input for the prediction of picks.
+    """Input for the prediction of picks."""
 
-    Attributes:
-        problem: The n observations of the fit.
-        fit: Their fit.
-        covariance: (p, p) of the unknowns, all sources included.
-        held_out: The observations' residuals by fits without their stops.
-        target_centres: (3,) of each target, in its frame [m]; of others, their origin.
-        freedom: Degrees of freedom of each robot's noise.
-        arms: The robots' arms, at the problem's stops.
-        board_columns: The problem's columns of boards' shapes.
-        centre_jacobians: (3, b) Jacobian of each target's middle for these columns, by its frame
-            [m].
-        full_problem: The observations of all pairs, merged or not, that the fit was made from.
-        jitters: Relative change of the focal length of each camera from image to image.
-    """
-
-    problem: Problem
-    fit: Solution
-    covariance: FloatArray
-    held_out: HeldOutResiduals
+    problem: Problem  # The n observations of the fit.
+    fit: Solution  # Their fit.
+    covariance: FloatArray  # (p, p) of the unknowns, all sources included.
+    held_out: HeldOutResiduals  # The observations' residuals by fits without their stops.
+    # (3,) of each target, in its frame [m]; of others, their origin.
     target_centres: Mapping[str, FloatArray]
-    freedom: Mapping[str, float]
-    arms: Mapping[str, RobotArm]
-    board_columns: IntArray
+    freedom: Mapping[str, float]  # Degrees of freedom of each robot's noise.
+    arms: Mapping[str, RobotArm]  # The robots' arms, at the problem's stops.
+    board_columns: IntArray  # The problem's columns of boards' shapes.
+    # (3, b) Jacobian of each target's middle for these columns, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
+    # The observations of all pairs, merged or not, that the fit was made from.
     full_problem: Problem
+    # Relative change of the focal length of each camera from image to image.
     jitters: Mapping[str, float]
 
 

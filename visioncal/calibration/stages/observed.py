@@ -29,60 +29,43 @@ _LISTED = 40
 
 @dataclass(frozen=True, eq=False)
 class CameraObservations:
-    """Observations of one camera.
+    """Observations of one camera."""
 
-    Attributes:
-        table: The session's table of the camera.
-        corners: The corners in its images, by view; those of several boards are numbered through.
-        resolution: Size of its images [px].
-        lens: Its intrinsics; None where no view determines them.
-        pixel_px: Noise of a corner's coordinate [px].
-    """
-
-    table: CameraTable
+    table: CameraTable  # The session's table of the camera.
+    # The corners in its images, by view; those of several boards are numbered through.
     corners: Mapping[int, Corners]
-    resolution: tuple[int, int] | None = None
-    lens: CameraResult | None = None
-    pixel_px: float | None = None
+    resolution: tuple[int, int] | None = None  # Size of its images [px].
+    lens: CameraResult | None = None  # Its intrinsics; None where no view determines them.
+    pixel_px: float | None = None  # Noise of a corner's coordinate [px].
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Observations of a session, as far as they are processed.
+    """Observations of a session, as far as they are processed."""
 
-    Attributes:
-        session: The recording.
-        progress: Reports long work.
-        threads: Number of images that are processed at a time; 0 for one per core.
-        cameras: Observations of each camera with images, by its frame.
-        poses: The target's pose by view; several candidates until one is chosen.
-        reasons: Why a view cannot be used, by view.
-        repeats: Why views that repeat others are not needed, by view.
-        robots: Reported poses and joints of each robot, by the name that rows give it.
-        clocks: Relations of the clocks of cameras and robots, where robots' streams are used.
-        warnings: Findings for the user.
-        notes: Remarks that are no reason for doubt.
-        dense: Corners by all pixels of images that the template refuses, by view; None where these
-            are not asked for.
-        is_misread: Whether robots' poses are clearly misread, so that they determine nothing of
-            lenses and boards.
-        turned: How turned or mirrored images, which determine nothing of their lens, were turned,
-            by view.
-    """
-
-    session: Session
-    progress: Progress | None = None
-    threads: int = 0
+    session: Session  # The recording.
+    progress: Progress | None = None  # Reports long work.
+    threads: int = 0  # Number of images that are processed at a time; 0 for one per core.
+    # Observations of each camera with images, by its frame.
     cameras: Mapping[str, CameraObservations] = field(default_factory=dict)
+    # The target's pose by view; several candidates until one is chosen.
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
-    reasons: Mapping[int, str] = field(default_factory=dict)
+    reasons: Mapping[int, str] = field(default_factory=dict)  # Why a view cannot be used, by view.
+    # Why views that repeat others are not needed, by view.
     repeats: Mapping[int, str] = field(default_factory=dict)
+    # Reported poses and joints of each robot, by the name that rows give it.
     robots: Mapping[str, RobotReport] = field(default_factory=dict)
+    # Relations of the clocks of cameras and robots, where robots' streams are used.
     clocks: Mapping[ClockPair, ClockedViews] = field(default_factory=dict)
-    warnings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()  # Findings for the user.
+    notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
+    # Corners by all pixels of images that the template refuses, by view; None where these are not
+    # asked for.
     dense: Mapping[int, DenseCorners] | None = None
+    # Whether robots' poses are clearly misread, so that they determine nothing of lenses and
+    # boards.
     is_misread: bool = False
+    # How turned or mirrored images, which determine nothing of their lens, were turned, by view.
     turned: Mapping[int, ImageTurn] = field(default_factory=dict)
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:

@@ -16,23 +16,15 @@ _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 
 @dataclass(frozen=True, eq=False)
 class Sighted:
-    """Candidate poses of n observations.
+    """Candidate poses of n observations."""
 
-    Attributes:
-        seers: (n,) the observing frame.
-        seen: (n,) the observed frame.
-        stops: (n,) the stop, numbered from 0 in the order of time.
-        candidates: The poses `seer_from_seen` that each allows.
-        turned: (t, 4, 4) rotational symmetries, by the frame of a target that has them.
-        places: (n,) whether a position alone was read, so that the rotation has no meaning.
-    """
-
-    seers: tuple[str, ...]
-    seen: tuple[str, ...]
-    stops: IntArray
-    candidates: Candidates
+    seers: tuple[str, ...]  # (n,) the observing frame.
+    seen: tuple[str, ...]  # (n,) the observed frame.
+    stops: IntArray  # (n,) the stop, numbered from 0 in the order of time.
+    candidates: Candidates  # The poses `seer_from_seen` that each allows.
+    # (t, 4, 4) rotational symmetries, by the frame of a target that has them.
     turned: Mapping[str, FloatArray]
-    places: Mask
+    places: Mask  # (n,) whether a position alone was read, so that the rotation has no meaning.
 
     def turns_of(self, frame: str) -> FloatArray:
         """The turns (t, 4, 4) after which a frame looks the same, the identity first."""
@@ -77,23 +69,14 @@ class FramePair:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Input of the tree's growth.
+    """Input of the tree's growth."""
 
-    Attributes:
-        tree: The frames.
-        poses: (s, 4, 4) `base_from_flange` by robot and stop.
-        sighted: The observations.
-        pairs: The observations by pairs of frames.
-        relations: Transforms that pairs determine by themselves.
-        measured: The frames with a prior.
-    """
-
-    tree: Tree
-    poses: Mapping[str, FloatArray]
-    sighted: Sighted
-    pairs: Sequence[FramePair]
-    relations: Sequence[Relation]
-    measured: frozenset[str] = frozenset()
+    tree: Tree  # The frames.
+    poses: Mapping[str, FloatArray]  # (s, 4, 4) `base_from_flange` by robot and stop.
+    sighted: Sighted  # The observations.
+    pairs: Sequence[FramePair]  # The observations by pairs of frames.
+    relations: Sequence[Relation]  # Transforms that pairs determine by themselves.
+    measured: frozenset[str] = frozenset()  # The frames with a prior.
 
     @property
     def oriented(self) -> tuple[FramePair, ...]:

@@ -33,17 +33,11 @@ _CAMERA_SIGMA = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidate poses of m views, padded to k.
+    """Candidate poses of m views, padded to k."""
 
-    Attributes:
-        poses: (m, k, 4, 4) `cam_from_target`.
-        turns: (m, k) which of the target's symmetries each has applied.
-        valid: (m, k) which are not padding.
-    """
-
-    poses: FloatArray
-    turns: IntArray
-    valid: Mask
+    poses: FloatArray  # (m, k, 4, 4) `cam_from_target`.
+    turns: IntArray  # (m, k) which of the target's symmetries each has applied.
+    valid: Mask  # (m, k) which are not padding.
 
     def __len__(self) -> int:
         return len(self.poses)

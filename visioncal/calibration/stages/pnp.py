@@ -36,29 +36,20 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class ViewPoses:
-    """Candidate poses of one view.
+    """Candidate poses of one view."""
 
-    Attributes:
-        view: The view's number.
-        corners: The inlier corners; None where the session states the pose itself.
-        cam_from_target: (c, 4, 4) candidates, the best by reprojection first.
-        turns: (c,) which of the target's own symmetries each candidate has applied.
-        covariance: (c, 6, 6) of the candidates' right perturbations; zero where the session states
-            the pose itself.
-        shared_jacobian: (c, 6, k) Jacobian of each candidate by the unknowns that all views share;
-            k = 0 before these are known.
-        board: Index of the target.
-        first: The number of the target's first corner, where several are numbered through.
-    """
-
-    view: int
-    corners: Corners | None
-    cam_from_target: FloatArray
-    turns: tuple[int, ...]
+    view: int  # The view's number.
+    corners: Corners | None  # The inlier corners; None where the session states the pose itself.
+    cam_from_target: FloatArray  # (c, 4, 4) candidates, the best by reprojection first.
+    turns: tuple[int, ...]  # (c,) which of the target's own symmetries each candidate has applied.
+    # (c, 6, 6) of the candidates' right perturbations; zero where the session states the pose
+    # itself.
     covariance: FloatArray
+    # (c, 6, k) Jacobian of each candidate by the unknowns that all views share; k = 0 before these
+    # are known.
     shared_jacobian: FloatArray
-    board: int = 0
-    first: int = 0
+    board: int = 0  # Index of the target.
+    first: int = 0  # The number of the target's first corner, where several are numbered through.
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,23 +35,16 @@ _LINE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of an instrument.
+    """Readings of an instrument."""
 
-    Attributes:
-        instrument: Its noise.
-        names: The points in the order in which they first appear; a single one may have no name.
-        read_m: (3,) by view, in the instrument's frame [m].
-        points: Index of the point, by view.
-        probes: (4, 4) `instrument_from_probe` by view, where poses were read; else None.
-        rejections: Rows that are of no use.
-    """
-
-    instrument: Instrument
+    instrument: Instrument  # Its noise.
+    # The points in the order in which they first appear; a single one may have no name.
     names: tuple[str, ...]
-    read_m: Mapping[int, FloatArray]
-    points: Mapping[int, int]
+    read_m: Mapping[int, FloatArray]  # (3,) by view, in the instrument's frame [m].
+    points: Mapping[int, int]  # Index of the point, by view.
+    # (4, 4) `instrument_from_probe` by view, where poses were read; else None.
     probes: Mapping[int, FloatArray] | None
-    rejections: tuple[Rejection, ...]
+    rejections: tuple[Rejection, ...]  # Rows that are of no use.
 
     @property
     def are_poses(self) -> bool:

@@ -26,25 +26,17 @@ _APART_PX = 0.01
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """An observation for comparison with others.
+    """An observation for comparison with others."""
 
-    Attributes:
-        view: Its number.
-        alike: What is equal in rows that are compared at all: who observes what, the kinds of
-            numbers, and other measurements such as loads and temperatures.
-        stamp_s: When it was taken; None where that is not known.
-        numbers: State of the robots and what was read, in units of what rows of one stop may
-            differ by.
-        read: How many of these, at the end, were read.
-        is_image: Whether corners were read.
-    """
-
-    view: int
+    view: int  # Its number.
+    # What is equal in rows that are compared at all: who observes what, the kinds of numbers, and
+    # other measurements such as loads and temperatures.
     alike: Hashable
-    stamp_s: float | None
+    stamp_s: float | None  # When it was taken; None where that is not known.
+    # State of the robots and what was read, in units of what rows of one stop may differ by.
     numbers: FloatArray
-    read: int
-    is_image: bool
+    read: int  # How many of these, at the end, were read.
+    is_image: bool  # Whether corners were read.
 
     def is_repeated_by(self, other: "_Row") -> bool:
         """Whether another row, of nearly the same numbers, is a copy of this one.

@@ -34,21 +34,13 @@ def move_to_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -
 
 @dataclass(frozen=True, eq=False)
 class RobotReport:
-    """Poses and joints that a robot's rows report.
+    """Poses and joints that a robot's rows report."""
 
-    Attributes:
-        base_from_flange: (4, 4) by view.
-        rejections: Views without a pose.
-        warnings: Contradictions.
-        notes: Remarks.
-        matched: The joints matched with the poses; None without a model.
-    """
-
-    base_from_flange: Mapping[int, FloatArray]
-    rejections: tuple[Rejection, ...] = ()
-    warnings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
-    matched: MatchedJoints | None = None
+    base_from_flange: Mapping[int, FloatArray]  # (4, 4) by view.
+    rejections: tuple[Rejection, ...] = ()  # Views without a pose.
+    warnings: tuple[Finding, ...] = ()  # Contradictions.
+    notes: tuple[str, ...] = ()  # Remarks.
+    matched: MatchedJoints | None = None  # The joints matched with the poses; None without a model.
 
     @cached_property
     def joints_rad(self) -> Mapping[int, FloatArray] | None:

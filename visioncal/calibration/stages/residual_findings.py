@@ -42,20 +42,14 @@ _CLEARLY = 2.0 * float(np.log(100.0))
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Deviations of the residuals of one robot's stops from noise.
+    """Deviations of the residuals of one robot's stops from noise."""
 
-    Attributes:
-        neighbours: Correlation of neighbouring stops; None for an arm whose joints are not known,
-            as its covariance includes that.
-        drift: Drift of its base or of what it observes; None where noise explains it.
-        step: Sudden change that explains more than a drift; None without one.
-        rival: Another step that explains about as much; None without one.
-    """
-
+    # Correlation of neighbouring stops; None for an arm whose joints are not known, as its
+    # covariance includes that.
     neighbours: Neighbours | None
-    drift: Drift | None
-    step: Step | None = None
-    rival: Step | None = None
+    drift: Drift | None  # Drift of its base or of what it observes; None where noise explains it.
+    step: Step | None = None  # Sudden change that explains more than a drift; None without one.
+    rival: Step | None = None  # Another step that explains about as much; None without one.
 
 
 def residual_tests(

@@ -66,21 +66,13 @@ _FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """Recorded heating of an arm, and when its views were taken.
+    """Recorded heating of an arm, and when its views were taken."""
 
-    Attributes:
-        session: The session that records it.
-        robot: The robot's name there.
-        joints: Number of joints.
-        views: (m,) a view of each of the arm's m stops.
-        stamps_s: (m,) when that was taken [s]; NaN where unknown.
-    """
-
-    session: Session
-    robot: str
-    joints: int
-    views: IntArray
-    stamps_s: FloatArray
+    session: Session  # The session that records it.
+    robot: str  # The robot's name there.
+    joints: int  # Number of joints.
+    views: IntArray  # (m,) a view of each of the arm's m stops.
+    stamps_s: FloatArray  # (m,) when that was taken [s]; NaN where unknown.
 
     def at(self, rows: IntArray) -> Self:
         """Returns it for some of the stops."""

@@ -51,46 +51,28 @@ _ROUNDS, _SETTLED = 5, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ThermalStops:
-    """A robot's stops.
+    """A robot's stops."""
 
-    Attributes:
-        robot: The robot's name in the problem.
-        places: (m,) the problem's stops.
-        q: (m, n) joint angles [rad].
-        stamps_s: (m,) when they were observed [s].
-    """
-
-    robot: str
-    places: IntArray
-    q: FloatArray
-    stamps_s: FloatArray
+    robot: str  # The robot's name in the problem.
+    places: IntArray  # (m,) the problem's stops.
+    q: FloatArray  # (m, n) joint angles [rad].
+    stamps_s: FloatArray  # (m,) when they were observed [s].
 
 
 @dataclass(frozen=True, eq=False)
 class ThermalFit:
-    """Estimated drift of an arm.
+    """Estimated drift of an arm."""
 
-    Attributes:
-        model: The arm with its coefficients and their covariance.
-        values: (p,) deviation of the parameters from their prior, in units of (p,) `sigmas`.
-        sigmas: The prior's sigmas.
-        shares: (p,) posterior over prior sigma of each parameter.
-        gain: Twice the gain in log-likelihood over an arm without drift.
-        before_m: Residual of the views without drift, as a root mean square [m].
-        after_m: The same with drift [m].
-        rises_k: (n,) range of each link's temperature over the views [K].
-        inputs: What heated the arm.
-    """
-
-    model: ThermalModel
+    model: ThermalModel  # The arm with its coefficients and their covariance.
+    # (p,) deviation of the parameters from their prior, in units of (p,) `sigmas`.
     values: FloatArray
-    sigmas: FloatArray
-    shares: FloatArray
-    gain: float
-    before_m: float
-    after_m: float
-    rises_k: FloatArray
-    inputs: Inputs
+    sigmas: FloatArray  # The prior's sigmas.
+    shares: FloatArray  # (p,) posterior over prior sigma of each parameter.
+    gain: float  # Twice the gain in log-likelihood over an arm without drift.
+    before_m: float  # Residual of the views without drift, as a root mean square [m].
+    after_m: float  # The same with drift [m].
+    rises_k: FloatArray  # (n,) range of each link's temperature over the views [K].
+    inputs: Inputs  # What heated the arm.
 
     @property
     def not_determined(self) -> tuple[str, ...]:

@@ -20,21 +20,14 @@ _FOLDS = 10
 
 @dataclass(frozen=True, eq=False)
 class HeldOutResiduals:
-    """Residuals of held-out observations.
+    """Residuals of held-out observations."""
 
-    Attributes:
-        method: The method of cross-validation, in words.
-        residual_m: (n,) distance between the observed and the predicted position [m]; NaN where the
-            other
-            observations do not determine it.
-        residual_rad: (n,) angle between the rotations [rad]; NaN for positions alone.
-        rms_px: (n,) reprojection error through the chain [px]; NaN without corners.
-    """
-
-    method: str
+    method: str  # The method of cross-validation, in words.
+    # (n,) distance between the observed and the predicted position [m]; NaN where the other
+    # observations do not determine it.
     residual_m: FloatArray
-    residual_rad: FloatArray
-    rms_px: FloatArray
+    residual_rad: FloatArray  # (n,) angle between the rotations [rad]; NaN for positions alone.
+    rms_px: FloatArray  # (n,) reprojection error through the chain [px]; NaN without corners.
 
 
 def cross_validate(

@@ -32,28 +32,19 @@ ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
 
 @dataclass(frozen=True, eq=False)
 class CalibrationPrior:
-    """The fit of a calibration: its unknowns, their covariance, and the noise.
+    """The fit of a calibration: its unknowns, their covariance, and the noise."""
 
-    Attributes:
-        calibration: The calibration.
-        targets: The printed targets by the session's names; that of an only one is empty.
-        boards: (b,) indices, among the targets, of those with an edge.
-        state: The edges of the camera and of these boards, and the k values that all stops share:
-            lens and boards, then the arm.
-        covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
-        looks: (l,) indices of the free values of lens and boards.
-        arm: Parametrisation of the arm's errors.
-        model: The calibrated arm, for errors of its model.
-    """
-
-    calibration: Calibration
+    calibration: Calibration  # The calibration.
+    # The printed targets by the session's names; that of an only one is empty.
     targets: Mapping[str, Target]
-    boards: tuple[int, ...]
+    boards: tuple[int, ...]  # (b,) indices, among the targets, of those with an edge.
+    # The edges of the camera and of these boards, and the k values that all stops share: lens and
+    # boards, then the arm.
     state: State
-    covariance: FloatArray
-    looks: tuple[int, ...]
-    arm: ArmKind
-    model: ArmModel | None
+    covariance: FloatArray  # (6 + 6 b + k, 6 + 6 b + k) of edges and values.
+    looks: tuple[int, ...]  # (l,) indices of the free values of lens and boards.
+    arm: ArmKind  # Parametrisation of the arm's errors.
+    model: ArmModel | None  # The calibrated arm, for errors of its model.
 
     @classmethod
     def of(cls, calibration: Calibration) -> "CalibrationPrior":

@@ -48,55 +48,36 @@ _ANYWHERE = np.repeat([1.0, 1.0], 3)
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A change that may have happened.
+    """A change that may have happened."""
 
-    Attributes:
-        name: `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
-            `board_size`, `board_replaced`, `robot_noise`, or `view 7`.
-        probability: Posterior probability among all changes.
-        explained: Fit and evidence of the change.
-    """
-
+    # `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
+    # `board_size`, `board_replaced`, `robot_noise`, or `view 7`.
     name: str
-    probability: float
-    explained: HypothesisEvidence
+    probability: float  # Posterior probability among all changes.
+    explained: HypothesisEvidence  # Fit and evidence of the change.
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """Result of verifying a calibration with a few new stops.
+    """Result of verifying a calibration with a few new stops."""
 
-    Attributes:
-        calibration: The calibration.
-        predicted: The stops.
-        prior: The calibration as a prior.
-        residuals: (m, 6) displacement of each board from its calibrated pose, by each observation
-            (rotation [rad], translation [m]), in the board's frame.
-        remaining: (m, 6) the same with the likeliest change undone, where one was found.
-        log_evidence: Logarithm of the likelihood ratio of any change to none.
-        misfit: Squared Mahalanobis distance of the stops from the prediction.
-        freedom: Its degrees of freedom.
-        p_value: Probability of a misfit at least as large if nothing has changed.
-        suspects: All changes that were compared, the likeliest first.
-        named: Changes that cannot be distinguished from the likeliest, which is the first; empty
-            where nothing has changed.
-        explained: Whether the likeliest change leaves no more residuals than noise.
-        camera_sigma: (6,) standard deviations of an estimated motion of the camera, about its axes
-            [rad, m].
-    """
-
-    calibration: Calibration
-    predicted: PredictedStops
-    prior: CalibrationPrior
+    calibration: Calibration  # The calibration.
+    predicted: PredictedStops  # The stops.
+    prior: CalibrationPrior  # The calibration as a prior.
+    # (m, 6) displacement of each board from its calibrated pose, by each observation (rotation
+    # [rad], translation [m]), in the board's frame.
     residuals: FloatArray
-    remaining: FloatArray
-    log_evidence: float
-    misfit: float
-    freedom: int
-    p_value: float
-    suspects: tuple[Suspect, ...]
+    remaining: FloatArray  # (m, 6) the same with the likeliest change undone, where one was found.
+    log_evidence: float  # Logarithm of the likelihood ratio of any change to none.
+    misfit: float  # Squared Mahalanobis distance of the stops from the prediction.
+    freedom: int  # Its degrees of freedom.
+    p_value: float  # Probability of a misfit at least as large if nothing has changed.
+    suspects: tuple[Suspect, ...]  # All changes that were compared, the likeliest first.
+    # Changes that cannot be distinguished from the likeliest, which is the first; empty where
+    # nothing has changed.
     named: tuple[Suspect, ...]
-    explained: bool
+    explained: bool  # Whether the likeliest change leaves no more residuals than noise.
+    # (6,) standard deviations of an estimated motion of the camera, about its axes [rad, m].
     camera_sigma: FloatArray
 
     @property

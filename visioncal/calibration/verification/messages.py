@@ -76,23 +76,14 @@ _LISTED_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class MeasuredMove:
-    """Estimated motion of a camera or board.
+    """Estimated motion of a camera or board."""
 
-    Attributes:
-        mm: Distance [mm].
-        sigma_mm: Its standard deviation [mm].
-        along: Its direction in words.
-        deg: Angle [deg].
-        sigma_deg: Its standard deviation [deg].
-        about: Its axis in words.
-    """
-
-    mm: float
-    sigma_mm: float
-    along: str
-    deg: float
-    sigma_deg: float
-    about: str
+    mm: float  # Distance [mm].
+    sigma_mm: float  # Its standard deviation [mm].
+    along: str  # Its direction in words.
+    deg: float  # Angle [deg].
+    sigma_deg: float  # Its standard deviation [deg].
+    about: str  # Its axis in words.
 
     @property
     def words(self) -> str:

@@ -33,47 +33,30 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class Trigger:
-    """A reason to calibrate again.
+    """A reason to calibrate again."""
 
-    Attributes:
-        quantity: The quantity that is compared.
-        limit: The limit beyond which it fires; None for a yes or no quantity.
-    """
-
-    quantity: str
-    limit: float | None = None
+    quantity: str  # The quantity that is compared.
+    limit: float | None = None  # The limit beyond which it fires; None for a yes or no quantity.
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Evaluation of one trigger.
+    """Evaluation of one trigger."""
 
-    Attributes:
-        trigger: The trigger.
-        state: Whether it fired, or could not be judged.
-        value: The figure that was compared with the limit; None for yes or no, and where unknown.
-        words: Its name, with figure and limit, or why the figure is unknown.
-    """
-
-    trigger: Trigger
-    state: State
+    trigger: Trigger  # The trigger.
+    state: State  # Whether it fired, or could not be judged.
+    # The figure that was compared with the limit; None for yes or no, and where unknown.
     value: float | None
-    words: str
+    words: str  # Its name, with figure and limit, or why the figure is unknown.
 
 
 @dataclass(frozen=True)
 class TriggerFacts:
-    """Input of the triggers.
+    """Input of the triggers."""
 
-    Attributes:
-        values: Figures by quantity.
-        flags: Yes or no, by quantity.
-        unknown: Why a figure is unknown, by quantity.
-    """
-
-    values: Mapping[str, float]
-    flags: Mapping[str, bool]
-    unknown: Mapping[str, str]
+    values: Mapping[str, float]  # Figures by quantity.
+    flags: Mapping[str, bool]  # Yes or no, by quantity.
+    unknown: Mapping[str, str]  # Why a figure is unknown, by quantity.
 
 
 def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:

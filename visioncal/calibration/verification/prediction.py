@@ -39,19 +39,13 @@ _MENTIONED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class PredictedStops:
-    """The stops of a session with a calibration's lens, boards and arm.
+    """The stops of a session with a calibration's lens, boards and arm."""
 
-    Attributes:
-        observed: The session's observations, with the calibration's lens, boards and arm.
-        problem: The m observations of a board at a stop, with the calibration's unknowns.
-        views: (m,) the views that each observation combines.
-        warnings: Warnings, in sentences.
-    """
-
+    # The session's observations, with the calibration's lens, boards and arm.
     observed: ObservedPoses
-    problem: Problem
-    views: tuple[tuple[int, ...], ...]
-    warnings: tuple[str, ...]
+    problem: Problem  # The m observations of a board at a stop, with the calibration's unknowns.
+    views: tuple[tuple[int, ...], ...]  # (m,) the views that each observation combines.
+    warnings: tuple[str, ...]  # Warnings, in sentences.
 
     @property
     def stops(self) -> int:

@@ -45,17 +45,11 @@ _FAR_M, _TURNED_RAD = 10.0, 2.0 * np.pi + 0.01
 
 @dataclass(frozen=True, eq=False)
 class PendantPose:
-    """A pose that was read.
+    """A pose that was read."""
 
-    Attributes:
-        pose: (4, 4) [m].
-        form: The assumed form.
-        reading: The assumed units and rotation.
-    """
-
-    pose: FloatArray
-    form: PoseForm
-    reading: Reading
+    pose: FloatArray  # (4, 4) [m].
+    form: PoseForm  # The assumed form.
+    reading: Reading  # The assumed units and rotation.
 
     @property
     def words(self) -> str:

@@ -34,21 +34,13 @@ _LISTED = re.compile(
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table.
+    """A table."""
 
-    Attributes:
-        label: Its file's name, for messages; empty for a table in memory.
-        columns: Names of the columns by the header, or `1`, `2`, ... without one.
-        rows: Cells of the rows.
-        lines: The line of each row in the file, or its number in memory.
-        has_header: Whether the names come from the file.
-    """
-
-    label: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    lines: Sequence[int]
-    has_header: bool = True
+    label: str  # Its file's name, for messages; empty for a table in memory.
+    columns: tuple[str, ...]  # Names of the columns by the header, or `1`, `2`, ... without one.
+    rows: tuple[tuple[str, ...], ...]  # Cells of the rows.
+    lines: Sequence[int]  # The line of each row in the file, or its number in memory.
+    has_header: bool = True  # Whether the names come from the file.
 
     def place(self, row: int) -> str:
         """Location of a row for messages: `poses.csv, line 3`."""

@@ -25,15 +25,11 @@ FEWEST_VIEWS = 2
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """Both unknown transforms.
+    """Both unknown transforms."""
 
-    Attributes:
-        x: (..., 4, 4) X: `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
-        z: (..., 4, 4) Z: `base_from_target` or `flange_from_target` [m].
-    """
-
+    # (..., 4, 4) X: `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
     x: FloatArray
-    z: FloatArray
+    z: FloatArray  # (..., 4, 4) Z: `base_from_target` or `flange_from_target` [m].
 
 
 Solver: TypeAlias = Callable[[FloatArray, FloatArray], HandEye]

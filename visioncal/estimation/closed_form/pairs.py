@@ -31,16 +31,11 @@ _GROUP = 100
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Relative rotations as quaternions (w, x, y, z), both orders of n / 2 pairs of views.
+    """Relative rotations as quaternions (w, x, y, z), both orders of n / 2 pairs of views."""
 
-    Attributes:
-        robot: (..., 4, n) of A = inv(R_j) R_i.
-        camera: (..., 4, n) of B = C_j inv(C_i), one motion after the other.
-        weight: (..., n) from -1 to 1; negative where the sign of one of the two must be flipped.
-    """
-
-    robot: FloatArray
-    camera: FloatArray
+    robot: FloatArray  # (..., 4, n) of A = inv(R_j) R_i.
+    camera: FloatArray  # (..., 4, n) of B = C_j inv(C_i), one motion after the other.
+    # (..., n) from -1 to 1; negative where the sign of one of the two must be flipped.
     weight: FloatArray
 
 

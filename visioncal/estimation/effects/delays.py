@@ -19,20 +19,16 @@ from visioncal.estimation.corners import CornerStack
 
 @dataclass(frozen=True)
 class Delay:
-    """An effect of time within an image.
-
-    Attributes:
-        sigma_s: Prior standard deviation of the time, about zero [s].
-        shares: Of (n, 2) corners [px] in an image of some resolution, the (n,) shares.
-        result: Fields of `results.ClockResult`, from a time, its sigma [s], whether it is
-            significant, and the image's resolution.
-        words: A sentence on a significant time, from the time and its sigma [s].
-    """
+    """An effect of time within an image."""
 
     name: str
-    sigma_s: float
+    sigma_s: float  # Prior standard deviation of the time, about zero [s].
+    # Of (n, 2) corners [px] in an image of some resolution, the (n,) shares.
     shares: Callable[[FloatArray, tuple[int, int]], FloatArray]
+    # Fields of `results.ClockResult`, from a time, its sigma [s], whether it is significant, and
+    # the image's resolution.
     result: Callable[[float, float, bool, tuple[int, int]], dict[str, Any]]
+    # A sentence on a significant time, from the time and its sigma [s].
     words: Callable[[float, float], str]
 
 

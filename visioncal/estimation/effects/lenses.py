@@ -26,19 +26,12 @@ LENSES = "lenses and boards"
 
 @dataclass(frozen=True, eq=False)
 class CameraParameters:
-    """Parameters of all lenses and boards, with the cameras' corners.
+    """Parameters of all lenses and boards, with the cameras' corners."""
 
-    Attributes:
-        problems: Each camera's corners, by camera name.
-        values: (k,) intrinsics of all lenses, camera by camera, then all boards' shapes.
-        poses: (v, 4, 4) `cam_from_target` of the views, camera by camera.
-        resized: Printed boards whose scales are free from the start.
-    """
-
-    problems: Mapping[str, CornerProblem]
-    values: FloatArray
-    poses: FloatArray
-    resized: tuple[int, ...] = ()
+    problems: Mapping[str, CornerProblem]  # Each camera's corners, by camera name.
+    values: FloatArray  # (k,) intrinsics of all lenses, camera by camera, then all boards' shapes.
+    poses: FloatArray  # (v, 4, 4) `cam_from_target` of the views, camera by camera.
+    resized: tuple[int, ...] = ()  # Printed boards whose scales are free from the start.
 
     @classmethod
     def of(
@@ -291,21 +284,13 @@ class CameraParameters:
 
 @dataclass(frozen=True, eq=False)
 class LinearisedCorners:
-    """All corners, linearised in poses, lenses and boards.
+    """All corners, linearised in poses, lenses and boards."""
 
-    Attributes:
-        camera_parameters: The linearisation point.
-        moving: Indices of the values that a fit moves.
-        compressed: Normal equations of each camera's corners.
-        sigmas_px: Each camera's noise of a corner's coordinate [px].
-        corners: Information of the corners on all values, with free poses.
-    """
-
-    camera_parameters: CameraParameters
-    moving: IntArray
-    compressed: tuple[Compressed, ...]
-    sigmas_px: tuple[float, ...]
-    corners: PriorInformation
+    camera_parameters: CameraParameters  # The linearisation point.
+    moving: IntArray  # Indices of the values that a fit moves.
+    compressed: tuple[Compressed, ...]  # Normal equations of each camera's corners.
+    sigmas_px: tuple[float, ...]  # Each camera's noise of a corner's coordinate [px].
+    corners: PriorInformation  # Information of the corners on all values, with free poses.
 
     @cached_property
     def free(self) -> IntArray:

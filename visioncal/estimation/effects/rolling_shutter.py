@@ -15,19 +15,12 @@ _READOUT_SIGMA_S = 0.02
 
 @dataclass(frozen=True)
 class Shutter:
-    """Shutter of a camera.
+    """Shutter of a camera."""
 
-    Attributes:
-        kind: Rows exposed one after the other, or all at once.
-        readout_s: Delay of the last row behind the first [s].
-        readout_sigma_s: Its standard deviation [s].
-        line_s: Delay of each row behind the one before it [s].
-    """
-
-    kind: Literal["rolling", "global"]
-    readout_s: float
-    readout_sigma_s: float
-    line_s: float
+    kind: Literal["rolling", "global"]  # Rows exposed one after the other, or all at once.
+    readout_s: float  # Delay of the last row behind the first [s].
+    readout_sigma_s: float  # Its standard deviation [s].
+    line_s: float  # Delay of each row behind the one before it [s].
 
 
 def _shares(px: FloatArray, resolution: tuple[int, int]) -> FloatArray:

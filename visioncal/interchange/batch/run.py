@@ -27,13 +27,9 @@ TABLE, PAGE, _CELLS = "batch.parquet", "index.html", "cells"
 
 @dataclass(frozen=True)
 class Batch:
-    """Results of many sessions.
+    """Results of many sessions."""
 
-    Attributes:
-        rows: One a session, the strongest outliers first.
-    """
-
-    rows: tuple[FleetRow, ...]
+    rows: tuple[FleetRow, ...]  # One a session, the strongest outliers first.
     table: Path
     page: Path
 

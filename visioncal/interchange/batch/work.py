@@ -33,16 +33,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Job:
-    """One session to be calibrated.
+    """One session to be calibrated."""
 
-    Attributes:
-        name: Its name in the batch.
-        folder: Absolute path for its result.
-    """
-
-    name: str
+    name: str  # Its name in the batch.
     session: Path
-    folder: Path
+    folder: Path  # Absolute path for its result.
     options: Options
 
 

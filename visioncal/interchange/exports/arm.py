@@ -52,18 +52,12 @@ class FitError:
 
 @dataclass(frozen=True, eq=False)
 class FittedLinks:
-    """Constant links and offsets fitted to an arm that a format cannot fully hold.
+    """Constant links and offsets fitted to an arm that a format cannot fully hold."""
 
-    Attributes:
-        robot: The arm with these links, and with the functions that the format holds.
-        measured: Remaining error over the joint ranges of the stops; None where these are not
-            known.
-        workspace: Remaining error over the workspace.
-    """
-
-    robot: Robot
+    robot: Robot  # The arm with these links, and with the functions that the format holds.
+    # Remaining error over the joint ranges of the stops; None where these are not known.
     measured: FitError | None
-    workspace: FitError
+    workspace: FitError  # Remaining error over the workspace.
 
     @property
     def words(self) -> str:
@@ -75,36 +69,28 @@ class FittedLinks:
 
 @dataclass(frozen=True, eq=False)
 class ArmContent:
-    """Content for a format of arms.
-
-    Attributes:
-        origin: Where the result comes from, in one line.
-        sigma_mm: Predicted standard deviation of a tool's position over the workspace; None where
-            unknown.
-        functions: Repeatable errors of the joints by their angles; None where none were found.
-        calibration_hash: The hash by which the driver recognises the arm, if stated.
-        sag_mm: Largest deflection of the flange under the arm's own weight [mm]; zero for a rigid
-            arm.
-        cold_c: Least and greatest reference temperature of its links [deg C], for an arm that
-            drifts.
-        drift_mm: Largest drift of its flange with temperature, in one posture of the session [mm].
-        links: Fitted links, where the format cannot hold the whole arm; else None.
-        with_corrections: Whether the table of joint corrections is used with the links.
-    """
+    """Content for a format of arms."""
 
     nominal: Robot
     robot: Robot
-    origin: str
+    origin: str  # Where the result comes from, in one line.
     verdict: Verdict
+    # Predicted standard deviation of a tool's position over the workspace; None where unknown.
     sigma_mm: WorkspaceSigma | None
+    # Repeatable errors of the joints by their angles; None where none were found.
     functions: JointFunctions | None = None
     convention: Convention | None = None
+    # The hash by which the driver recognises the arm, if stated.
     calibration_hash: str | None = None
+    # Largest deflection of the flange under the arm's own weight [mm]; zero for a rigid arm.
     sag_mm: float = 0.0
+    # Least and greatest reference temperature of its links [deg C], for an arm that drifts.
     cold_c: tuple[float, float] | None = None
+    # Largest drift of its flange with temperature, in one posture of the session [mm].
     drift_mm: float = 0.0
+    # Fitted links, where the format cannot hold the whole arm; else None.
     links: FittedLinks | None = None
-    with_corrections: bool = False
+    with_corrections: bool = False  # Whether the table of joint corrections is used with the links.
 
     @property
     def written(self) -> Robot:
@@ -199,12 +185,9 @@ class ArmContent:
 
 @dataclass(frozen=True)
 class ArmFormat(Format[ArmContent]):
-    """A foreign format of arms.
+    """A foreign format of arms."""
 
-    Attributes:
-        holds: Everything; links and offsets only; or joint functions for use with such links.
-    """
-
+    # Everything; links and offsets only; or joint functions for use with such links.
     holds: Literal["all", "links", "functions"] = "all"
 
 

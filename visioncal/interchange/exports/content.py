@@ -31,47 +31,34 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Load:
-    """A tool's load, which no calibration determines.
-
-    Attributes:
-        centre_mm: Its centre of mass in the flange's frame.
-    """
+    """A tool's load, which no calibration determines."""
 
     mass_kg: float
-    centre_mm: tuple[float, float, float]
+    centre_mm: tuple[float, float, float]  # Its centre of mass in the flange's frame.
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What to export; None leaves the choice to the format.
+    """What to export; None leaves the choice to the format."""
 
-    Attributes:
-        edge: A transform by name; None for the camera's, or in a format of tools or fixtures for
-            the only one of its kind.
-        parent: Exported name of the frame in which the pose is given.
-        child: Exported name of the frame whose pose it is; the camera, in a format of lenses.
-        number: Number of the controller's tool or base.
-        calibration_hash: The `hash` of a UR's own kinematics.
-        camera: Which camera of a cell is meant, in a format of lenses.
-        robot: Which robot of a cell: its part is exported as of one camera and robot.
-        target: Which target of a cell; likewise.
-        with_corrections: Whether the table of joint corrections is used with the arm.
-        lens: A file with the lens of the receiving program, for which the camera's transform is
-            written; None for the calibration's own.
-    """
-
+    # A transform by name; None for the camera's, or in a format of tools or fixtures for the only
+    # one of its kind.
     edge: str | None = None
     inverse: bool = False
-    parent: str | None = None
+    parent: str | None = None  # Exported name of the frame in which the pose is given.
+    # Exported name of the frame whose pose it is; the camera, in a format of lenses.
     child: str | None = None
-    number: int | None = None
+    number: int | None = None  # Number of the controller's tool or base.
     load: Load | None = None
     convention: str | None = None
-    calibration_hash: str | None = None
-    camera: str | None = None
+    calibration_hash: str | None = None  # The `hash` of a UR's own kinematics.
+    camera: str | None = None  # Which camera of a cell is meant, in a format of lenses.
+    # Which robot of a cell: its part is exported as of one camera and robot.
     robot: str | None = None
-    target: str | None = None
-    with_corrections: bool = False
+    target: str | None = None  # Which target of a cell; likewise.
+    with_corrections: bool = False  # Whether the table of joint corrections is used with the arm.
+    # A file with the lens of the receiving program, for which the camera's transform is written;
+    # None for the calibration's own.
     lens: Path | None = None
 
     @property
@@ -94,30 +81,20 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """Content for a format of transforms or lenses.
+    """Content for a format of transforms or lenses."""
 
-    Attributes:
-        name: Name of the transform in the result.
-        edge: `parent_from_child`: its translation and rotation are the child's pose in the parent.
-        parent: Exported name of the parent frame.
-        child: Exported name of the child frame.
-        frames: Our own names of parent and child.
-        lens: The camera, where there is one.
-        origin: Where the result comes from, in one line.
-        conditions: Under which the transform holds.
-        rotation_of: Our name of the frame whose rotation was copied; None where it was measured.
-    """
-
-    name: str
+    name: str  # Name of the transform in the result.
+    # `parent_from_child`: its translation and rotation are the child's pose in the parent.
     edge: Edge
-    parent: str
-    child: str
-    frames: tuple[str, str]
+    parent: str  # Exported name of the parent frame.
+    child: str  # Exported name of the child frame.
+    frames: tuple[str, str]  # Our own names of parent and child.
     mount: Mount | None
-    lens: CameraResult | None
-    origin: str
+    lens: CameraResult | None  # The camera, where there is one.
+    origin: str  # Where the result comes from, in one line.
     verdict: Verdict
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[Condition, ...] = ()  # Under which the transform holds.
+    # Our name of the frame whose rotation was copied; None where it was measured.
     rotation_of: str | None = None
     number: int | None = None
     load: Load | None = None
@@ -169,20 +146,13 @@ class Content:
 
 @dataclass(frozen=True)
 class Format(Generic[_T]):
-    """A foreign format of a result.
+    """A foreign format of a result."""
 
-    Attributes:
-        name: Its name on the command line.
-        words: Its description with its reader and units, in one line.
-        write: Builds the document.
-        takes: Options that apply to it; see `check`.
-        warn: What its user should know or do before using the document, in sentences.
-    """
-
-    name: str
-    words: str
-    write: Callable[[_T], str]
-    takes: frozenset[Takes] = frozenset()
+    name: str  # Its name on the command line.
+    words: str  # Its description with its reader and units, in one line.
+    write: Callable[[_T], str]  # Builds the document.
+    takes: frozenset[Takes] = frozenset()  # Options that apply to it; see `check`.
+    # What its user should know or do before using the document, in sentences.
     warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
 
     def check(self, selection: Selection, also: Collection[str] = ()) -> None:
@@ -207,20 +177,15 @@ class Format(Generic[_T]):
 
 @dataclass(frozen=True)
 class ExportFormat(Format[Content]):
-    """A foreign format of a transform or a lens.
-
-    Attributes:
-        frames: Its names of our frames; a frame that is missing keeps our name.
-        counterpart: The maker's format of fixtures, for one of tools; and vice versa.
-        write_all: Builds the document of all transforms of a cell; None where it holds one.
-        carries_lens: Whether the camera's own lens is written with its transform.
-    """
+    """A foreign format of a transform or a lens."""
 
     holds: Holds = "any edge"
+    # Its names of our frames; a frame that is missing keeps our name.
     frames: Mapping[str, str] = field(default_factory=dict)
-    counterpart: str = ""
+    counterpart: str = ""  # The maker's format of fixtures, for one of tools; and vice versa.
+    # Builds the document of all transforms of a cell; None where it holds one.
     write_all: Callable[[Sequence[Content]], str] | None = None
-    carries_lens: bool = False
+    carries_lens: bool = False  # Whether the camera's own lens is written with its transform.
 
 
 def numbers(values: FloatArray) -> list[float]:

@@ -23,20 +23,13 @@ _NO_LOAD = "[-1,[0,0,0],[1,0,0,0],0,0,0]"
 
 @dataclass(frozen=True)
 class Language:
-    """Rules of a language for variable names.
-
-    Attributes:
-        shape: Pattern of a valid name.
-        needed: The same in words.
-        taken: Reserved words; lower case where the language ignores case.
-        cased: Whether it distinguishes upper and lower case.
-    """
+    """Rules of a language for variable names."""
 
     name: str
-    shape: re.Pattern[str]
-    needed: str
-    taken: frozenset[str]
-    cased: bool
+    shape: re.Pattern[str]  # Pattern of a valid name.
+    needed: str  # The same in words.
+    taken: frozenset[str]  # Reserved words; lower case where the language ignores case.
+    cased: bool  # Whether it distinguishes upper and lower case.
 
 
 _RAPID_WORDS = """

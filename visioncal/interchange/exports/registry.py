@@ -65,15 +65,11 @@ _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
 
 @dataclass(frozen=True)
 class Document:
-    """A result in a foreign format.
-
-    Attributes:
-        verdict: The worst verdict of what was written.
-        warnings: What else its user should know before it is used, each in plain words.
-    """
+    """A result in a foreign format."""
 
     text: str
-    verdict: Verdict
+    verdict: Verdict  # The worst verdict of what was written.
+    # What else its user should know before it is used, each in plain words.
     warnings: tuple[str, ...] = ()
 
 

@@ -31,42 +31,28 @@ _COMMANDS: Mapping[Kind, str] = {"tool": "visioncal tcp", "fixture": "visioncal 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """One transform of a source.
+    """One transform of a source."""
 
-    Attributes:
-        edge: `parent_from_child`.
-        oriented: Whether its rotation was measured.
-        rotation_of: The frame whose rotation was copied otherwise; empty for its parent's.
-        conditions: Under which it holds.
-    """
-
-    edge: Edge
+    edge: Edge  # `parent_from_child`.
     origin: str
     verdict: Verdict
-    oriented: bool = True
-    rotation_of: str = ""
-    conditions: tuple[Condition, ...] = ()
+    oriented: bool = True  # Whether its rotation was measured.
+    rotation_of: str = ""  # The frame whose rotation was copied otherwise; empty for its parent's.
+    conditions: tuple[Condition, ...] = ()  # Under which it holds.
 
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """All transforms of a source, and its camera.
-
-    Attributes:
-        frames: Names of the tools' and fixtures' transforms.
-        words: The kind of source, for messages.
-        mount: How the camera is mounted; None where there is no calibration.
-        cell: The result of a cell, which relates any two of its frames; None for other sources.
-        lenses: Its cameras by frame.
-    """
+    """All transforms of a source, and its camera."""
 
     by_name: Mapping[str, Placement]
-    frames: tuple[str, ...]
-    words: str
-    mount: Mount | None
+    frames: tuple[str, ...]  # Names of the tools' and fixtures' transforms.
+    words: str  # The kind of source, for messages.
+    mount: Mount | None  # How the camera is mounted; None where there is no calibration.
     lens: CameraResult | None
+    # The result of a cell, which relates any two of its frames; None for other sources.
     cell: Calibration | None = None
-    lenses: Mapping[str, CameraResult] = field(default_factory=dict)
+    lenses: Mapping[str, CameraResult] = field(default_factory=dict)  # Its cameras by frame.
 
     def find(self, name: str) -> tuple[Placement, tuple[str, str]]:
         """Finds a transform by its name, with our names of its parent and child.

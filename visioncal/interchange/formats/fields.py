@@ -37,27 +37,18 @@ _MOST_NUMBERS = 200
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Named values of n rows.
+    """Named values of n rows."""
 
-    Attributes:
-        name: Name of the recording.
-        folder: What the names of images are relative to.
-        places: (n,) place of each row in the source, for messages.
-        numbers: (n, ...) arrays by name; NaN where a row has none.
-        texts: (n,) texts by name, of every column of a table and of single numbers.
-        views: (n,) the rows' numbers, where their files' names have them.
-        shape_errors: Error messages of fields whose rows differ in shape, by name.
-        form: A name among `POSE_FORMS` where the rows state the form of the robot's poses.
-    """
-
-    name: str
-    folder: Path
-    places: tuple[str, ...]
-    numbers: Mapping[str, FloatArray]
+    name: str  # Name of the recording.
+    folder: Path  # What the names of images are relative to.
+    places: tuple[str, ...]  # (n,) place of each row in the source, for messages.
+    numbers: Mapping[str, FloatArray]  # (n, ...) arrays by name; NaN where a row has none.
+    # (n,) texts by name, of every column of a table and of single numbers.
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    views: tuple[int, ...] = ()
+    views: tuple[int, ...] = ()  # (n,) the rows' numbers, where their files' names have them.
+    # Error messages of fields whose rows differ in shape, by name.
     shape_errors: Mapping[str, str] = field(default_factory=dict)
-    form: str = ""
+    form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
 
     def __len__(self) -> int:
         return len(self.places)

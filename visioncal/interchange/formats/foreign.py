@@ -12,19 +12,12 @@ from visioncal.interchange.formats.import_options import ImportOptions
 
 @dataclass(frozen=True, eq=False)
 class ForeignSweep:
-    """Two streams of one motion, each with its own clock.
+    """Two streams of one motion, each with its own clock."""
 
-    Attributes:
-        robot_s: (n,) times [s], ascending.
-        robot: (n,) `base_from_flange`.
-        camera_s: (k,) times [s], ascending.
-        camera: (k,) `cam_from_target`.
-    """
-
-    robot_s: FloatArray
-    robot: PoseNumbers
-    camera_s: FloatArray
-    camera: PoseNumbers
+    robot_s: FloatArray  # (n,) times [s], ascending.
+    robot: PoseNumbers  # (n,) `base_from_flange`.
+    camera_s: FloatArray  # (k,) times [s], ascending.
+    camera: PoseNumbers  # (k,) `cam_from_target`.
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,43 +30,34 @@ class FoundCorners:
 
 @dataclass(frozen=True, eq=False)
 class ForeignRecording:
-    """A recording in a foreign format: n rows, each an observation at one robot pose.
-
-    Attributes:
-        robot: `base_from_flange` of each row.
-        camera: `cam_from_target` of each row; None where images are used instead.
-        images: (n,) the image of each row; None in a row without one, empty where there are none.
-        corners: (n,) corners found by another program in each row's image; None in a row without,
-            empty where there are none.
-        joints_rad: (n, j) joint angles [rad], NaN in a row without; None where they were not
-            recorded.
-        stamps_s: (n,) times [s]; None where they were not recorded.
-        mount: How the camera is mounted, where the source states it.
-        target: The content of a target's `.toml`, where the source describes one.
-        lens: The fields of `[camera]` in session.toml, where the source has intrinsics.
-        arm: The fields of `[robot]` in session.toml, where the user names a robot.
-        views: (n,) the rows' numbers in the source; 0, 1, ... where empty.
-        sweep: Two streams with separate clocks, of which the rows are a sample; None where the
-            source has one clock.
-        columns: Further columns of views.csv with their (n,) cells.
-        notes: Assumptions and omissions, in sentences for the user.
-    """
+    """A recording in a foreign format: n rows, each an observation at one robot pose."""
 
     name: str
-    robot: PoseNumbers
+    robot: PoseNumbers  # `base_from_flange` of each row.
+    # `cam_from_target` of each row; None where images are used instead.
     camera: PoseNumbers | None = None
+    # (n,) the image of each row; None in a row without one, empty where there are none.
     images: tuple[Path | None, ...] = ()
+    # (n,) corners found by another program in each row's image; None in a row without, empty where
+    # there are none.
     corners: tuple[FoundCorners | None, ...] = ()
+    # (n, j) joint angles [rad], NaN in a row without; None where they were not recorded.
     joints_rad: FloatArray | None = None
-    stamps_s: FloatArray | None = None
-    mount: Mount | None = None
+    stamps_s: FloatArray | None = None  # (n,) times [s]; None where they were not recorded.
+    mount: Mount | None = None  # How the camera is mounted, where the source states it.
+    # The content of a target's `.toml`, where the source describes one.
     target: Mapping[str, Any] | None = None
+    # The fields of `[camera]` in session.toml, where the source has intrinsics.
     lens: Mapping[str, Any] | None = None
+    # The fields of `[robot]` in session.toml, where the user names a robot.
     arm: Mapping[str, Any] | None = None
-    views: tuple[int, ...] = ()
+    views: tuple[int, ...] = ()  # (n,) the rows' numbers in the source; 0, 1, ... where empty.
+    # Two streams with separate clocks, of which the rows are a sample; None where the source has
+    # one clock.
     sweep: ForeignSweep | None = None
+    # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
 
 
 def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
@@ -96,16 +80,11 @@ def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
 
 @dataclass(frozen=True)
 class ForeignFormat:
-    """A foreign format of recordings, which is read and never written.
+    """A foreign format of recordings, which is read and never written."""
 
-    Attributes:
-        name: Its name on the command line.
-        words: Its description, for messages.
-        recognises: Whether an existing path looks like this format; never raises DataError.
-        read: Reads the recording at a path, with the user's options for its poses already applied.
-    """
-
-    name: str
-    words: str
+    name: str  # Its name on the command line.
+    words: str  # Its description, for messages.
+    # Whether an existing path looks like this format; never raises DataError.
     recognises: Callable[[Path], bool]
+    # Reads the recording at a path, with the user's options for its poses already applied.
     read: Callable[[Path, ImportOptions], ForeignRecording]

@@ -12,19 +12,13 @@ from visioncal.core.types import Mount
 
 @dataclass(frozen=True)
 class PoseImportOptions:
-    """Location and convention of poses; None or empty leaves it to the source.
+    """Location and convention of poses; None or empty leaves it to the source."""
 
-    Attributes:
-        names: Columns of a table, keys of JSON or arrays of an .npz: position first.
-        form: A name among `POSE_FORMS` or `ROTATION_FORMS`.
-        unit: A name among `UNITS_M`.
-        inverse: Whether the inverse of the pose is written.
-    """
-
+    # Columns of a table, keys of JSON or arrays of an .npz: position first.
     names: tuple[str, ...] = ()
-    form: str | None = None
-    unit: str | None = None
-    inverse: bool | None = None
+    form: str | None = None  # A name among `POSE_FORMS` or `ROTATION_FORMS`.
+    unit: str | None = None  # A name among `UNITS_M`.
+    inverse: bool | None = None  # Whether the inverse of the pose is written.
 
     @property
     def is_scalar_first(self) -> bool:
@@ -69,33 +63,20 @@ def _check(what: str, name: str, names: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """All options for a foreign recording.
+    """All options for a foreign recording."""
 
-    Attributes:
-        robot: Of the robot's poses, `base_from_flange`.
-        camera: Of the measured poses of the target, `cam_from_target`.
-        joints: Columns or keys of the joint angles.
-        image: The column or key that names each row's image.
-        camera_file: A second file, which holds the camera's poses.
-        target: A shipped name, the path of a `.toml`, or a one-word description.
-        intrinsics: The path of a file with intrinsics, or `estimate`.
-        corners: A file with corners that another program found in the images.
-        resolution: (width, height) [px].
-        robot_model: A built-in robot's name, or the path of a .urdf or a DH .toml.
-        tip: The frame that the poses are of.
-    """
-
-    robot: PoseImportOptions = PoseImportOptions()
+    robot: PoseImportOptions = PoseImportOptions()  # Of the robot's poses, `base_from_flange`.
+    # Of the measured poses of the target, `cam_from_target`.
     camera: PoseImportOptions = PoseImportOptions()
-    joints: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()  # Columns or keys of the joint angles.
     joints_deg: bool = False
-    image: str | None = None
-    camera_file: Path | None = None
+    image: str | None = None  # The column or key that names each row's image.
+    camera_file: Path | None = None  # A second file, which holds the camera's poses.
     mount: Mount | None = None
-    target: str | None = None
-    intrinsics: str | None = None
+    target: str | None = None  # A shipped name, the path of a `.toml`, or a one-word description.
+    intrinsics: str | None = None  # The path of a file with intrinsics, or `estimate`.
     images: Path | None = None
-    corners: Path | None = None
-    resolution: tuple[int, int] | None = None
-    robot_model: str | None = None
-    tip: str | None = None
+    corners: Path | None = None  # A file with corners that another program found in the images.
+    resolution: tuple[int, int] | None = None  # (width, height) [px].
+    robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
+    tip: str | None = None  # The frame that the poses are of.

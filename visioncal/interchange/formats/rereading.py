@@ -127,14 +127,11 @@ def _is_overruled(note: str, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class DoubtfulSession:
-    """A session whose poses may be in another convention.
+    """A session whose poses may be in another convention."""
 
-    Attributes:
-        session: The session, with identity rotations where its own are in an unsupported form.
-        robot: The robot's poses as they are written; None for those of the session.
-    """
-
+    # The session, with identity rotations where its own are in an unsupported form.
     session: Session
+    # The robot's poses as they are written; None for those of the session.
     robot: PoseNumbers | None = None
 
 
@@ -182,15 +179,10 @@ def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _PoseTable:
-    """A views.csv whose poses are in columns or forms that sessions do not have.
+    """A views.csv whose poses are in columns or forms that sessions do not have."""
 
-    Attributes:
-        plain: Its columns and rows, with the same positions and identity rotations.
-        robot: The poses as they are written.
-    """
-
-    plain: TextTable
-    robot: PoseNumbers
+    plain: TextTable  # Its columns and rows, with the same positions and identity rotations.
+    robot: PoseNumbers  # The poses as they are written.
 
 
 def _other_columns(folder: Path) -> _PoseTable | None:

@@ -26,17 +26,11 @@ _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 @dataclass(frozen=True, eq=False)
 class PairedSamples:
-    """A sample of slow, distinct poses from the overlap of two streams.
+    """A sample of slow, distinct poses from the overlap of two streams."""
 
-    Attributes:
-        rows: (m,) the chosen samples of the camera.
-        base_from_flange: (m, 4, 4) the robot's poses at these times [m].
-        match: Coarse clock offset, to a fraction of a frame.
-    """
-
-    rows: IntArray
-    base_from_flange: FloatArray
-    match: Match
+    rows: IntArray  # (m,) the chosen samples of the camera.
+    base_from_flange: FloatArray  # (m, 4, 4) the robot's poses at these times [m].
+    match: Match  # Coarse clock offset, to a fraction of a frame.
 
 
 def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:

@@ -26,16 +26,11 @@ _THIRDS = (("left", "middle", "right"), ("top", "middle", "bottom"))
 
 @dataclass(eq=False)
 class Coach:
-    """Coverage of a recording by its views.
-
-    Attributes:
-        resolution: (width, height) of the images [px].
-        camera: Intrinsics for tilt and distance; None where they are not known.
-    """
+    """Coverage of a recording by its views."""
 
     target: Target
-    resolution: tuple[int, int]
-    camera: Camera | None
+    resolution: tuple[int, int]  # (width, height) of the images [px].
+    camera: Camera | None  # Intrinsics for tilt and distance; None where they are not known.
     _covered_cells: Mask = field(init=False)
     _normals: list[FloatArray] = field(default_factory=list)
     _distances: list[float] = field(default_factory=list)

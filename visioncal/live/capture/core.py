@@ -32,25 +32,15 @@ class Times:
 
 @dataclass(frozen=True, eq=False)
 class CaptureEvent:
-    """Result of a stop, for watchers.
+    """Result of a stop, for watchers."""
 
-    Attributes:
-        view: Number of the view.
-        place: Number of the stop, from 1 on.
-        count: Number of stops; 0 where it is not known.
-        found: The view, or why there is none.
-        covered: Coverage so far, in words.
-        accuracy: Accuracy predicted so far; None while there is no prediction.
-        advice: What comes next, in words.
-    """
-
-    view: int
-    place: int
-    count: int
-    found: TakenView | Missed
-    covered: str
-    accuracy: Accuracy | None
-    advice: str
+    view: int  # Number of the view.
+    place: int  # Number of the stop, from 1 on.
+    count: int  # Number of stops; 0 where it is not known.
+    found: TakenView | Missed  # The view, or why there is none.
+    covered: str  # Coverage so far, in words.
+    accuracy: Accuracy | None  # Accuracy predicted so far; None while there is no prediction.
+    advice: str  # What comes next, in words.
     times: Times
 
 
@@ -63,21 +53,15 @@ class Watcher(Protocol):
 
 @dataclass(eq=False)
 class Capture:
-    """A recording in progress.
-
-    Attributes:
-        agreement: Consistency check of joints and pose.
-        coach: Coverage, and advice for the next view.
-        prediction: Predicted accuracy.
-    """
+    """A recording in progress."""
 
     cell: LiveCell
     target: Target
     journal: Journal
     options: CaptureOptions
-    agreement: JointPoseCheck
-    coach: Coach
-    prediction: Prediction | None
+    agreement: JointPoseCheck  # Consistency check of joints and pose.
+    coach: Coach  # Coverage, and advice for the next view.
+    prediction: Prediction | None  # Predicted accuracy.
     watchers: Sequence[Watcher] = ()
     steps: list[CaptureEvent] = field(default_factory=list)
 

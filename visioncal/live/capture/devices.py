@@ -13,21 +13,13 @@ from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 @dataclass(frozen=True)
 class ArmSetup:
-    """Options of an arm to open.
+    """Options of an arm to open."""
 
-    Attributes:
-        address: What follows the kind: a host.
-        watch_only: Whether it is only read, and need not be ready to be driven.
-        ask: Asks a question and returns the line that was typed.
-        form: Form of typed poses; None to recognise it.
-        answers: Whether a person types, who can be asked again, unlike a file.
-    """
-
-    address: str
-    watch_only: bool
-    ask: Callable[[str], str]
-    form: str | None = None
-    answers: bool = True
+    address: str  # What follows the kind: a host.
+    watch_only: bool  # Whether it is only read, and need not be ready to be driven.
+    ask: Callable[[str], str]  # Asks a question and returns the line that was typed.
+    form: str | None = None  # Form of typed poses; None to recognise it.
+    answers: bool = True  # Whether a person types, who can be asked again, unlike a file.
 
 
 ArmOpener: TypeAlias = Callable[[ArmSetup], Arm]

@@ -25,15 +25,10 @@ _ARRIVED_RAD = 2e-2
 
 @dataclass(frozen=True)
 class JointPace:
-    """Speed of a synchronised joint motion, led by the joint that travels farthest.
+    """Speed of a synchronised joint motion, led by the joint that travels farthest."""
 
-    Attributes:
-        speed: Speed of that joint [rad/s].
-        acceleration: Its acceleration [rad/s^2].
-    """
-
-    speed: float
-    acceleration: float
+    speed: float  # Speed of that joint [rad/s].
+    acceleration: float  # Its acceleration [rad/s^2].
 
     @classmethod
     def of(cls, options: CaptureOptions) -> "JointPace":

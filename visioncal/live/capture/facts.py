@@ -20,27 +20,18 @@ _TARGET_FILE = "target.toml"
 
 @dataclass(frozen=True, eq=False)
 class CaptureFacts:
-    """Facts of a recording that are the same for all views.
-
-    Attributes:
-        robot: The arm's model; None where it is not known.
-        arm: The name that the arm reports.
-        camera: The name that the camera reports.
-        resolution: (width, height) of its pictures [px].
-        lens: Intrinsics that it reports, to be refined; None to have them estimated.
-        plan: Digest of the plan that is driven; empty for none.
-    """
+    """Facts of a recording that are the same for all views."""
 
     name: str
     mount: Mount
     target: Target
-    robot: Robot | None
-    arm: str
-    camera: str
-    resolution: tuple[int, int]
-    lens: Camera | None
+    robot: Robot | None  # The arm's model; None where it is not known.
+    arm: str  # The name that the arm reports.
+    camera: str  # The name that the camera reports.
+    resolution: tuple[int, int]  # (width, height) of its pictures [px].
+    lens: Camera | None  # Intrinsics that it reports, to be refined; None to have them estimated.
     settings: Mapping[str, str | float]
-    plan: str
+    plan: str  # Digest of the plan that is driven; empty for none.
 
     def texts(self) -> dict[str, str]:
         """Files of the session besides its views, by name; session.toml is the last."""

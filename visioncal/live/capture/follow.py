@@ -24,16 +24,11 @@ _NEW_MM, _NEW_DEG = 20.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class HeldArm:
-    """An arm that stays at a given pose.
-
-    Attributes:
-        reported: Its state when it was read.
-        clock: Clock of the state's stamps.
-    """
+    """An arm that stays at a given pose."""
 
     name: str
-    reported: ArmState
-    clock: Clock
+    reported: ArmState  # Its state when it was read.
+    clock: Clock  # Clock of the state's stamps.
 
     def state(self) -> ArmState:
         """The state, stamped now."""

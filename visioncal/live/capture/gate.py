@@ -25,12 +25,9 @@ _SAME_ARM_MM = 50.0
 
 @dataclass(eq=False)
 class Consent:
-    """A person's consent to motions: to all by `--yes`, else asked for at a terminal.
+    """A person's consent to motions: to all by `--yes`, else asked for at a terminal."""
 
-    Attributes:
-        ask: Asks, and returns the typed line; None once all motions are allowed.
-    """
-
+    # Asks, and returns the typed line; None once all motions are allowed.
     ask: Callable[[str], str] | None
 
     @classmethod
@@ -77,14 +74,10 @@ class Consent:
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """The one way by which a command moves an arm.
-
-    Attributes:
-        robot: The arm's model, as in its controller.
-    """
+    """The one way by which a command moves an arm."""
 
     live: LiveArm
-    robot: Robot
+    robot: Robot  # The arm's model, as in its controller.
     consent: Consent
     pace: JointPace
 

@@ -30,18 +30,12 @@ _THERE_MM = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Hovering:
-    """Driven arm, and the board that all on its flange stays above.
-
-    Attributes:
-        cell: The cell, with the arm's model as in its controller.
-        targets: The board, and what the flange carries.
-        height_m: Height of the tip [m].
-    """
+    """Driven arm, and the board that all on its flange stays above."""
 
     gate: Gate
-    cell: PlanCell
-    targets: TouchTargets
-    height_m: float
+    cell: PlanCell  # The cell, with the arm's model as in its controller.
+    targets: TouchTargets  # The board, and what the flange carries.
+    height_m: float  # Height of the tip [m].
 
     @classmethod
     def of(

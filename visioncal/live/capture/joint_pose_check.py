@@ -21,12 +21,9 @@ class JointPoseCheck:
     """Comparison of poses with the robot's model, up to a constant base or tool.
 
     It keeps the states so far that were consistent with one another.
-
-    Attributes:
-        robot: The nominal model; None where it is not known, and nothing is compared.
     """
 
-    robot: Robot | None
+    robot: Robot | None  # The nominal model; None where it is not known, and nothing is compared.
     _states: list[ArmState] = field(default_factory=list)
 
     def why_not(self, state: ArmState) -> str:

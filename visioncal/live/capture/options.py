@@ -13,49 +13,34 @@ FASTEST = 1.5
 
 @dataclass(frozen=True)
 class Stillness:
-    """Limits within which arm and image count as still.
+    """Limits within which arm and image count as still."""
 
-    Attributes:
-        joint_speed: Speed of the fastest joint [rad/s].
-        joint_rad: Motion of a joint since the rest began [rad].
-        flange_m: Motion of the flange since then [m]; the repeatability of well-kept arms.
-        flange_rad: Rotation of the flange since then [rad].
-        image_px: Motion of the image since then [px].
-        quiet_s: How long all of this must have held before the first frame that counts [s].
-        patience_s: How long to wait for it [s].
-    """
-
-    joint_speed: float = 2e-3
-    joint_rad: float = 5e-5
+    joint_speed: float = 2e-3  # Speed of the fastest joint [rad/s].
+    joint_rad: float = 5e-5  # Motion of a joint since the rest began [rad].
+    # Motion of the flange since then [m]; the repeatability of well-kept arms.
     flange_m: float = 3e-5
-    flange_rad: float = 5e-5
-    image_px: float = 0.15
+    flange_rad: float = 5e-5  # Rotation of the flange since then [rad].
+    image_px: float = 0.15  # Motion of the image since then [px].
+    # How long all of this must have held before the first frame that counts [s].
     quiet_s: float = 0.3
-    patience_s: float = 8.0
+    patience_s: float = 8.0  # How long to wait for it [s].
 
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Options of a recording.
+    """Options of a recording."""
 
-    Attributes:
-        speed: Speed of the joint that travels farthest [rad/s].
-        acceleration: Its acceleration [rad/s^2].
-        frames: Frames per view.
-        keep: Whether the sharpest frame is kept, or their mean.
-        still: Limits within which arm and image count as still.
-        single: Whether every frame is of another pose, as in a folder of pictures; it is then taken
-            without waiting.
-        missed_in_a_row: Number of stops in a row without a view that ends the recording; 0 for
-            never, where a person sees it.
-    """
-
-    speed: float = PLAN_SPEED
-    acceleration: float = PLAN_ACCELERATION
-    frames: int = 3
-    keep: Keep = "sharpest"
+    speed: float = PLAN_SPEED  # Speed of the joint that travels farthest [rad/s].
+    acceleration: float = PLAN_ACCELERATION  # Its acceleration [rad/s^2].
+    frames: int = 3  # Frames per view.
+    keep: Keep = "sharpest"  # Whether the sharpest frame is kept, or their mean.
+    # Limits within which arm and image count as still.
     still: Stillness = field(default_factory=Stillness)
+    # Whether every frame is of another pose, as in a folder of pictures; it is then taken without
+    # waiting.
     single: bool = False
+    # Number of stops in a row without a view that ends the recording; 0 for never, where a person
+    # sees it.
     missed_in_a_row: int = 3
 
     def __post_init__(self) -> None:

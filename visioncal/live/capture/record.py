@@ -30,19 +30,13 @@ _ARRIVED_RAD = 5e-3
 
 @dataclass(frozen=True, eq=False)
 class MotionSummary:
-    """Summary of a recording before anything moves.
+    """Summary of a recording before anything moves."""
 
-    Attributes:
-        stops: Stops that have no view yet.
-        first: Postures (n,) to the first stop, its own last; empty where no stop is left.
-        turn_rad: Largest joint travel on that path [rad].
-        duration_s: Approximate duration of the recording [s].
-    """
-
-    stops: tuple[Stop, ...]
+    stops: tuple[Stop, ...]  # Stops that have no view yet.
+    # Postures (n,) to the first stop, its own last; empty where no stop is left.
     first: tuple[FloatArray, ...]
-    turn_rad: float
-    duration_s: float
+    turn_rad: float  # Largest joint travel on that path [rad].
+    duration_s: float  # Approximate duration of the recording [s].
 
 
 def motion_summary(

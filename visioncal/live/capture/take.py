@@ -22,19 +22,12 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class TakenView:
-    """A view.
+    """A view."""
 
-    Attributes:
-        frame: The sharpest frame, or the mean of all.
-        state: The arm at its exposure.
-        corners: Corners detected in it.
-        motion_px: Image motion from the first to the last frame [px].
-    """
-
-    frame: Frame
-    state: ArmState
-    corners: Corners
-    motion_px: float
+    frame: Frame  # The sharpest frame, or the mean of all.
+    state: ArmState  # The arm at its exposure.
+    corners: Corners  # Corners detected in it.
+    motion_px: float  # Image motion from the first to the last frame [px].
 
 
 @dataclass(frozen=True)

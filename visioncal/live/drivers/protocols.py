@@ -12,75 +12,45 @@ Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "faul
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """State of an arm at one moment; what it does not report is None.
+    """State of an arm at one moment; what it does not report is None."""
 
-    Attributes:
-        stamp_s: Time of arrival, on the host's monotonic clock (`time.monotonic`) [s].
-        base_from_flange: (4, 4) flange in the controller's base frame [m].
-        q: (n,) joint angles [rad].
-        dq: (n,) joint speeds [rad/s].
-        flange_from_tool: (4, 4) tool offset that is set in the controller [m].
-        payload_kg: Payload that is set in the controller [kg].
-        payload_m: (3,) its centre of mass, in the flange frame [m].
-        currents_a: (n,) motor currents [A].
-        temperatures_c: (n,) joint temperatures [C].
-        safety: Whether it may move.
-    """
-
-    stamp_s: float
-    base_from_flange: FloatArray
-    q: FloatArray | None = None
-    dq: FloatArray | None = None
+    stamp_s: float  # Time of arrival, on the host's monotonic clock (`time.monotonic`) [s].
+    base_from_flange: FloatArray  # (4, 4) flange in the controller's base frame [m].
+    q: FloatArray | None = None  # (n,) joint angles [rad].
+    dq: FloatArray | None = None  # (n,) joint speeds [rad/s].
+    # (4, 4) tool offset that is set in the controller [m].
     flange_from_tool: FloatArray | None = None
-    payload_kg: float | None = None
-    payload_m: FloatArray | None = None
-    currents_a: FloatArray | None = None
-    temperatures_c: FloatArray | None = None
-    safety: Safety = "normal"
+    payload_kg: float | None = None  # Payload that is set in the controller [kg].
+    payload_m: FloatArray | None = None  # (3,) its centre of mass, in the flange frame [m].
+    currents_a: FloatArray | None = None  # (n,) motor currents [A].
+    temperatures_c: FloatArray | None = None  # (n,) joint temperatures [C].
+    safety: Safety = "normal"  # Whether it may move.
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A picture.
+    """A picture."""
 
-    Attributes:
-        image: (h, w) grey or (h, w, 3) blue, green, red.
-        stamp_s: Middle of the exposure, on the host's monotonic clock [s].
-        exposure_s: Exposure time [s], where the camera reports it.
-    """
-
-    image: Image
-    stamp_s: float
-    exposure_s: float | None = None
+    image: Image  # (h, w) grey or (h, w, 3) blue, green, red.
+    stamp_s: float  # Middle of the exposure, on the host's monotonic clock [s].
+    exposure_s: float | None = None  # Exposure time [s], where the camera reports it.
 
 
 @dataclass(frozen=True, eq=False)
 class JointSample:
-    """Joint states at one moment.
+    """Joint states at one moment."""
 
-    Attributes:
-        stamp_s: Time on the controller's own clock [s].
-        q: (n,) joint angles [rad].
-        dq: (n,) joint speeds [rad/s].
-        currents_a: (n,) motor currents [A].
-    """
-
-    stamp_s: float
-    q: FloatArray
-    dq: FloatArray
-    currents_a: FloatArray
+    stamp_s: float  # Time on the controller's own clock [s].
+    q: FloatArray  # (n,) joint angles [rad].
+    dq: FloatArray  # (n,) joint speeds [rad/s].
+    currents_a: FloatArray  # (n,) motor currents [A].
 
 
 class Joints(Protocol):
-    """Source of joint states at a high rate.
+    """Source of joint states at a high rate."""
 
-    Attributes:
-        name: Name in messages: `UR10e at 192.168.0.10`.
-        rate_hz: Rate of the samples.
-    """
-
-    name: str
-    rate_hz: float
+    name: str  # Name in messages: `UR10e at 192.168.0.10`.
+    rate_hz: float  # Rate of the samples.
 
     def sample(self) -> JointSample:
         """Returns the next sample."""
@@ -159,16 +129,9 @@ class CameraDevice(Protocol):
 
 @dataclass(frozen=True)
 class DeviceSetup:
-    """Requested settings of a camera; None leaves the choice to the driver, which then holds it.
+    """Requested settings of a camera; None leaves the choice to the driver, which then holds it."""
 
-    Attributes:
-        resolution: (width, height) [px].
-        exposure_us: Exposure time [us].
-        gain: ISO, or in the device's own unit.
-        focus: Lens position in the device's own unit.
-    """
-
-    resolution: tuple[int, int] | None = None
-    exposure_us: int | None = None
-    gain: int | None = None
-    focus: int | None = None
+    resolution: tuple[int, int] | None = None  # (width, height) [px].
+    exposure_us: int | None = None  # Exposure time [us].
+    gain: int | None = None  # ISO, or in the device's own unit.
+    focus: int | None = None  # Lens position in the device's own unit.

@@ -50,22 +50,14 @@ _SAFETY_BITS: tuple[tuple[int, Safety], ...] = (
 
 @dataclass(frozen=True)
 class Condition:
-    """The dashboard's answers.
-
-    Attributes:
-        version: PolyScope's version: major, minor, bug fix.
-        model: The arm's name, such as `UR10e`.
-        mode: The robot's mode, such as `RUNNING`.
-        safety: The state of the safety system, such as `NORMAL`.
-        remote: Whether it is in remote control; True where it does not report it.
-    """
+    """The dashboard's answers."""
 
     host: str
-    version: tuple[int, int, int]
-    model: str
-    mode: str
-    safety: str
-    remote: bool
+    version: tuple[int, int, int]  # PolyScope's version: major, minor, bug fix.
+    model: str  # The arm's name, such as `UR10e`.
+    mode: str  # The robot's mode, such as `RUNNING`.
+    safety: str  # The state of the safety system, such as `NORMAL`.
+    remote: bool  # Whether it is in remote control; True where it does not report it.
 
     def check_moves(self) -> None:
         """Checks that it can be moved from outside.

@@ -13,15 +13,10 @@ OPEN_SIGMA = 0.25 * WEAK_SIGMA
 
 @dataclass(frozen=True)
 class Wish:
-    """Wished accuracy, as standard deviations; None where that does not matter.
+    """Wished accuracy, as standard deviations; None where that does not matter."""
 
-    Attributes:
-        mm: Of the position [mm].
-        deg: Of the rotation [deg].
-    """
-
-    mm: float | None = None
-    deg: float | None = None
+    mm: float | None = None  # Of the position [mm].
+    deg: float | None = None  # Of the rotation [deg].
 
     def __post_init__(self) -> None:
         for name in ("mm", "deg"):

@@ -64,19 +64,13 @@ _NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidate stops.
+    """Candidate stops."""
 
-    Attributes:
-        q: (k, n) joint angles [rad].
-        cam_from_target: (k, 4, 4) board in the camera, if the guesses are right [m].
-        seen: (k,) share of the uncertain cell's draws in which the whole board is in the image.
-        lost: Number of drawn views or postures that each limit rejected.
-    """
-
-    q: FloatArray
-    cam_from_target: FloatArray
+    q: FloatArray  # (k, n) joint angles [rad].
+    cam_from_target: FloatArray  # (k, 4, 4) board in the camera, if the guesses are right [m].
+    # (k,) share of the uncertain cell's draws in which the whole board is in the image.
     seen: FloatArray
-    lost: Mapping[str, int]
+    lost: Mapping[str, int]  # Number of drawn views or postures that each limit rejected.
 
     def __len__(self) -> int:
         return len(self.q)
@@ -295,16 +289,11 @@ def _unwind(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray
 
 @dataclass
 class Losses:
-    """Number of tries that each limit let through, in the order in which they are checked.
+    """Number of tries that each limit let through, in the order in which they are checked."""
 
-    Attributes:
-        tried: Number of tries that reached each limit.
-        lost: Number that it rejected.
-        named: The same by joint, body or pair of bodies, where it is known.
-    """
-
-    tried: Counter[str] = field(default_factory=Counter)
-    lost: Counter[str] = field(default_factory=Counter)
+    tried: Counter[str] = field(default_factory=Counter)  # Number of tries that reached each limit.
+    lost: Counter[str] = field(default_factory=Counter)  # Number that it rejected.
+    # The same by joint, body or pair of bodies, where it is known.
     named: Counter[str] = field(default_factory=Counter)
 
     def passed(self, limit: str, good: Mask) -> Mask:

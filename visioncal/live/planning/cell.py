@@ -33,16 +33,11 @@ _KEEP_OFF_SIGMAS = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box-shaped obstacle.
-
-    Attributes:
-        base_from_box: (4, 4) frame at its centre [m].
-        size_m: (3,) full lengths along that frame's axes [m].
-    """
+    """A box-shaped obstacle."""
 
     name: str
-    base_from_box: FloatArray
-    size_m: FloatArray
+    base_from_box: FloatArray  # (4, 4) frame at its centre [m].
+    size_m: FloatArray  # (3,) full lengths along that frame's axes [m].
 
     def __post_init__(self) -> None:
         _check_pose(f"box {self.name}", self.base_from_box)
@@ -57,27 +52,21 @@ class Box:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of every planned stop, and of every path between two of them.
+    """Limits of every planned stop, and of every path between two of them."""
 
-    Attributes:
-        joint_margin_rad: Distance of the joints from their limits [rad]; [m] for a prismatic joint.
-        distance_m: Least and greatest distance of the camera from the board's centre [m]. None
-            takes distances at which the board fills the image well, and stays in it within the
-            uncertainty of the guesses.
-        focus_m: Least and greatest depth at which the image is sharp [m]; None for any.
-        tilt_rad: Greatest angle between the line of sight and the board's normal [rad].
-        edge_px: Distance of the board from the image's edge [px].
-        clearance_m: Distance of the arm, and of what it carries, from the floor, the board, the
-            boxes and itself [m].
-        floor_m: Height of the floor in the base frame [m]; None for a cell without one.
-    """
-
+    # Distance of the joints from their limits [rad]; [m] for a prismatic joint.
     joint_margin_rad: float = 0.05
+    # Least and greatest distance of the camera from the board's centre [m]. None takes distances at
+    # which the board fills the image well, and stays in it within the uncertainty of the guesses.
     distance_m: tuple[float, float] | None = None
+    # Least and greatest depth at which the image is sharp [m]; None for any.
     focus_m: tuple[float, float] | None = None
-    tilt_rad: float = 0.9
-    edge_px: float = 20.0
+    tilt_rad: float = 0.9  # Greatest angle between the line of sight and the board's normal [rad].
+    edge_px: float = 20.0  # Distance of the board from the image's edge [px].
+    # Distance of the arm, and of what it carries, from the floor, the board, the boxes and itself
+    # [m].
     clearance_m: float = 0.03
+    # Height of the floor in the base frame [m]; None for a cell without one.
     floor_m: float | None = 0.0
 
     def __post_init__(self) -> None:
@@ -100,35 +89,28 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class PlanCell:
-    """A cell to plan for: its parts, rough guesses of the unknown edges, and limits.
-
-    Attributes:
-        x: (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
-        z: (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
-        sigma_rad: Standard deviation of both rotations, per axis [rad].
-        sigma_m: The same for their translations [m].
-        noise: Noise of the robot's poses.
-        pixel_px: Noise of a corner, per axis [px].
-        covariance: (12, 12) joint covariance of both edges (rotation, translation; right
-            perturbations), where recorded stops determine it; both sigmas are then typical of it.
-            None where the sigmas are all that is known.
-        observed_distances_m: Least and greatest distance at which the board has been observed [m],
-            allowed whether it fills the image there or not; None where it has not been.
-    """
+    """A cell to plan for: its parts, rough guesses of the unknown edges, and limits."""
 
     mount: Mount
     robot: Robot
     camera: Camera
     target: Target
+    # (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
     x: FloatArray
+    # (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
     z: FloatArray
-    sigma_rad: float
-    sigma_m: float
-    noise: Noise
-    pixel_px: float
+    sigma_rad: float  # Standard deviation of both rotations, per axis [rad].
+    sigma_m: float  # The same for their translations [m].
+    noise: Noise  # Noise of the robot's poses.
+    pixel_px: float  # Noise of a corner, per axis [px].
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
+    # (12, 12) joint covariance of both edges (rotation, translation; right perturbations), where
+    # recorded stops determine it; both sigmas are then typical of it. None where the sigmas are all
+    # that is known.
     covariance: FloatArray | None = None
+    # Least and greatest distance at which the board has been observed [m], allowed whether it fills
+    # the image there or not; None where it has not been.
     observed_distances_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:

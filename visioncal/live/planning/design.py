@@ -31,15 +31,10 @@ _NULL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Variance:
-    """A variance as a function of a covariance C: `trace(roots C roots^T) + rest`.
+    """A variance as a function of a covariance C: `trace(roots C roots^T) + rest`."""
 
-    Attributes:
-        roots: (s, r).
-        rest: Contribution of the directions that no candidate determines.
-    """
-
-    roots: FloatArray
-    rest: float
+    roots: FloatArray  # (s, r).
+    rest: float  # Contribution of the directions that no candidate determines.
 
     def of(self, covariance: FloatArray) -> float:
         """The variance with an (r, r) covariance."""
@@ -48,25 +43,15 @@ class Variance:
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """A world in coordinates in which the prior information is the identity.
+    """A world in coordinates in which the prior information is the identity."""
 
-    Attributes:
-        factors: (k, 6, r) whitened Jacobians of the candidates.
-        start: (r, r) information without any candidate.
-        objective: Variance that is minimised.
-        position: Variance of the position whose accuracy is reported [m^2].
-        rotation: The same for the rotation [rad^2].
-        unestimated: (k, 6, a) as in `World`.
-        gradient: (r, a) as in `World`.
-    """
-
-    factors: FloatArray
-    start: FloatArray
-    objective: Variance
-    position: Variance
-    rotation: Variance
-    unestimated: FloatArray
-    gradient: FloatArray
+    factors: FloatArray  # (k, 6, r) whitened Jacobians of the candidates.
+    start: FloatArray  # (r, r) information without any candidate.
+    objective: Variance  # Variance that is minimised.
+    position: Variance  # Variance of the position whose accuracy is reported [m^2].
+    rotation: Variance  # The same for the rotation [rad^2].
+    unestimated: FloatArray  # (k, 6, a) as in `World`.
+    gradient: FloatArray  # (r, a) as in `World`.
 
 
 def reduced(world: World) -> Reduced:
@@ -108,18 +93,12 @@ def _square_root(square: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Chosen candidates, and their information in each world.
-
-    Attributes:
-        rows: The chosen candidates.
-        information: (r, r) by world.
-        gradients: (r, a) by world, the gradient's Jacobian in parameters that a fit does not
-            estimate.
-    """
+    """Chosen candidates, and their information in each world."""
 
     problem: tuple[Reduced, ...]
-    rows: tuple[int, ...]
-    information: tuple[FloatArray, ...]
+    rows: tuple[int, ...]  # The chosen candidates.
+    information: tuple[FloatArray, ...]  # (r, r) by world.
+    # (r, a) by world, the gradient's Jacobian in parameters that a fit does not estimate.
     gradients: tuple[FloatArray, ...]
 
     @classmethod
@@ -213,25 +192,16 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Chosen stops.
+    """Chosen stops."""
 
-    Attributes:
-        rows: (n,) chosen candidates, the most informative first.
-        sigma_mm: Root mean variance of the positions that count, with these stops [mm].
-        history: Accuracy predicted without any of them, and after each in the order of `rows`.
-        best: Accuracy with all candidates.
-        best_known_lens_board: The same if lens and board were known exactly.
-        best_exact_arm: The same without errors of the arm that a fit treats as noise.
-        met: Whether the wish is met; None where there was none.
-    """
-
-    rows: IntArray
-    sigma_mm: float
+    rows: IntArray  # (n,) chosen candidates, the most informative first.
+    sigma_mm: float  # Root mean variance of the positions that count, with these stops [mm].
+    # Accuracy predicted without any of them, and after each in the order of `rows`.
     history: tuple[Accuracy, ...]
-    best: Accuracy
-    best_known_lens_board: Accuracy
-    best_exact_arm: Accuracy
-    met: bool | None
+    best: Accuracy  # Accuracy with all candidates.
+    best_known_lens_board: Accuracy  # The same if lens and board were known exactly.
+    best_exact_arm: Accuracy  # The same without errors of the arm that a fit treats as noise.
+    met: bool | None  # Whether the wish is met; None where there was none.
 
     @property
     def predicted(self) -> Accuracy:

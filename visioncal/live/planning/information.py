@@ -52,32 +52,23 @@ _FEWEST_CORNERS = 6
 
 @dataclass(frozen=True, eq=False)
 class RecordedStops:
-    """Stops that were recorded already.
+    """Stops that were recorded already."""
 
-    Attributes:
-        problem: The stops, without errors of the arm. Its first effect is lens and boards.
-        edges: Edges of the problem: the camera's, the planned board's, then further boards'.
-        free: Free parameters of lens and boards.
-        q: (s, n) joint angles of the stops [rad]; None where they are not known.
-        noise: Noise of the robot at the stops.
-        first_corner: Number of the first corner of the planned board.
-        arm: Posture-dependent errors of the arm at the stops; None where the stops show none.
-        inflation: Factor on the noise variance.
-        edge_error_root: (12, c) root of the covariance of the edges' further errors, those of an
-            arm without joint angles. More stops do not reduce them.
-        held: (k, c) gradient at shared parameters that a fit holds. Further stops are expected to
-            add nothing but noise to it.
-    """
-
-    problem: Problem
+    problem: Problem  # The stops, without errors of the arm. Its first effect is lens and boards.
+    # Edges of the problem: the camera's, the planned board's, then further boards'.
     edges: FloatArray
-    free: LensBoardParameters
-    q: FloatArray | None
-    noise: Noise
-    first_corner: int = 0
+    free: LensBoardParameters  # Free parameters of lens and boards.
+    q: FloatArray | None  # (s, n) joint angles of the stops [rad]; None where they are not known.
+    noise: Noise  # Noise of the robot at the stops.
+    first_corner: int = 0  # Number of the first corner of the planned board.
+    # Posture-dependent errors of the arm at the stops; None where the stops show none.
     arm: ArmErrors | None = None
-    inflation: float = 1.0
+    inflation: float = 1.0  # Factor on the noise variance.
+    # (12, c) root of the covariance of the edges' further errors, those of an arm without joint
+    # angles. More stops do not reduce them.
     edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    # (k, c) gradient at shared parameters that a fit holds. Further stops are expected to add
+    # nothing but noise to it.
     held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property

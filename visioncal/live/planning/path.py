@@ -133,19 +133,14 @@ class _PostureTree:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Path through the stops, straight in joint space between its postures.
+    """Path through the stops, straight in joint space between its postures."""
 
-    Attributes:
-        order: (k,) rows of the stops in driving order.
-        segments: Via postures (j, n) before each stop, j often 0; the first is from the start where
-            one was given, and absent otherwise.
-        length_rad: Length of the path, as the sum of its segments' norms.
-        unreachable: Rows to which no safe path was found, with the pair of bodies that collides.
-    """
-
-    order: tuple[int, ...]
+    order: tuple[int, ...]  # (k,) rows of the stops in driving order.
+    # Via postures (j, n) before each stop, j often 0; the first is from the start where one was
+    # given, and absent otherwise.
     segments: tuple[FloatArray, ...]
-    length_rad: float
+    length_rad: float  # Length of the path, as the sum of its segments' norms.
+    # Rows to which no safe path was found, with the pair of bodies that collides.
     unreachable: Mapping[int, str]
 
 

@@ -29,19 +29,12 @@ _NEARLY = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Picking:
-    """Picks after a calibration from some candidates of a plan.
+    """Picks after a calibration from some candidates of a plan."""
 
-    Attributes:
-        cells: The guessed cell, and draws from its uncertainty.
-        worlds: The candidates' information in each of these.
-        q: (k, n) joint angles of the candidates [rad].
-        need: Tolerance of the picks.
-    """
-
-    cells: Sequence[PlanCell]
-    worlds: Sequence[World]
-    q: FloatArray
-    need: Need
+    cells: Sequence[PlanCell]  # The guessed cell, and draws from its uncertainty.
+    worlds: Sequence[World]  # The candidates' information in each of these.
+    q: FloatArray  # (k, n) joint angles of the candidates [rad].
+    need: Need  # Tolerance of the picks.
 
     def chance(self, rows: IntArray, *, without: str = "") -> float:
         """Probability that a pick lands within tolerance, calibrated from some candidates.
@@ -83,20 +76,13 @@ class Picking:
 
 @dataclass(frozen=True)
 class NeedPlanned:
-    """Predicted probability that picks land within tolerance.
-
-    Attributes:
-        before: Probability without the planned stops.
-        probability: The same with them.
-        best: The same with all candidates.
-        limits: What limits it, in words; empty where the need is met.
-    """
+    """Predicted probability that picks land within tolerance."""
 
     need: Need
-    before: float
-    probability: float
-    best: float
-    limits: str
+    before: float  # Probability without the planned stops.
+    probability: float  # The same with them.
+    best: float  # The same with all candidates.
+    limits: str  # What limits it, in words; empty where the need is met.
 
     @property
     def met(self) -> bool:

@@ -47,83 +47,55 @@ _LEVER_M = 0.5
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """Request for a plan.
-
-    Attributes:
-        count: Most stops.
-        wish: Accuracy at which fewer stops are enough; None for none.
-        need: Tolerance of picks at which fewer are enough; None for none.
-        workspace: Region in which the arm's accuracy counts; None for all of its reach.
-        start_q: (n,) present joint angles of the arm [rad]; None where they are not known, and the
-            path to the first stop is not checked.
-    """
+    """Request for a plan."""
 
     purpose: Purpose
-    count: int
-    wish: Wish | None = None
+    count: int  # Most stops.
+    wish: Wish | None = None  # Accuracy at which fewer stops are enough; None for none.
     candidates: int = 1500
+    # Region in which the arm's accuracy counts; None for all of its reach.
     workspace: Box | None = None
+    # (n,) present joint angles of the arm [rad]; None where they are not known, and the path to the
+    # first stop is not checked.
     start_q: FloatArray | None = None
     seed: int = 0
-    need: Need | None = None
+    need: Need | None = None  # Tolerance of picks at which fewer are enough; None for none.
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedStop:
-    """A planned stop.
+    """A planned stop."""
 
-    Attributes:
-        view: Number of the view to be taken there.
-        q: (n,) joint angles [rad].
-        via: (j, n) via postures after the previous stop, connected straight in joint space [rad].
-        base_from_flange: (4, 4) flange, by the robot's model [m].
-        cam_from_target: (4, 4) board in the camera if the guesses are right [m].
-        seen: Share of the uncertain cell's draws in which the whole board is in the image.
-        rank: 1 for the most informative stop, 2 for the next, ...
-        words: What the stop contributes.
-        before: Accuracy predicted with the recorded stops and those of lower rank number.
-        after: The same with this one.
-    """
-
-    view: int
-    q: FloatArray
+    view: int  # Number of the view to be taken there.
+    q: FloatArray  # (n,) joint angles [rad].
+    # (j, n) via postures after the previous stop, connected straight in joint space [rad].
     via: FloatArray
-    base_from_flange: FloatArray
-    cam_from_target: FloatArray
-    seen: float
-    rank: int
-    words: str
-    before: Accuracy
-    after: Accuracy
+    base_from_flange: FloatArray  # (4, 4) flange, by the robot's model [m].
+    cam_from_target: FloatArray  # (4, 4) board in the camera if the guesses are right [m].
+    seen: float  # Share of the uncertain cell's draws in which the whole board is in the image.
+    rank: int  # 1 for the most informative stop, 2 for the next, ...
+    words: str  # What the stop contributes.
+    before: Accuracy  # Accuracy predicted with the recorded stops and those of lower rank number.
+    after: Accuracy  # The same with this one.
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan.
-
-    Attributes:
-        design: The chosen candidates and the accuracy predicted with them.
-        length_rad: Length of the path, as the sum of its segments' norms [rad].
-        start: The session to which the stops are added; None for none.
-        candidate_count: Number of candidates.
-        lost: Number of tries that each limit rejected.
-        in_the_way: What blocked stops that were replaced, one entry for each.
-        shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is met
-            or there is none.
-        need: Prediction for picks; None where there is no need.
-    """
+    """A plan."""
 
     cell: PlanCell
     request: PlanRequest
     stops: tuple[PlannedStop, ...]
-    design: Design
-    length_rad: float
-    start: SessionStart | None
-    candidate_count: int
-    lost: Mapping[str, int]
-    in_the_way: tuple[str, ...]
+    design: Design  # The chosen candidates and the accuracy predicted with them.
+    length_rad: float  # Length of the path, as the sum of its segments' norms [rad].
+    start: SessionStart | None  # The session to which the stops are added; None for none.
+    candidate_count: int  # Number of candidates.
+    lost: Mapping[str, int]  # Number of tries that each limit rejected.
+    in_the_way: tuple[str, ...]  # What blocked stops that were replaced, one entry for each.
+    # Why the wished accuracy, or the need, is not met, in words; empty where it is met or there is
+    # none.
     shortfall: str
-    need: NeedPlanned | None = None
+    need: NeedPlanned | None = None  # Prediction for picks; None where there is no need.
 
 
 @typed
@@ -186,20 +158,13 @@ def make_plan(
 
 @dataclass(frozen=True, eq=False)
 class _Planning:
-    """Inputs of the choice of stops.
+    """Inputs of the choice of stops."""
 
-    Attributes:
-        cells: The guessed cell, and draws from its uncertainty.
-        found: The candidates.
-        worlds: Their information in each of the cells.
-        begun: Session to which the stops are added; None for none.
-    """
-
-    cells: tuple[PlanCell, ...]
+    cells: tuple[PlanCell, ...]  # The guessed cell, and draws from its uncertainty.
     request: PlanRequest
-    found: Candidates
-    worlds: tuple[World, ...]
-    begun: SessionStart | None
+    found: Candidates  # The candidates.
+    worlds: tuple[World, ...]  # Their information in each of the cells.
+    begun: SessionStart | None  # Session to which the stops are added; None for none.
 
     @property
     def recorded(self) -> int:

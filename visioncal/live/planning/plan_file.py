@@ -29,37 +29,25 @@ _FILE = "plan.json"
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A stop to drive to.
+    """A stop to drive to."""
 
-    Attributes:
-        view: Number of the view to be taken there.
-        q: (n,) joint angles [rad].
-        via: (j, n) via postures after the previous stop [rad].
-        words: What it contributes.
-    """
-
-    view: int
-    q: FloatArray
-    via: FloatArray
-    words: str = ""
+    view: int  # Number of the view to be taken there.
+    q: FloatArray  # (n,) joint angles [rad].
+    via: FloatArray  # (j, n) via postures after the previous stop [rad].
+    words: str = ""  # What it contributes.
 
 
 @dataclass(frozen=True, eq=False)
 class PlanFile:
-    """A plan read from its file.
-
-    Attributes:
-        stops: In driving order.
-        start_q: (n,) joint angles before the first stop [rad]; None where they were not stated, and
-            the path to the first stop was not checked.
-        digest: SHA-256 of the plan's inputs.
-    """
+    """A plan read from its file."""
 
     cell: PlanCell
     purpose: Purpose
-    stops: tuple[Stop, ...]
+    stops: tuple[Stop, ...]  # In driving order.
+    # (n,) joint angles before the first stop [rad]; None where they were not stated, and the path
+    # to the first stop was not checked.
     start_q: FloatArray | None
-    digest: str
+    digest: str  # SHA-256 of the plan's inputs.
 
 
 def read_plan(path: Path | str) -> PlanFile:

@@ -14,21 +14,14 @@ Judged: TypeAlias = Literal["sight", "workspace"]
 
 @dataclass(frozen=True)
 class Purpose:
-    """Purpose of a plan. Both edges are unknown for any purpose.
+    """Purpose of a plan. Both edges are unknown for any purpose."""
 
-    Attributes:
-        name: Its name, as a user gives it.
-        judged: Which errors count.
-        errors: What they are, in words.
-        stops: Default number of stops of a plan that adds to no session.
-        blocks: Unknown errors of the arm (see `ArmModel`) with their prior standard deviation
-            [rad]; that of lengths is 0.5 m times as much.
-    """
-
-    name: str
-    judged: Judged
-    errors: str
-    stops: int
+    name: str  # Its name, as a user gives it.
+    judged: Judged  # Which errors count.
+    errors: str  # What they are, in words.
+    stops: int  # Default number of stops of a plan that adds to no session.
+    # Unknown errors of the arm (see `ArmModel`) with their prior standard deviation [rad]; that of
+    # lengths is 0.5 m times as much.
     blocks: Mapping[str, float] = field(default_factory=dict)
 
 

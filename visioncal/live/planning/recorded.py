@@ -65,19 +65,12 @@ class RoughEdges:
 
 @dataclass(frozen=True, eq=False)
 class SessionStart:
-    """A session to which stops are added.
+    """A session to which stops are added."""
 
-    Attributes:
-        cell: The cell as far as the session determines it.
-        recorded: The session's information.
-        refusal: Why the session alone gives no result; empty where it does.
-        views: Number of the first view of each stop.
-    """
-
-    cell: PlanCell
-    recorded: RecordedStops
-    refusal: str
-    views: tuple[int, ...]
+    cell: PlanCell  # The cell as far as the session determines it.
+    recorded: RecordedStops  # The session's information.
+    refusal: str  # Why the session alone gives no result; empty where it does.
+    views: tuple[int, ...]  # Number of the first view of each stop.
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,23 +197,15 @@ def _recorded_stops(
 
 @dataclass(frozen=True, eq=False)
 class _RecordedStart:
-    """Problem of the recorded stops.
+    """Problem of the recorded stops."""
 
-    Attributes:
-        problem: The s stops, without errors of the arm; the planned board comes first.
-        noise: Noise of the robot at the stops.
-        free: Free parameters of lens and boards.
-        board: Index of the planned board: the one in the most views.
-        views: (s,) first view of each stop.
-    """
-
-    problem: Problem
+    problem: Problem  # The s stops, without errors of the arm; the planned board comes first.
     state: State
-    noise: Noise
-    free: LensBoardParameters
+    noise: Noise  # Noise of the robot at the stops.
+    free: LensBoardParameters  # Free parameters of lens and boards.
     arm: RobotArm
-    board: int
-    views: tuple[int, ...]
+    board: int  # Index of the planned board: the one in the most views.
+    views: tuple[int, ...]  # (s,) first view of each stop.
 
 
 def _start_from_fit(run: RunState, solved: CellFit) -> _RecordedStart:

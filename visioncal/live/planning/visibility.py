@@ -111,24 +111,17 @@ def _between(normals: FloatArray, points: FloatArray) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """Views of a board by a camera.
-
-    Attributes:
-        distance_m: Least and greatest distance between camera and board centre [m].
-        outline: (p, 3) points around the print, its corners first, in the target frame [m].
-        centre: (3,) centre of the print [m].
-        window: Field of view.
-        x: (g, 4, 4) draws of the uncertain edge x.
-        z: (g, 4, 4) draws of the uncertain edge z.
-    """
+    """Views of a board by a camera."""
 
     cell: PlanCell
+    # Least and greatest distance between camera and board centre [m].
     distance_m: tuple[float, float]
+    # (p, 3) points around the print, its corners first, in the target frame [m].
     outline: FloatArray
-    centre: FloatArray
-    window: FieldOfView
-    x: FloatArray
-    z: FloatArray
+    centre: FloatArray  # (3,) centre of the print [m].
+    window: FieldOfView  # Field of view.
+    x: FloatArray  # (g, 4, 4) draws of the uncertain edge x.
+    z: FloatArray  # (g, 4, 4) draws of the uncertain edge z.
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws views of the board.
@@ -294,16 +287,12 @@ def _outline(target: Target) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Occlusion:
-    """Occlusion of the lines of sight from the camera to points of the print.
-
-    Attributes:
-        points: (p, 3) the points of the print, in the target frame [m].
-        parts: The arm's bodies, without those on the last link: they carry camera or board, and do
-            not move relative to it.
-    """
+    """Occlusion of the lines of sight from the camera to points of the print."""
 
     cell: PlanCell
-    points: FloatArray
+    points: FloatArray  # (p, 3) the points of the print, in the target frame [m].
+    # The arm's bodies, without those on the last link: they carry camera or board, and do not move
+    # relative to it.
     parts: tuple[Body, ...]
 
     @classmethod

@@ -27,33 +27,23 @@ Program: TypeAlias = Literal["stopped", "playing", "paused"]
 
 @dataclass(frozen=True)
 class ControllerOptions:
-    """A simulated controller and its arm.
+    """A simulated controller and its arm."""
 
-    Attributes:
-        robot: `ur3e`, `ur5e` or `ur10e`.
-        errors: Errors of the true arm relative to its controller's model.
-        q: Joint angles at the start [rad].
-        tcp: Tool offset that is set: x, y, z [m] and a rotation vector [rad].
-        payload_kg: Payload that is set [kg].
-        payload_m: Its centre of mass in the flange frame [m].
-        repeatability_rad: Sigma of a joint's error relative to its encoder, drawn anew for each
-            motion [rad].
-        polyscope: The dashboard's version string.
-        rate_hz: States per second.
-    """
-
-    robot: str = "ur10e"
+    robot: str = "ur10e"  # `ur3e`, `ur5e` or `ur10e`.
     seed: int = 0
+    # Errors of the true arm relative to its controller's model.
     errors: ArmErrors = field(
         default_factory=lambda: ArmErrors(dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4)
     )
-    q: tuple[float, ...] = _HOME
+    q: tuple[float, ...] = _HOME  # Joint angles at the start [rad].
+    # Tool offset that is set: x, y, z [m] and a rotation vector [rad].
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
-    payload_kg: float = 0.6
-    payload_m: tuple[float, ...] = (0.0, 0.0, 0.04)
+    payload_kg: float = 0.6  # Payload that is set [kg].
+    payload_m: tuple[float, ...] = (0.0, 0.0, 0.04)  # Its centre of mass in the flange frame [m].
+    # Sigma of a joint's error relative to its encoder, drawn anew for each motion [rad].
     repeatability_rad: float = 1e-5
-    polyscope: str = "URSoftware 5.11.6.1010000 (Aug 01 2024)"
-    rate_hz: float = 125.0
+    polyscope: str = "URSoftware 5.11.6.1010000 (Aug 01 2024)"  # The dashboard's version string.
+    rate_hz: float = 125.0  # States per second.
 
     @property
     def believed_arm(self) -> DhArm:
@@ -68,20 +58,13 @@ class ControllerOptions:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Straight path of all joints, with a trapezoidal or triangular speed profile.
+    """Straight path of all joints, with a trapezoidal or triangular speed profile."""
 
-    Attributes:
-        start: (n,) first posture [rad].
-        goal: (n,) last posture [rad].
-        speed: Speed limit of the joint that travels farthest [rad/s].
-        acceleration: Its acceleration [rad/s^2].
-        begun_at: Elapsed time at the start [s]: braking is the last ramp of such a motion.
-    """
-
-    start: FloatArray
-    goal: FloatArray
-    speed: float = 1.0
-    acceleration: float = 1.0
+    start: FloatArray  # (n,) first posture [rad].
+    goal: FloatArray  # (n,) last posture [rad].
+    speed: float = 1.0  # Speed limit of the joint that travels farthest [rad/s].
+    acceleration: float = 1.0  # Its acceleration [rad/s^2].
+    # Elapsed time at the start [s]: braking is the last ramp of such a motion.
     begun_at: float = 0.0
 
     @classmethod

@@ -24,17 +24,11 @@ _GUESSES = 101
 
 @dataclass(frozen=True, eq=False)
 class LiveSimulation:
-    """A simulated cell.
+    """A simulated cell."""
 
-    Attributes:
-        truth: The true arm, edges, lens and board.
-        controller: The same arm for the simulated controller.
-        known: The user's prior knowledge: rough guesses and the factory's lens.
-    """
-
-    truth: SimulatedCell
-    controller: ControllerOptions
-    known: PlanCell
+    truth: SimulatedCell  # The true arm, edges, lens and board.
+    controller: ControllerOptions  # The same arm for the simulated controller.
+    known: PlanCell  # The user's prior knowledge: rough guesses and the factory's lens.
 
 
 def live_simulation(seed: int) -> LiveSimulation:

@@ -44,28 +44,18 @@ _START_S, _END_S = 60.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class TrueState:
-    """True states of the arm at m moments.
+    """True states of the arm at m moments."""
 
-    Attributes:
-        q: (m, n) joint angles [rad].
-        dq: (m, n) joint speeds [rad/s].
-        base_from_flange: (m, 4, 4) by the arm's true geometry [m].
-    """
-
-    q: FloatArray
-    dq: FloatArray
-    base_from_flange: FloatArray
+    q: FloatArray  # (m, n) joint angles [rad].
+    dq: FloatArray  # (m, n) joint speeds [rad/s].
+    base_from_flange: FloatArray  # (m, 4, 4) by the arm's true geometry [m].
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedController:
-    """A running controller; it ends with the context.
+    """A running controller; it ends with the context."""
 
-    Attributes:
-        host: The loopback address that it listens on.
-    """
-
-    host: str
+    host: str  # The loopback address that it listens on.
     _process: BaseProcess
     _pipe: "Connection[Any, Any]"
     _lock: threading.Lock = field(default_factory=threading.Lock)

@@ -99,21 +99,15 @@ def frame(kind: int, payload: bytes = b"") -> bytes:
 
 @dataclass
 class _Client:
-    """State of a client.
-
-    Attributes:
-        outputs: Names of the variables that it is sent.
-        inputs: Names of the variables that it sends, by recipe; it counts these from 1.
-        every_s: Period of its states [s].
-        due_s: When the next one is due, on the monotonic clock [s].
-    """
+    """State of a client."""
 
     writer: asyncio.StreamWriter
-    outputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()  # Names of the variables that it is sent.
+    # Names of the variables that it sends, by recipe; it counts these from 1.
     inputs: list[tuple[str, ...]] = field(default_factory=list)
     started: bool = False
-    every_s: float = 0.0
-    due_s: float = 0.0
+    every_s: float = 0.0  # Period of its states [s].
+    due_s: float = 0.0  # When the next one is due, on the monotonic clock [s].
 
 
 class ControllerServer:

@@ -47,22 +47,15 @@ _POINT, _FINE_LINE = 0.005, 0.0015
 
 @dataclass(frozen=True, eq=False)
 class ArmPicture:
-    """Drawing of a calibrated arm.
+    """Drawing of a calibrated arm."""
 
-    Attributes:
-        result: Result of its calibration.
-        robot: Calibrated model.
-        deviations_m: By view, (k, 3) origins of the calibrated arm's joints and flange in the base,
-            and the deviations of the nominal arm's origins [m].
-        factor: Magnification of the nominal arm's deviations.
-        size_m: Size of the cell [m].
-    """
-
-    result: ArmResult
-    robot: Robot
+    result: ArmResult  # Result of its calibration.
+    robot: Robot  # Calibrated model.
+    # By view, (k, 3) origins of the calibrated arm's joints and flange in the base, and the
+    # deviations of the nominal arm's origins [m].
     deviations_m: Mapping[int, tuple[FloatArray, FloatArray]]
-    factor: int
-    size_m: float
+    factor: int  # Magnification of the nominal arm's deviations.
+    size_m: float  # Size of the cell [m].
 
     @classmethod
     def of(
@@ -207,24 +200,15 @@ def _colours(values: FloatArray, low: float, high: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Drawing of the result's uncertainty.
+    """Drawing of the result's uncertainty."""
 
-    Attributes:
-        edges: Edges with a covariance, by name, including tools and fixtures.
-        scatter_m: By view, deviation of its target position from the result: (3,) in the target's
-            frame.
-        frames: By view, frame of its target.
-        used: The views in the fit.
-        factor: Magnification of everything.
-        size_m: Size of the cell [m].
-    """
-
-    edges: Mapping[str, Edge]
+    edges: Mapping[str, Edge]  # Edges with a covariance, by name, including tools and fixtures.
+    # By view, deviation of its target position from the result: (3,) in the target's frame.
     scatter_m: Mapping[int, FloatArray]
-    frames: Mapping[int, str]
-    used: frozenset[int]
-    factor: int
-    size_m: float
+    frames: Mapping[int, str]  # By view, frame of its target.
+    used: frozenset[int]  # The views in the fit.
+    factor: int  # Magnification of everything.
+    size_m: float  # Size of the cell [m].
 
     @classmethod
     def of(

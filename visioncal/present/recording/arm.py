@@ -94,23 +94,15 @@ def log_arms(
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Capsules and balls of m arms with n links each, arm after arm.
+    """Capsules and balls of m arms with n links each, arm after arm."""
 
-    Attributes:
-        lengths_m: (m n,) lengths of the capsules [m].
-        radii_m: (m n,) radii of the capsules [m].
-        begins_m: (m n, 3) start points of the capsules [m].
-        quaternions: (m n, 4) rotations x, y, z, w of the capsules from the z axis.
-        joints_m: (m (n - 1), 3) centres of the balls [m]; neither base nor flange is a joint.
-        half_sizes_m: (m (n - 1), 3) radii of the balls [m].
-    """
-
-    lengths_m: FloatArray
-    radii_m: FloatArray
-    begins_m: FloatArray
-    quaternions: FloatArray
+    lengths_m: FloatArray  # (m n,) lengths of the capsules [m].
+    radii_m: FloatArray  # (m n,) radii of the capsules [m].
+    begins_m: FloatArray  # (m n, 3) start points of the capsules [m].
+    quaternions: FloatArray  # (m n, 4) rotations x, y, z, w of the capsules from the z axis.
+    # (m (n - 1), 3) centres of the balls [m]; neither base nor flange is a joint.
     joints_m: FloatArray
-    half_sizes_m: FloatArray
+    half_sizes_m: FloatArray  # (m (n - 1), 3) radii of the balls [m].
 
     @classmethod
     def of(cls, link_frames: FloatArray) -> "_Shapes":

@@ -27,17 +27,11 @@ _BAR = 0.012
 
 @dataclass(frozen=True, eq=False)
 class JointChart:
-    """Residuals against the angle of one joint.
+    """Residuals against the angle of one joint."""
 
-    Attributes:
-        joint: Its index, from 0.
-        angle_deg: By view [deg].
-        residual_mm: By view [mm].
-    """
-
-    joint: int
-    angle_deg: Mapping[int, float]
-    residual_mm: Mapping[int, float]
+    joint: int  # Its index, from 0.
+    angle_deg: Mapping[int, float]  # By view [deg].
+    residual_mm: Mapping[int, float]  # By view [mm].
 
     def log(self, stream: rr.RecordingStream) -> None:
         """Draws the bars of all views."""
@@ -79,17 +73,12 @@ class JointChart:
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """All charts of a result.
+    """All charts of a result."""
 
-    Attributes:
-        points: Coverage of the image, of directions and of rotation axes, where known.
-        joints: One chart per joint, if the session has joint angles.
-        used: The views in the fit.
-    """
-
+    # Coverage of the image, of directions and of rotation axes, where known.
     points: tuple[PointChart, ...]
-    joints: tuple[JointChart, ...]
-    used: frozenset[int]
+    joints: tuple[JointChart, ...]  # One chart per joint, if the session has joint angles.
+    used: frozenset[int]  # The views in the fit.
 
     @classmethod
     def of(

@@ -47,29 +47,18 @@ _MEDIA_TYPES = {
 
 @dataclass(frozen=True)
 class Header:
-    """Data that holds for all rows; an empty text stands for a document that the session lacks.
+    """Data that holds for all rows; an empty text stands for a document that the session lacks."""
 
-    Attributes:
-        rows: Announced number of rows; UNKNOWN if it was not known.
-        columns: Columns of views.csv.
-        number_columns: Those of them that are stored as numbers.
-        session_toml: Content of session.toml.
-        target_json: Content of the target's file.
-        robot_json: The robot's model.
-        streams: Names of the streams, followed by their seals.
-        corners: Seal of the external detector's corners; empty if there are none.
-        images: What is stored of the images: empty for all, `thumbnail`, or `none`; their digests
-            are in the rows in any case.
-    """
-
-    rows: int
-    columns: tuple[str, ...]
-    number_columns: tuple[str, ...]
-    session_toml: str
-    target_json: str
-    robot_json: str
-    streams: tuple[str, ...] = ()
-    corners: str = ""
+    rows: int  # Announced number of rows; UNKNOWN if it was not known.
+    columns: tuple[str, ...]  # Columns of views.csv.
+    number_columns: tuple[str, ...]  # Those of them that are stored as numbers.
+    session_toml: str  # Content of session.toml.
+    target_json: str  # Content of the target's file.
+    robot_json: str  # The robot's model.
+    streams: tuple[str, ...] = ()  # Names of the streams, followed by their seals.
+    corners: str = ""  # Seal of the external detector's corners; empty if there are none.
+    # What is stored of the images: empty for all, `thumbnail`, or `none`; their digests are in the
+    # rows in any case.
     images: str = ""
 
     @classmethod
@@ -116,17 +105,11 @@ class Header:
 
 @dataclass(frozen=True)
 class StoredRow:
-    """A row as stored: NaN and empty text stand for empty cells.
+    """A row as stored: NaN and empty text stand for empty cells."""
 
-    Attributes:
-        numbers: Cells of the number columns.
-        texts: Cells of the other columns.
-        image_sha256: Digest of the image's bytes; empty without an image.
-    """
-
-    numbers: tuple[float, ...]
-    texts: tuple[str, ...]
-    image_sha256: str
+    numbers: tuple[float, ...]  # Cells of the number columns.
+    texts: tuple[str, ...]  # Cells of the other columns.
+    image_sha256: str  # Digest of the image's bytes; empty without an image.
 
     @classmethod
     def of(cls, columns: tuple[str, ...], view: View, image_sha256: str) -> "StoredRow":

@@ -17,19 +17,12 @@ _FAINT_QUALITY = 15
 
 @dataclass(frozen=True, eq=False)
 class ExternalImages(ImageStore):
-    """Images of a session whose recording was written without them.
+    """Images of a session whose recording was written without them."""
 
-    Attributes:
-        path: The recording.
-        kept: What the recording stores of them: `thumbnail` or `none`.
-        digests: SHA-256 of the images' bytes, by name.
-        pictures: Readers of the low-quality copies, by image name.
-    """
-
-    path: Path
-    kept: ImagesKept
-    digests: Mapping[str, str]
-    pictures: Mapping[str, Callable[[], bytes]]
+    path: Path  # The recording.
+    kept: ImagesKept  # What the recording stores of them: `thumbnail` or `none`.
+    digests: Mapping[str, str]  # SHA-256 of the images' bytes, by name.
+    pictures: Mapping[str, Callable[[], bytes]]  # Readers of the low-quality copies, by image name.
 
     def read(self, path: str) -> bytes:
         """Raises an error: the image is not in the recording.

@@ -24,49 +24,30 @@ _JPEG = 80
 
 @dataclass(frozen=True, eq=False)
 class LiveCell:
-    """Content of a live drawing that is the same for all views.
+    """Content of a live drawing that is the same for all views."""
 
-    Attributes:
-        mount: Where the camera is.
-        target: The board.
-        resolution: (width, height) of the images [px].
-        robot: Model of the arm; None where unknown.
-        camera: Intrinsics; None where unknown.
-        x: (4, 4) estimated pose of the camera, on the flange or in the base [m]; None where
-            unknown, and neither camera nor board are drawn.
-        z: (4, 4) estimated pose of the board, in the base or on the flange [m].
-    """
-
-    mount: Mount
-    target: Target
-    resolution: tuple[int, int]
-    robot: Robot | None
-    camera: Camera | None
+    mount: Mount  # Where the camera is.
+    target: Target  # The board.
+    resolution: tuple[int, int]  # (width, height) of the images [px].
+    robot: Robot | None  # Model of the arm; None where unknown.
+    camera: Camera | None  # Intrinsics; None where unknown.
+    # (4, 4) estimated pose of the camera, on the flange or in the base [m]; None where unknown, and
+    # neither camera nor board are drawn.
     x: FloatArray | None
-    z: FloatArray | None
+    z: FloatArray | None  # (4, 4) estimated pose of the board, in the base or on the flange [m].
 
 
 @dataclass(frozen=True, eq=False)
 class LiveView:
-    """Content of a live drawing for one view.
+    """Content of a live drawing for one view."""
 
-    Attributes:
-        view: Its number.
-        image: (h, w) or (h, w, 3) blue, green, red.
-        px: (n, 2) detected corners [px].
-        base_from_flange: (4, 4) [m].
-        q: (n,) joint angles [rad]; None where unknown.
-        sigma_mm: Sigma predicted from the views so far [mm]; None where undetermined.
-        note: Text in Markdown.
-    """
-
-    view: int
-    image: Image
-    px: FloatArray
-    base_from_flange: FloatArray
-    q: FloatArray | None
-    sigma_mm: float | None
-    note: str
+    view: int  # Its number.
+    image: Image  # (h, w) or (h, w, 3) blue, green, red.
+    px: FloatArray  # (n, 2) detected corners [px].
+    base_from_flange: FloatArray  # (4, 4) [m].
+    q: FloatArray | None  # (n,) joint angles [rad]; None where unknown.
+    sigma_mm: float | None  # Sigma predicted from the views so far [mm]; None where undetermined.
+    note: str  # Text in Markdown.
 
 
 @dataclass(eq=False)

@@ -22,22 +22,15 @@ _DOT, _LINE = 1 / 280, 1 / 800
 
 @dataclass(frozen=True)
 class Overlay:
-    """Style of corners and residuals, the same in all views.
+    """Style of corners and residuals, the same in all views."""
 
-    Attributes:
-        factor: Magnification of the used views' residuals. Those of other views are drawn to scale,
-            as they may be arbitrarily large.
-        used: The views in the fit.
-        width: Width of the images [px].
-        frames: Frame of each image, by row.
-        active: Whether any view has corners.
-    """
-
+    # Magnification of the used views' residuals. Those of other views are drawn to scale, as they
+    # may be arbitrarily large.
     factor: int
-    used: frozenset[int]
-    width: float
-    frames: Mapping[int, str]
-    active: bool
+    used: frozenset[int]  # The views in the fit.
+    width: float  # Width of the images [px].
+    frames: Mapping[int, str]  # Frame of each image, by row.
+    active: bool  # Whether any view has corners.
 
     @classmethod
     def of(

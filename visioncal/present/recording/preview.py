@@ -46,35 +46,21 @@ class PreviewStop:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """Content of a plan's preview.
+    """Content of a plan's preview."""
 
-    Attributes:
-        name: Name of the recording.
-        mount: Where the camera is.
-        robot: The arm.
-        camera: The camera's intrinsics.
-        target: The board.
-        x: (4, 4) estimated pose of the camera, on the flange or in the base [m].
-        z: (4, 4) estimated pose of the board, in the base or on the flange [m].
-        stops: Stops in driving order.
-        sigmas_mm: Predicted sigma by number of stops; NaN where something is undetermined [mm].
-        obstacles: Obstacles in the cell.
-        floor_m: Height of the floor in the base [m]; None without a floor.
-        note: Text of the plan in Markdown.
-    """
-
-    name: str
-    mount: Mount
-    robot: Robot
-    camera: Camera
-    target: Target
-    x: FloatArray
-    z: FloatArray
-    stops: Sequence[PreviewStop]
+    name: str  # Name of the recording.
+    mount: Mount  # Where the camera is.
+    robot: Robot  # The arm.
+    camera: Camera  # The camera's intrinsics.
+    target: Target  # The board.
+    x: FloatArray  # (4, 4) estimated pose of the camera, on the flange or in the base [m].
+    z: FloatArray  # (4, 4) estimated pose of the board, in the base or on the flange [m].
+    stops: Sequence[PreviewStop]  # Stops in driving order.
+    # Predicted sigma by number of stops; NaN where something is undetermined [mm].
     sigmas_mm: FloatArray
-    obstacles: Sequence[Obstacle]
-    floor_m: float | None
-    note: str
+    obstacles: Sequence[Obstacle]  # Obstacles in the cell.
+    floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
+    note: str  # Text of the plan in Markdown.
 
     @property
     def base_from_flange(self) -> FloatArray:
@@ -254,38 +240,23 @@ def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> Fl
 
 @dataclass(frozen=True, eq=False)
 class MotionPart:
-    """One motion of a plan.
+    """One motion of a plan."""
 
-    Attributes:
-        name: Its name.
-        motion: Joint motion, from time zero.
-        torques_nm: (m, n) torques of the nominal arm [N m]; None where unknown.
-    """
-
-    name: str
-    motion: JointMotion
-    torques_nm: FloatArray | None
+    name: str  # Its name.
+    motion: JointMotion  # Joint motion, from time zero.
+    torques_nm: FloatArray | None  # (m, n) torques of the nominal arm [N m]; None where unknown.
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPreview:
-    """Content of a preview of planned motions.
+    """Content of a preview of planned motions."""
 
-    Attributes:
-        name: Name of the recording.
-        robot: The arm.
-        parts: Motions in their order, one after the other on the timeline.
-        obstacles: Obstacles in the cell.
-        floor_m: Height of the floor in the base [m]; None without a floor.
-        note: Text of the plan in Markdown.
-    """
-
-    name: str
-    robot: Robot
-    parts: Sequence[MotionPart]
-    obstacles: Sequence[Obstacle]
-    floor_m: float | None
-    note: str
+    name: str  # Name of the recording.
+    robot: Robot  # The arm.
+    parts: Sequence[MotionPart]  # Motions in their order, one after the other on the timeline.
+    obstacles: Sequence[Obstacle]  # Obstacles in the cell.
+    floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
+    note: str  # Text of the plan in Markdown.
 
     @property
     def places_m(self) -> FloatArray:

@@ -86,15 +86,10 @@ class _Image:
 
 @dataclass(frozen=True, eq=False)
 class RecordedImages(ImageStore):
-    """Images that are read from a recording on demand.
+    """Images that are read from a recording on demand."""
 
-    Attributes:
-        path: The recording.
-        places: Position of each image in it, by name.
-    """
-
-    path: Path
-    places: Mapping[str, _Image]
+    path: Path  # The recording.
+    places: Mapping[str, _Image]  # Position of each image in it, by name.
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file.
@@ -131,25 +126,15 @@ class RecordedImages(ImageStore):
 
 @dataclass(frozen=True, eq=False)
 class _Records:
-    """The records of a session's data.
+    """The records of a session's data."""
 
-    Attributes:
-        header: Data that holds for all rows.
-        rows: Rows by number.
-        images: Images by row number.
-        streams: Streams by name.
-        corners: Corners of an external detector; None if there are none.
-        closed: Number of rows by the end mark; None without the mark.
-        damaged: Number of chunks that could not be read.
-    """
-
-    header: codec.Header
-    rows: Mapping[int, codec.StoredRow]
-    images: Mapping[int, _Image]
-    streams: Mapping[str, Stream]
-    corners: CornerTable | None
-    closed: int | None
-    damaged: int
+    header: codec.Header  # Data that holds for all rows.
+    rows: Mapping[int, codec.StoredRow]  # Rows by number.
+    images: Mapping[int, _Image]  # Images by row number.
+    streams: Mapping[str, Stream]  # Streams by name.
+    corners: CornerTable | None  # Corners of an external detector; None if there are none.
+    closed: int | None  # Number of rows by the end mark; None without the mark.
+    damaged: int  # Number of chunks that could not be read.
 
     @property
     def is_incomplete(self) -> bool:

@@ -33,17 +33,11 @@ _LZ4_RATIO = 255
 
 @dataclass(frozen=True)
 class MessageFrame:
-    """Position of one message in the file.
+    """Position of one message in the file."""
 
-    Attributes:
-        kind: LAST, STORE_INFO, CHUNK or ACTIVATION (of a layout).
-        offset: Offset of its payload in the file.
-        size: Length of the payload [bytes].
-    """
-
-    kind: int
-    offset: int
-    size: int
+    kind: int  # LAST, STORE_INFO, CHUNK or ACTIVATION (of a layout).
+    offset: int  # Offset of its payload in the file.
+    size: int  # Length of the payload [bytes].
 
     @property
     def end(self) -> int:
@@ -53,21 +47,14 @@ class MessageFrame:
 
 @dataclass(frozen=True)
 class Scan:
-    """The complete messages of a file.
+    """The complete messages of a file."""
 
-    Attributes:
-        path: The file.
-        frames: Messages in file order up to the first truncated one, without the one of kind LAST.
-        end: Offset behind the last of them.
-        finished: Whether the file has rerun's closing bytes.
-        cut: Whether data follows `end` although the file is not finished.
-    """
-
-    path: Path
+    path: Path  # The file.
+    # Messages in file order up to the first truncated one, without the one of kind LAST.
     frames: tuple[MessageFrame, ...]
-    end: int
-    finished: bool
-    cut: bool
+    end: int  # Offset behind the last of them.
+    finished: bool  # Whether the file has rerun's closing bytes.
+    cut: bool  # Whether data follows `end` although the file is not finished.
 
 
 def scan(path: Path) -> Scan:

@@ -41,16 +41,11 @@ _BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
 @dataclass(frozen=True, eq=False)
 class RobotState:
-    """Pose and posture of a robot in a view.
+    """Pose and posture of a robot in a view."""
 
-    Attributes:
-        pose: (4, 4) `base_from_flange`.
-        q: (n,) joint angles [rad]; None where unknown.
-        is_past: Whether the state is that of another view, as it is unknown in this one.
-    """
-
-    pose: FloatArray
-    q: FloatArray | None
+    pose: FloatArray  # (4, 4) `base_from_flange`.
+    q: FloatArray | None  # (n,) joint angles [rad]; None where unknown.
+    # Whether the state is that of another view, as it is unknown in this one.
     is_past: bool = False
 
     def link_frames(self, robot: Robot | None) -> FloatArray | None:
@@ -117,27 +112,17 @@ def _state(row: View, robot: Robot | None) -> RobotState | None:
 
 @dataclass(frozen=True, eq=False)
 class SceneDrawing:
-    """Drawing of the cell, with each frame placed on its parent.
+    """Drawing of the cell, with each frame placed on its parent."""
 
-    Attributes:
-        session: The session.
-        calibration: Result of the session; without it only the flange is drawn.
-        frames: Tree of frames.
-        states: State of each robot, where known, by flange and view number.
-        size_m: Size of the cell, which drawn sizes refer to [m].
-        uncertainty: Drawing of the result's uncertainty.
-        charts: Charts over all views.
-        arm: Drawing of a calibrated arm.
-    """
-
-    session: Session
-    calibration: Calibration | None
-    frames: result_parts.FrameHierarchy
+    session: Session  # The session.
+    calibration: Calibration | None  # Result of the session; without it only the flange is drawn.
+    frames: result_parts.FrameHierarchy  # Tree of frames.
+    # State of each robot, where known, by flange and view number.
     states: Mapping[str, Mapping[int, RobotState]]
-    size_m: float
-    uncertainty: Uncertainty | None
-    charts: Charts | None
-    arm: ArmPicture | None
+    size_m: float  # Size of the cell, which drawn sizes refer to [m].
+    uncertainty: Uncertainty | None  # Drawing of the result's uncertainty.
+    charts: Charts | None  # Charts over all views.
+    arm: ArmPicture | None  # Drawing of a calibrated arm.
 
     @classmethod
     def of(

@@ -21,15 +21,10 @@ _Facts = list[tuple[str, str]]
 
 @dataclass(frozen=True)
 class CertificateEntries:
-    """What a person adds to a certificate.
+    """What a person adds to a certificate."""
 
-    Attributes:
-        operator: Who made the calibration; empty to be filled in by hand.
-        serials: Serial numbers by device.
-    """
-
-    operator: str = ""
-    serials: Mapping[str, str] = field(default_factory=dict)
+    operator: str = ""  # Who made the calibration; empty to be filled in by hand.
+    serials: Mapping[str, str] = field(default_factory=dict)  # Serial numbers by device.
 
 
 def write_certificate(

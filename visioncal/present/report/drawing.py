@@ -19,15 +19,10 @@ _COLOURS = (
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure of the report.
+    """A figure of the report."""
 
-    Attributes:
-        name: What it shows.
-        markup: Markup to embed in pages.
-    """
-
-    name: str
-    markup: str
+    name: str  # What it shows.
+    markup: str  # Markup to embed in pages.
 
     def __repr__(self) -> str:
         return f"Drawing of {self.name}; save it as .svg, or show it in a notebook"

@@ -51,19 +51,12 @@ _HEADROOM = 1.25
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar of a bar chart.
+    """One bar of a bar chart."""
 
-    Attributes:
-        label: Axis label.
-        value: Height; None where unknown.
-        used: Whether it was used; used bars define the scale.
-        colour: Colour of the bar and its mark.
-    """
-
-    label: str
-    value: float | None
-    used: bool
-    colour: str
+    label: str  # Axis label.
+    value: float | None  # Height; None where unknown.
+    used: bool  # Whether it was used; used bars define the scale.
+    colour: str  # Colour of the bar and its mark.
 
 
 def draw_bars(axes: Axes, bars: Sequence[Bar], rms: float | None, limit: float | None) -> None:

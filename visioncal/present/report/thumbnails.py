@@ -28,28 +28,17 @@ class Residual:
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A picture with its overlay, in the full image's pixel coordinates.
+    """A picture with its overlay, in the full image's pixel coordinates."""
 
-    Attributes:
-        view: The view's number.
-        caption: Text below it.
-        jpeg_uri: The picture as a data URI.
-        left: Image x of the left edge [px]; pixel centres are at integers.
-        top: Image y of the upper edge [px].
-        width: Width [px].
-        height: Height [px].
-        corners: (n, 2) detected corners [px].
-        residuals: Arrows from detected corners towards their predictions, magnified.
-    """
-
-    view: int
-    caption: str
-    jpeg_uri: str
-    left: float
-    top: float
-    width: float
-    height: float
-    corners: tuple[tuple[float, float], ...] = ()
+    view: int  # The view's number.
+    caption: str  # Text below it.
+    jpeg_uri: str  # The picture as a data URI.
+    left: float  # Image x of the left edge [px]; pixel centres are at integers.
+    top: float  # Image y of the upper edge [px].
+    width: float  # Width [px].
+    height: float  # Height [px].
+    corners: tuple[tuple[float, float], ...] = ()  # (n, 2) detected corners [px].
+    # Arrows from detected corners towards their predictions, magnified.
     residuals: tuple[Residual, ...] = ()
 
     @property

@@ -47,20 +47,14 @@ class CalibratedArm:
     """Nominal and calibrated model of an arm, prepared for `correct`.
 
     In a loop, prepare it once for each thread.
-
-    Attributes:
-        nominal: The controller's model.
-        real: The calibrated model.
-        inverse: Inverse kinematics of the calibrated arm without a load.
-        compliance: (n,) compliance of its joints [rad/(N m)].
-        weight_moments: (n, 4 n) compliance times unknown masses and first moments of the links;
-            None where the masses are known (see `bent_joints`).
     """
 
-    nominal: Robot
-    real: Robot
-    inverse: Inverse
-    compliance: FloatArray
+    nominal: Robot  # The controller's model.
+    real: Robot  # The calibrated model.
+    inverse: Inverse  # Inverse kinematics of the calibrated arm without a load.
+    compliance: FloatArray  # (n,) compliance of its joints [rad/(N m)].
+    # (n, 4 n) compliance times unknown masses and first moments of the links; None where the masses
+    # are known (see `bent_joints`).
     weight_moments: FloatArray | None
 
     @classmethod
@@ -171,28 +165,20 @@ def _interpolated(p_base: FloatArray, rows: Sequence[WorkspacePlace]) -> FloatAr
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """Corrected commands for m targets.
+    """Corrected commands for m targets."""
 
-    Attributes:
-        wanted: (m, 4, 4) the targets of the flange [m].
-        q: (m, n) joint targets [rad or m]; where `reached` is false, the nearest ones.
-        base_from_flange: (m, 4, 4) Cartesian targets [m]: the nominal flange pose at `q`.
-        reached: (m,) whether the calibrated arm reaches its target within its limits.
-        off_m: (m,) remaining distance [m].
-        off_rad: (m,) remaining angle [rad]. An arm of fewer than six joints reaches the position,
-            and the rotation as nearly as it can.
-        turned_rad: (m, n) rotation of each joint from its seed, or else from the target before;
-            zero for a prismatic joint, and for a first target without a seed.
-        beyond: (m,) for an unreached target, the joints whose limits alone prevent it.
-    """
-
-    wanted: FloatArray
-    q: FloatArray
-    base_from_flange: FloatArray
-    reached: Mask
-    off_m: FloatArray
+    wanted: FloatArray  # (m, 4, 4) the targets of the flange [m].
+    q: FloatArray  # (m, n) joint targets [rad or m]; where `reached` is false, the nearest ones.
+    base_from_flange: FloatArray  # (m, 4, 4) Cartesian targets [m]: the nominal flange pose at `q`.
+    reached: Mask  # (m,) whether the calibrated arm reaches its target within its limits.
+    off_m: FloatArray  # (m,) remaining distance [m].
+    # (m,) remaining angle [rad]. An arm of fewer than six joints reaches the position, and the
+    # rotation as nearly as it can.
     off_rad: FloatArray
+    # (m, n) rotation of each joint from its seed, or else from the target before; zero for a
+    # prismatic joint, and for a first target without a seed.
     turned_rad: FloatArray
+    # (m,) for an unreached target, the joints whose limits alone prevent it.
     beyond: tuple[tuple[str, ...], ...]
 
     def __len__(self) -> int:

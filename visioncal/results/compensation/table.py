@@ -25,19 +25,12 @@ ADDED = ("moved_mm", "moved_deg", "sigma_mm", "off_deg")
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """The rows of a table of targets, m in all.
+    """The rows of a table of targets, m in all."""
 
-    Attributes:
-        table: The table itself.
-        places: (m,) the rows' lines: `targets.csv, line 3`.
-        base_from_tool: (m, 4, 4) the targets, of the flange or of a tool [m].
-        q_seed: (m, n) joint seeds [rad or m], NaN in a row without.
-    """
-
-    table: TextTable
-    places: tuple[str, ...]
-    base_from_tool: FloatArray
-    q_seed: FloatArray
+    table: TextTable  # The table itself.
+    places: tuple[str, ...]  # (m,) the rows' lines: `targets.csv, line 3`.
+    base_from_tool: FloatArray  # (m, 4, 4) the targets, of the flange or of a tool [m].
+    q_seed: FloatArray  # (m, n) joint seeds [rad or m], NaN in a row without.
 
     def __len__(self) -> int:
         return len(self.places)

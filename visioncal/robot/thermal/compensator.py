@@ -21,17 +21,12 @@ _SLOWEST_S, _LEAST_SHARE = 3600.0, 1e-3
 
 @dataclass(frozen=True)
 class Advice:
-    """Current drift rate of the flange, and time until it is below a limit.
+    """Current drift rate of the flange, and time until it is below a limit."""
 
-    Attributes:
-        rate_um_min: Drift rate of the flange now [um/min]; None after too few samples.
-        limit_um_min: Its limit [um/min].
-        wait_s: Time until it is below the limit if work continues [s]; zero where it is already,
-            None where it takes more than ten hours or after too few samples.
-    """
-
-    rate_um_min: float | None
-    limit_um_min: float
+    rate_um_min: float | None  # Drift rate of the flange now [um/min]; None after too few samples.
+    limit_um_min: float  # Its limit [um/min].
+    # Time until it is below the limit if work continues [s]; zero where it is already, None where
+    # it takes more than ten hours or after too few samples.
     wait_s: float | None
 
     @property
@@ -50,18 +45,12 @@ class Advice:
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Temperatures of the links at a sample.
+    """Temperatures of the links at a sample."""
 
-    Attributes:
-        rest: (n,) steady state [deg C].
-        driven: (n,) its part by motor currents [K].
-        links: (n,) current temperatures [deg C].
-        jacobian: (n, s) their derivatives over the heating's parameters; see `Heating.jacobian`.
-    """
-
-    rest: FloatArray
-    driven: FloatArray
-    links: FloatArray
+    rest: FloatArray  # (n,) steady state [deg C].
+    driven: FloatArray  # (n,) its part by motor currents [K].
+    links: FloatArray  # (n,) current temperatures [deg C].
+    # (n, s) their derivatives over the heating's parameters; see `Heating.jacobian`.
     jacobian: FloatArray
 
 

@@ -18,34 +18,22 @@ Kind: TypeAlias = Literal["temperatures", "currents"]
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Recorded signals that heat an arm with n joints, at t samples.
+    """Recorded signals that heat an arm with n joints, at t samples."""
 
-    Attributes:
-        kind: Whether joint temperatures or motor currents were recorded.
-        stamps_s: (t,) ascending [s].
-        signal: (t, n) joint temperatures [deg C], or squared motor currents [A^2].
-        ambient_c: (t,) air temperature [deg C]; zero where not recorded: others are then relative.
-    """
-
-    kind: Kind
-    stamps_s: FloatArray
-    signal: FloatArray
+    kind: Kind  # Whether joint temperatures or motor currents were recorded.
+    stamps_s: FloatArray  # (t,) ascending [s].
+    signal: FloatArray  # (t, n) joint temperatures [deg C], or squared motor currents [A^2].
+    # (t,) air temperature [deg C]; zero where not recorded: others are then relative.
     ambient_c: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Heating:
-    """Heating model of n links.
+    """Heating model of n links."""
 
-    Attributes:
-        kind: The recorded signal.
-        tau_s: (n,) time constants [s].
-        gain_k_per_a2: (n,) steady-state rise over the air per squared current [K/A^2]; ones for
-            temperatures.
-    """
-
-    kind: Kind
-    tau_s: FloatArray
+    kind: Kind  # The recorded signal.
+    tau_s: FloatArray  # (n,) time constants [s].
+    # (n,) steady-state rise over the air per squared current [K/A^2]; ones for temperatures.
     gain_k_per_a2: FloatArray
 
     @property

@@ -18,23 +18,15 @@ class ThermalModel:
 
     A link's lengths, a and d of its joint table, grow in proportion to the rise of its temperature,
     and the joint's zero drifts with it.
-
-    Attributes:
-        robot: The arm at the reference temperatures.
-        heating: Heating model of the links.
-        reference_c: (n,) reference temperatures of the links [deg C].
-        growth_per_k: (n,) relative growth of links [1/K].
-        drift_rad_per_k: (n,) drift of the joints' zeros [rad/K].
-        covariance: (2 n + h, 2 n + h) of growth, drift and the heating's h parameters.
-        lengths: (n + 1, 3) growing vectors from each joint's frame to the next, in the former [m].
     """
 
-    robot: Robot
-    heating: Heating
-    reference_c: FloatArray
-    growth_per_k: FloatArray
-    drift_rad_per_k: FloatArray
-    covariance: FloatArray
+    robot: Robot  # The arm at the reference temperatures.
+    heating: Heating  # Heating model of the links.
+    reference_c: FloatArray  # (n,) reference temperatures of the links [deg C].
+    growth_per_k: FloatArray  # (n,) relative growth of links [1/K].
+    drift_rad_per_k: FloatArray  # (n,) drift of the joints' zeros [rad/K].
+    covariance: FloatArray  # (2 n + h, 2 n + h) of growth, drift and the heating's h parameters.
+    # (n + 1, 3) growing vectors from each joint's frame to the next, in the former [m].
     lengths: FloatArray
 
     @property

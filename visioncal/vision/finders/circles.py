@@ -42,23 +42,14 @@ _STAGGER = np.array([[1, 1], [1, -1]])
 
 @dataclass(frozen=True, eq=False)
 class Circles:
-    """A grid of circles in an image.
+    """A grid of circles in an image."""
 
-    Attributes:
-        columns: Number of circles in each row.
-        rows: Number of rows.
-        asymmetric: Whether every second row is shifted by half a step.
-        px: (n, 2) approximate centres, row by row [px].
-        share: Diameter over the spacing of neighbouring columns or rows.
-        diameter_px: Median diameter [px].
-    """
-
-    columns: int
-    rows: int
-    asymmetric: bool
-    px: FloatArray
-    share: float
-    diameter_px: float
+    columns: int  # Number of circles in each row.
+    rows: int  # Number of rows.
+    asymmetric: bool  # Whether every second row is shifted by half a step.
+    px: FloatArray  # (n, 2) approximate centres, row by row [px].
+    share: float  # Diameter over the spacing of neighbouring columns or rows.
+    diameter_px: float  # Median diameter [px].
 
 
 def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:

@@ -38,50 +38,31 @@ _MAYBE_CHARUCO = (
 
 @dataclass(frozen=True)
 class Identity:
-    """An identified target, without its size.
+    """An identified target, without its size."""
 
-    Attributes:
-        kind: Kind of target.
-        columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
-        rows: Likewise along y; rows of tags for an AprilGrid.
-        whole: Whether the board's end is visible; otherwise it may be larger.
-        dictionary: Smallest dictionary that contains the markers; empty without markers.
-        larger: Other dictionaries that contain the same markers.
-        legacy: Whether a ChArUco board has OpenCV's layout before 4.6; with an odd number of rows
-            both layouts are the same.
-        marker_share: Marker side over square side; 0 except for ChArUco.
-        marker_share_sigma: Its standard deviation.
-        marker_ids: Decoded ids, ascending; for single markers, the target's first.
-        first_id: Smallest id of an AprilGrid.
-        spacing: Gap between its tags, as a share of their side.
-        border: Number of dark modules around its tags' bits.
-        asymmetric: Whether every second row of circles is shifted.
-        diameter_share: Circles' diameter over the spacing of rows; 0 without circles.
-        square_px: Approximate side of a checkerboard's squares, or spacing of rows of circles [px].
-        corners_seen: Number of corners that the detector of this kind finds.
-        corners: Number of corners of the target.
-        notes: Remarks, in sentences.
-    """
-
-    kind: TargetKind
-    columns: int
-    rows: int
-    whole: bool
-    corners_seen: int
-    corners: int
-    dictionary: str = ""
-    larger: tuple[str, ...] = ()
+    kind: TargetKind  # Kind of target.
+    columns: int  # Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
+    rows: int  # Likewise along y; rows of tags for an AprilGrid.
+    whole: bool  # Whether the board's end is visible; otherwise it may be larger.
+    corners_seen: int  # Number of corners that the detector of this kind finds.
+    corners: int  # Number of corners of the target.
+    dictionary: str = ""  # Smallest dictionary that contains the markers; empty without markers.
+    larger: tuple[str, ...] = ()  # Other dictionaries that contain the same markers.
+    # Whether a ChArUco board has OpenCV's layout before 4.6; with an odd number of rows both
+    # layouts are the same.
     legacy: bool = False
-    marker_share: float = 0.0
-    marker_share_sigma: float = 0.0
+    marker_share: float = 0.0  # Marker side over square side; 0 except for ChArUco.
+    marker_share_sigma: float = 0.0  # Its standard deviation.
+    # Decoded ids, ascending; for single markers, the target's first.
     marker_ids: tuple[int, ...] = ()
-    first_id: int = -1
-    spacing: float = 0.0
-    border: int = 1
-    asymmetric: bool = False
-    diameter_share: float = 0.0
+    first_id: int = -1  # Smallest id of an AprilGrid.
+    spacing: float = 0.0  # Gap between its tags, as a share of their side.
+    border: int = 1  # Number of dark modules around its tags' bits.
+    asymmetric: bool = False  # Whether every second row of circles is shifted.
+    diameter_share: float = 0.0  # Circles' diameter over the spacing of rows; 0 without circles.
+    # Approximate side of a checkerboard's squares, or spacing of rows of circles [px].
     square_px: float = 0.0
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Remarks, in sentences.
 
     @property
     def is_filled(self) -> bool:

@@ -28,19 +28,12 @@ _USUAL_SPACING = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """An AprilGrid in an image, with tags of 1 m.
+    """An AprilGrid in an image, with tags of 1 m."""
 
-    Attributes:
-        target: The grid, without its size.
-        whole: Whether its end above the uppermost row is visible.
-        ids: Ids of the tags that were read, ascending.
-        corners: Number of corners that the AprilGrid detector finds.
-    """
-
-    target: Target
-    whole: bool
-    ids: IntArray
-    corners: int
+    target: Target  # The grid, without its size.
+    whole: bool  # Whether its end above the uppermost row is visible.
+    ids: IntArray  # Ids of the tags that were read, ascending.
+    corners: int  # Number of corners that the AprilGrid detector finds.
 
 
 def find_grid(image: Image) -> Grid | None:

@@ -60,25 +60,15 @@ _LEAST_STEP = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Layout of a board's markers.
+    """Layout of a board's markers."""
 
-    Attributes:
-        columns: Number of squares along x.
-        rows: Number of squares along y; possibly more unless `rows_certain`.
-        rows_certain: Whether the board's end is visible.
-        legacy: Whether square 0 holds a marker.
-        share: Marker side over square side.
-        share_sigma: Its standard deviation.
-        markers: Markers that fit.
-    """
-
-    columns: int
-    rows: int
-    rows_certain: bool
-    legacy: bool
-    share: float
-    share_sigma: float
-    markers: tuple[Marker, ...]
+    columns: int  # Number of squares along x.
+    rows: int  # Number of squares along y; possibly more unless `rows_certain`.
+    rows_certain: bool  # Whether the board's end is visible.
+    legacy: bool  # Whether square 0 holds a marker.
+    share: float  # Marker side over square side.
+    share_sigma: float  # Its standard deviation.
+    markers: tuple[Marker, ...]  # Markers that fit.
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,23 +42,14 @@ _ATTEMPTS = (0, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE)
 
 @dataclass(frozen=True)
 class Squares:
-    """A checkerboard.
+    """A checkerboard."""
 
-    Attributes:
-        columns: Number of inner corners along its longer side.
-        rows: Likewise along the other.
-        cut: Whether it may continue outside the image.
-        found: Whether the corner detector finds a board of exactly this size.
-        filled: Whether the light squares are not plain, as with markers too blurred to read.
-        square_px: Approximate side of a square [px].
-    """
-
-    columns: int
-    rows: int
-    cut: bool
-    found: bool
-    filled: bool
-    square_px: float
+    columns: int  # Number of inner corners along its longer side.
+    rows: int  # Likewise along the other.
+    cut: bool  # Whether it may continue outside the image.
+    found: bool  # Whether the corner detector finds a board of exactly this size.
+    filled: bool  # Whether the light squares are not plain, as with markers too blurred to read.
+    square_px: float  # Approximate side of a square [px].
 
 
 @dataclass(frozen=True)

@@ -35,19 +35,12 @@ _SHORT_MODULES = 6
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A decoded marker.
+    """A decoded marker."""
 
-    Attributes:
-        family: Its family, a key of `FAMILIES`.
-        number: Its id.
-        px: (4, 2) corners in OpenCV's order [px].
-        likeness: Correlation of its image with the ideal marker, -1 to 1.
-    """
-
-    family: str
-    number: int
-    px: FloatArray
-    likeness: float
+    family: str  # Its family, a key of `FAMILIES`.
+    number: int  # Its id.
+    px: FloatArray  # (4, 2) corners in OpenCV's order [px].
+    likeness: float  # Correlation of its image with the ideal marker, -1 to 1.
 
     @cached_property
     def centre(self) -> FloatArray:

@@ -29,17 +29,11 @@ _LEAST_CONTRAST = 0.4
 
 @dataclass(frozen=True)
 class Lens:
-    """Distortion of the image.
+    """Distortion of the image."""
 
-    Attributes:
-        middle: Centre of the image (x, y) [px].
-        radius: Half its diagonal [px].
-        bend: Distortion coefficient; negative for barrel distortion.
-    """
-
-    middle: tuple[float, float]
-    radius: float
-    bend: float
+    middle: tuple[float, float]  # Centre of the image (x, y) [px].
+    radius: float  # Half its diagonal [px].
+    bend: float  # Distortion coefficient; negative for barrel distortion.
 
     def straighten(self, px: FloatArray) -> FloatArray:
         """Undistorts (n, 2) pixels."""
@@ -55,14 +49,10 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Pose of a board in an image.
+    """Pose of a board in an image."""
 
-    Attributes:
-        lens: Distortion.
-        straight_from_board: (3, 3) homography from the board [squares] to undistorted points.
-    """
-
-    lens: Lens
+    lens: Lens  # Distortion.
+    # (3, 3) homography from the board [squares] to undistorted points.
     straight_from_board: FloatArray
 
     def to_px(self, places: FloatArray) -> FloatArray:

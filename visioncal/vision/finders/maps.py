@@ -23,15 +23,10 @@ _RADIAL_CORNERS, _RADIAL_STEPS, _RADIAL_STEADY, _LEAST_RADIAL = 8, 6, 0.01, 0.1
 
 @dataclass(frozen=True, eq=False)
 class OpticalAxis:
-    """Approximate axis of a lens's radial distortion.
+    """Approximate axis of a lens's radial distortion."""
 
-    Attributes:
-        px: (2,) centre of the image, near which it is [px].
-        reach_px: Half the image's diagonal [px].
-    """
-
-    px: FloatArray
-    reach_px: float
+    px: FloatArray  # (2,) centre of the image, near which it is [px].
+    reach_px: float  # Half the image's diagonal [px].
 
     @classmethod
     def of(cls, shape: tuple[int, ...], origin: FloatArray | IntArray) -> Self:

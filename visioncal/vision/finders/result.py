@@ -7,20 +7,15 @@ from visioncal.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class DetectedCorners:
-    """Detected corners.
+    """Detected corners."""
 
-    Attributes:
-        ids: (n,) corner ids, ascending.
-        px: (n, 2) positions [px].
-        weights: (n,) accuracy relative to the usual one, as the ratio of standard deviations; None
-            if all are usual.
-        blur_px: Edge width as a Gaussian's sigma, in the direction of the wider edges [px]; None if
-            not measured.
-    """
-
-    ids: IntArray
-    px: FloatArray
+    ids: IntArray  # (n,) corner ids, ascending.
+    px: FloatArray  # (n, 2) positions [px].
+    # (n,) accuracy relative to the usual one, as the ratio of standard deviations; None if all are
+    # usual.
     weights: FloatArray | None = None
+    # Edge width as a Gaussian's sigma, in the direction of the wider edges [px]; None if not
+    # measured.
     blur_px: float | None = None
 
 

@@ -118,51 +118,39 @@ _MISFIT_TIMES, _MISFIT_MORE, _MOST_MISFIT = 3.0, 0.05, 0.6
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Corners refined by the template.
+    """Corners refined by the template."""
 
-    Attributes:
-        px: (n, 2) positions; the detector's where the fit failed [px].
-        sigma_px: (n,) standard deviation of a coordinate, from the residuals; too large where the
-            image has content that is not in the template; NaN where the fit failed [px].
-        reasons: (n,) why the fit of a corner failed, in words; empty if it succeeded.
-        blur_px: (2,) edge widths between neighbours along x and along y, as sigmas; NaN if no
-            corner was fitted [px].
-    """
-
-    px: FloatArray
+    px: FloatArray  # (n, 2) positions; the detector's where the fit failed [px].
+    # (n,) standard deviation of a coordinate, from the residuals; too large where the image has
+    # content that is not in the template; NaN where the fit failed [px].
     sigma_px: FloatArray
+    # (n,) why the fit of a corner failed, in words; empty if it succeeded.
     reasons: tuple[str, ...]
+    # (2,) edge widths between neighbours along x and along y, as sigmas; NaN if no corner was
+    # fitted [px].
     blur_px: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Pattern:
-    """Print around n corners.
+    """Print around n corners."""
 
-    Attributes:
-        signs: (n,) colour of the squares where x y > 0: one sign for light. On a checkerboard,
-            which may be described rotated, either sign may be light; on an AprilGrid one sign
-            stands for dark.
-        inset: Margin of a light square around its marker, or of a tag around its bits [squares];
-            infinite without them.
-        half: Half-width of the patch around a corner [squares].
-        radius: Radius of the circle [squares]; 0 without one.
-        lone: (n, 2) signs of x and y on the dark square of a lone tag's corner; None where two dark
-            squares meet.
-        outside: Width of the white around a lone tag [squares].
-        clear: Distance of pixels from a marker, or from the surroundings of a lone tag's white
-            [edge widths].
-        axes: (n, 2, 2) from the board to each corner's own axes and units; None if these are the
-            board's.
-    """
-
+    # (n,) colour of the squares where x y > 0: one sign for light. On a checkerboard, which may be
+    # described rotated, either sign may be light; on an AprilGrid one sign stands for dark.
     signs: FloatArray
+    # Margin of a light square around its marker, or of a tag around its bits [squares]; infinite
+    # without them.
     inset: float
-    half: float = _HALF
-    radius: float = 0.0
+    half: float = _HALF  # Half-width of the patch around a corner [squares].
+    radius: float = 0.0  # Radius of the circle [squares]; 0 without one.
+    # (n, 2) signs of x and y on the dark square of a lone tag's corner; None where two dark squares
+    # meet.
     lone: FloatArray | None = None
-    outside: float = np.inf
+    outside: float = np.inf  # Width of the white around a lone tag [squares].
+    # Distance of pixels from a marker, or from the surroundings of a lone tag's white [edge
+    # widths].
     clear: float = _CLEAR
+    # (n, 2, 2) from the board to each corner's own axes and units; None if these are the board's.
     axes: FloatArray | None = None
 
     @classmethod
@@ -190,31 +178,19 @@ class _Pattern:
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Pixels around n corners, and the maps from there to the board.
+    """Pixels around n corners, and the maps from there to the board."""
 
-    Attributes:
-        px: (n, 2) corner positions at which the maps were made [px].
-        jacobian: (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
-        widths: (n, 2) squares per pixel, across the lines of constant x and y.
-        x: (n, h, w) x of each pixel on the board, relative to the corner [squares].
-        y: (n, h, w) y, likewise.
-        grey: (n, h, w) the smoothed image, less 128.
-        within: (n, h, w) mask of a corner's patch.
-        inside: (n, h, w) mask of pixels inside the image.
-        neighbours: (n, k) neighbours of each corner.
-        smoother: (n, 10, k) operators from neighbours' values to polynomial coefficients.
-    """
-
-    px: FloatArray
+    px: FloatArray  # (n, 2) corner positions at which the maps were made [px].
+    # (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
     jacobian: FloatArray
-    widths: FloatArray
-    x: _Float32Array
-    y: _Float32Array
-    grey: _Float32Array
-    within: Mask
-    inside: Mask
-    neighbours: IntArray
-    smoother: FloatArray
+    widths: FloatArray  # (n, 2) squares per pixel, across the lines of constant x and y.
+    x: _Float32Array  # (n, h, w) x of each pixel on the board, relative to the corner [squares].
+    y: _Float32Array  # (n, h, w) y, likewise.
+    grey: _Float32Array  # (n, h, w) the smoothed image, less 128.
+    within: Mask  # (n, h, w) mask of a corner's patch.
+    inside: Mask  # (n, h, w) mask of pixels inside the image.
+    neighbours: IntArray  # (n, k) neighbours of each corner.
+    smoother: FloatArray  # (n, 10, k) operators from neighbours' values to polynomial coefficients.
 
     @classmethod
     def cut(
@@ -304,22 +280,15 @@ class _Windows:
 
 @dataclass(frozen=True, eq=False)
 class _GaussNewtonStep:
-    """A Gauss-Newton step of n corners.
+    """A Gauss-Newton step of n corners."""
 
-    Attributes:
-        levels: (n, 2) offset, and contrast with the pattern's sign [grey levels].
-        shift: (n, 2) step of the corners [squares].
-        blur: (n, 2) step of the edge widths' logarithms, (n, 3) with the step of a circle's radius
-            [squares]; (n, 0) unless requested.
-        covariance: (n, 2, 2) of the shift, from the residuals [squares^2].
-        misfit: (n,) rms residual relative to the contrast.
-    """
-
-    levels: FloatArray
-    shift: FloatArray
+    levels: FloatArray  # (n, 2) offset, and contrast with the pattern's sign [grey levels].
+    shift: FloatArray  # (n, 2) step of the corners [squares].
+    # (n, 2) step of the edge widths' logarithms, (n, 3) with the step of a circle's radius
+    # [squares]; (n, 0) unless requested.
     blur: FloatArray
-    covariance: FloatArray
-    misfit: FloatArray
+    covariance: FloatArray  # (n, 2, 2) of the shift, from the residuals [squares^2].
+    misfit: FloatArray  # (n,) rms residual relative to the contrast.
 
     @classmethod
     def solve(cls, sums: FloatArray, *, blurs: int) -> Self:

@@ -58,25 +58,16 @@ class Page:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A page with its printed content, in mm from its top left corner, y down.
+    """A page with its printed content, in mm from its top left corner, y down."""
 
-    Attributes:
-        target: The target.
-        pattern: Its dark shapes.
-        page: The paper.
-        origin_mm: Origin of the target's frame.
-        ruler_mm: Lengths of the rulers along x and y; they start at the origin's coordinates.
-        lines: Lines of text below the board.
-        text_mm: Top left corner of the text.
-    """
-
-    target: Target
-    pattern: Pattern
-    page: Page
-    origin_mm: tuple[float, float]
+    target: Target  # The target.
+    pattern: Pattern  # Its dark shapes.
+    page: Page  # The paper.
+    origin_mm: tuple[float, float]  # Origin of the target's frame.
+    # Lengths of the rulers along x and y; they start at the origin's coordinates.
     ruler_mm: tuple[float, float]
-    lines: tuple[str, ...]
-    text_mm: tuple[float, float]
+    lines: tuple[str, ...]  # Lines of text below the board.
+    text_mm: tuple[float, float]  # Top left corner of the text.
 
 
 @dataclass(frozen=True)

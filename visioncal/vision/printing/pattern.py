@@ -17,19 +17,15 @@ _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Printed shapes of a target.
+    """Printed shapes of a target."""
 
-    Attributes:
-        loops: Closed outlines, (n, 2) each, in the target's frame [m]; the last point connects to
-            the first. Dark is the area with winding number one; a hole's outline has the opposite
-            direction. Two outlines share at most a point, so that renderers show no seams.
-        box: Left, top, right and bottom of the print in the target's frame [m].
-        quiet_m: Width of the quiet zone around the print [m].
-    """
-
+    # Closed outlines, (n, 2) each, in the target's frame [m]; the last point connects to the first.
+    # Dark is the area with winding number one; a hole's outline has the opposite direction. Two
+    # outlines share at most a point, so that renderers show no seams.
     loops: tuple[FloatArray, ...]
+    # Left, top, right and bottom of the print in the target's frame [m].
     box: tuple[float, float, float, float]
-    quiet_m: float
+    quiet_m: float  # Width of the quiet zone around the print [m].
 
 
 def draw_pattern(target: Target) -> Pattern:

@@ -31,38 +31,24 @@ _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 @dataclass(frozen=True)
 class BoardRequest:
-    """Requirements of a board; None and empty texts are chosen automatically.
+    """Requirements of a board; None and empty texts are chosen automatically."""
 
-    Attributes:
-        kind: Kind of target.
-        columns: Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or
-            circles along x.
-        rows: Likewise along y.
-        square_mm: Side of a square, or of the marker for a single marker and an AprilGrid [mm].
-        marker_mm: Side of the markers in a ChArUco board [mm].
-        dictionary: ArUco dictionary by OpenCV's name.
-        legacy: Whether a ChArUco board has OpenCV's layout before 4.6.
-        marker_id: Id of a single marker; the smallest one of an AprilGrid.
-        name: Name of the target.
-        spacing: Gap between the tags of an AprilGrid, as a share of their side.
-        border: Number of dark modules around their bits.
-        diameter_mm: Diameter of circles [mm].
-        asymmetric: Whether every second row of circles is shifted.
-    """
-
-    kind: TargetKind
+    kind: TargetKind  # Kind of target.
+    # Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
+    # x.
     columns: int | None = None
-    rows: int | None = None
+    rows: int | None = None  # Likewise along y.
+    # Side of a square, or of the marker for a single marker and an AprilGrid [mm].
     square_mm: float | None = None
-    marker_mm: float | None = None
-    dictionary: str = ""
-    legacy: bool = False
-    marker_id: int | None = None
-    name: str = ""
-    spacing: float | None = None
-    border: int | None = None
-    diameter_mm: float | None = None
-    asymmetric: bool = False
+    marker_mm: float | None = None  # Side of the markers in a ChArUco board [mm].
+    dictionary: str = ""  # ArUco dictionary by OpenCV's name.
+    legacy: bool = False  # Whether a ChArUco board has OpenCV's layout before 4.6.
+    marker_id: int | None = None  # Id of a single marker; the smallest one of an AprilGrid.
+    name: str = ""  # Name of the target.
+    spacing: float | None = None  # Gap between the tags of an AprilGrid, as a share of their side.
+    border: int | None = None  # Number of dark modules around their bits.
+    diameter_mm: float | None = None  # Diameter of circles [mm].
+    asymmetric: bool = False  # Whether every second row of circles is shifted.
 
 
 def side_metres(option: str, side_mm: float) -> float:
