@@ -168,8 +168,9 @@ def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path)
     assert rotation.any() == options.poses
     again = visioncal.calibrate(visioncal.Session.load(out / "recording.rrd"))
     again.save(tmp_path / "again.json")
-    repeated = json.loads((tmp_path / "again.json").read_text())
-    assert repeated | {"created": ""} == document | {"created": ""}
+    # What is calibrated by a call has no folder for its commands.
+    repeated = (tmp_path / "again.json").read_text().replace("OUT", str(out))
+    assert json.loads(repeated) | {"created": ""} == document | {"created": ""}
     assert "child_frame_id: instrument" in command("export", out, "--to", "ros").out
     assert "holds the camera, and" in command("export", out, "--to", "easy-handeye2").err
     report = (out / "report.html").read_text()
@@ -282,7 +283,7 @@ def test_motion_that_tells_too_little_is_refused():
     with pytest.raises(DegenerateError, match="3 usable stops of the robot; at least 4"):
         known_of(session_of(tracked(replace(POINT, stops=3))))
     still = tracked(POINT, joints=np.repeat(shop.joints[:1], 12, axis=0))
-    with pytest.raises(DegenerateError, match="1 usable stop of the robot"):
+    with pytest.raises(DegenerateError, match="12 used views are all from one pose of the robot"):
         known_of(session_of(still, joints=False, poses=True))
     # Joint 1 alone: the point goes round in a circle. Where a search without an answer ends is up
     # to rounding, and with it which of the directions is named.

@@ -33,6 +33,7 @@ class _Row:
     # other measurements such as loads and temperatures.
     alike: Hashable
     stamp_s: float | None  # When it was taken; None where that is not known.
+    stop: int | None  # The stop that it states; None where it states none.
     # State of the robots and what was read, in units of what rows of one stop may differ by.
     numbers: FloatArray
     read: int  # How many of these, at the end, were read.
@@ -41,12 +42,14 @@ class _Row:
     def is_repeated_by(self, other: "_Row") -> bool:
         """Whether another row, of nearly the same numbers, is a copy of this one.
 
-        Corners and exact numbers are never read twice; others are, at another time.
+        Corners and exact numbers are never read twice; others are, at another time or stop.
         """
-        if self.is_image or self.stamp_s is None or self.stamp_s == other.stamp_s:
+        stated = ((self.stamp_s, other.stamp_s), (self.stop, other.stop))
+        is_apart = any(None not in pair and pair[0] != pair[1] for pair in stated)
+        if self.is_image or not is_apart:
             return True
         read = np.s_[len(self.numbers) - self.read :]
-        return other.stamp_s is None or np.array_equal(self.numbers[read], other.numbers[read])
+        return np.array_equal(self.numbers[read], other.numbers[read])
 
 
 def without_repeats(seen: T) -> T:
@@ -108,6 +111,7 @@ def _rows(session: Session, corners: Mapping[int, Corners]) -> Iterator[_Row]:
                 None if known else view.stamp_s,
             ),
             view.stamp_s,
+            view.stop,
             np.concatenate([*states, reading]),
             len(reading),
             bool(ids),
@@ -165,10 +169,10 @@ def _finding(repeated: Mapping[int, int]) -> Finding:
         "repeated_views",
         f"{views} {listed(copies)} {repeat} {listed(originals)}: what was read is the same, or "
         f"differs by less than {APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without "
-        "a time of its own. They count once.",
+        "a time or a stop of its own. They count once.",
         Remedy(
             f"In views.csv, delete the {rows} of {views.lower()} {listed(copies)}; or, if they "
-            f"were read anew, write {their} times into stamp_s."
+            f"were read anew, write {their} times into stamp_s, or {their} stops into stop."
         ),
         tuple(copies),
         until_mm=LEAST_NEED_MM,
