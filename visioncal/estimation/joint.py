@@ -164,11 +164,12 @@ def diverging() -> Iterator[None]:
             yield
     except np.linalg.LinAlgError as error:
         raise ConvergenceError(
-            "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
-            "runs away. The likeliest cause is poses of other views than the images.",
+            "hand-eye: the fit diverges: no frames explain both the robot's poses and what the "
+            "cameras saw. Likely causes are poses of other views than the images, or a lens or a "
+            "board that is not the stated one.",
             culprits=["poses", "images"],
-            next_step="Look at which image belongs to which pose; visioncal convert --guess tries "
-            "other readings of the poses.",
+            next_step="Look at which image belongs to which pose (visioncal convert --guess tries "
+            "other readings of the poses), and calibrate each camera alone.",
         ) from error
 
 
