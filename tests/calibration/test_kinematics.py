@@ -11,9 +11,11 @@ from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
 import visioncal
 from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.stages.kinematics import choose_level, findings
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
+from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.workspace import postures
@@ -184,3 +186,24 @@ def test_a_level_that_explains_too_little_is_told():
     right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
     assert right.robot_arm.kinematics.level == "nominal"
     assert any("The arm stays as stated" in reason for reason in right.verdict.reasons)
+
+
+def test_a_level_whose_fit_diverges_is_none_and_is_said():
+    """The largest errors that a number holds: their squares are none."""
+    known = calibrated(simulate(replace(WRONG_LINKS, views=14, seed=0)))
+    arm, fit = known.robot_arm, known.cell_fit.inlier_fit.fit
+    assert arm.joints_rad is not None
+    nominal = ArmModel.of(known.robot, arm.joints_rad, arm.reported)
+    bases = {
+        name: nominal.columns(name, arm.joints_rad, arm.loads)
+        for name in ("offsets", "links", "eccentricity")
+    }
+    problem = arm.without_errors(known.cell_fit.inlier_problem)
+    state = State(fit.state.edges, problem.start_values)
+    sound = choose_level(problem, state, ROBOT, bases, "auto")
+    assert (sound.level, sound.diverged) == ("geometry", ())
+    bases["offsets"] = 1e200 * bases["offsets"]
+    found = choose_level(problem, state, ROBOT, bases, "auto")
+    assert (found.level, found.diverged) == ("geometry", ("offsets",))
+    assert found.fits["geometry"].gain == sound.fits["geometry"].gain
+    assert any("offsets was not compared" in words for words in findings(found))
