@@ -235,7 +235,7 @@ def test_measured_distances_of_another_scale_are_named(mount, scale):
         assert not named
         return
     assert verdict.status != "good"
-    assert verdict.ranked[0] is named[0]
+    assert verdict.causes[0] is named[0]
     # A scale's sigma is a hundredth of a percent there; the factor has five digits.
     factor = float(named[0].do.words.split()[-1].rstrip("."))
     assert factor == pytest.approx(scale, abs=4e-4)

@@ -312,7 +312,7 @@ def test_kelvin_is_no_celsius(learnt, tmp_path):
     kelvin = [",".join([row.split(",")[0], *[repr(float(n) + 273.15) for n in row.split(",")[1:]]])
               for row in rows]  # fmt: skip
     path.write_text("\n".join([head, *kelvin]) + "\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"heat\.csv, column temp1_c: .*looks like kelvin"):
+    with pytest.raises(DataError, match=r"heat\.csv, line 2, column temp1_c: .*looks like kelvin"):
         Session.load(tmp_path / "warm")
 
 

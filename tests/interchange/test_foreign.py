@@ -360,7 +360,7 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
 @pytest.mark.parametrize("count", [170, slow(510)])
 def test_damaged_recordings_end_in_a_clear_message_or_a_session(tmp_path, count):
     """In bounded memory; `foreign_damage.py` lists the kinds of damage."""
-    script = Path(__file__).parents[1] / "support" / "foreign_damage.py"
+    script = Path(__file__).parents[1] / "support" / "fuzz" / "foreign_damage.py"
     done = subprocess.run(
         [sys.executable, "-W", "error", script, tmp_path, str(count)],
         check=False,

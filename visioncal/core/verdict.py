@@ -213,10 +213,10 @@ class Verdict:
         causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
         costs = [finding for kind in _SIZES for finding in self.findings if finding.kind == kind]
         missing = [finding for finding in self.findings if finding.kind in NOT_USABLE]
-        # Also where there are doubts, but not where the result is of no use.
+        # Behind a likely cause, and not where the result is of no use.
         of_use = [] if self.status == "bad" else self.findings
         to_correct = [finding for finding in of_use if finding.kind == CALIBRATED_ARM]
-        ordered = [*missing, *to_correct, *causes[:1], *costs[:1], *causes[1:], *self.findings]
+        ordered = [*missing, *causes[:1], *to_correct, *costs[:1], *causes[1:], *self.findings]
         return tuple({id(finding): finding for finding in ordered}.values())
 
     @property

@@ -62,7 +62,9 @@ class Solution:
 
 def starting_noise(problem: Problem) -> Noise:
     """Initial noise: robots from above, sensors as stated."""
-    sensors = int(problem.observations.sensors.max(initial=-1)) + 1
+    # Some sensors may have no observations among these.
+    seen = int(problem.observations.sensors.max(initial=-1)) + 1
+    sensors = max(seen, len(problem.least_levels))
     return Noise(np.full((len(problem.robots), 2), START_SIGMA), np.ones(sensors))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.stages.observed import Observed
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
 from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
@@ -57,7 +58,11 @@ def without_repeats(seen: T) -> T:
 
     The corners are of all cameras, and no pose is known yet.
     """
-    repeated = repeated_rows(seen.timed, seen.corners)
+    try:
+        repeated = repeated_rows(seen.timed, seen.corners)
+    except DataError:
+        # Where the robot is cannot be told yet, and whether it is where it was neither.
+        return seen
     if not repeated:
         return seen
     for frame, look in seen.cameras.items():
