@@ -28,9 +28,9 @@ MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
 NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
 # A part of the image without corners: few robots fill all of a fixed camera's image, and picks are
 # where the views looked.
-EMPTY_IMAGE = "empty_image"
+EMPTY_IMAGE, REPEATED_READINGS = "empty_image", "repeated_readings"
 # Kinds of a step's warnings that are no doubts about the result.
-NO_DOUBTS = (*NOT_USABLE, EMPTY_IMAGE)
+NO_DOUBTS = (*NOT_USABLE, EMPTY_IMAGE, REPEATED_READINGS)
 # Kinds with a special rank among causes of at least the last probability.
 EXCHANGED, ARM_ERRORS, UNEXPLAINED, _SURE = "exchanged_views", "arm_errors", "unexplained", 0.99
 # Kinds of findings that state the size of errors, the most important first.

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
-from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
+from visioncal.core.verdict import LEAST_NEED_MM, REPEATED_READINGS, Finding, Remedy
 from visioncal.session import Observation, Session, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
 from visioncal.session.observations import APART_DEG, APART_MM, APART_RAD
@@ -68,8 +68,18 @@ def without_repeats(seen: T) -> T:
     for frame, look in seen.cameras.items():
         unique = {view: px for view, px in look.corners.items() if view not in repeated}
         seen = seen.with_camera(frame, replace(look, corners=unique))
+    views = {view.number: view for view in seen.session.views}
+
+    def is_copy(number: int) -> bool:
+        one, other = (_read(views[at], seen.corners.get(at)) for at in (number, repeated[number]))
+        return one is None or other is None or np.array_equal(one[1], other[1])
+
+    # Readings that differ may be of another time that is not stated, and some of them are equal by
+    # the instrument's resolution.
+    copies = sum(map(is_copy, repeated))
+    kind = "repeated_views" if 2 * copies > len(repeated) else REPEATED_READINGS
     repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
-    return replace(seen, repeats=repeats).noting((), (_finding(repeated),))
+    return replace(seen, repeats=repeats).noting((), (_finding(kind, repeated),))
 
 
 def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int, int]:
@@ -165,13 +175,13 @@ def _others(observation: Observation) -> tuple[tuple[str, float], ...]:
     )
 
 
-def _finding(repeated: Mapping[int, int]) -> Finding:
+def _finding(kind: str, repeated: Mapping[int, int]) -> Finding:
     copies, originals = list(repeated), list(dict.fromkeys(repeated.values()))
     one = len(repeated) == 1
     rows, repeat = ("row", "repeats") if one else ("rows", "repeat")
     views, their = ("View", "its") if one else ("Views", "their")
     return Finding(
-        "repeated_views",
+        kind,
         f"{views} {listed(copies)} {repeat} {listed(originals)}: what was read is the same, or "
         f"differs by less than {APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without "
         "a time or a stop of its own. They count once.",
