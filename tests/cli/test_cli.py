@@ -238,6 +238,8 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
         done = visioncal("demo", "--views", 8)
         assert done.status == 0, done.err
     assert "against the truth" in done.out
+    # What to do next can be typed as it is printed.
+    assert "visioncal export demo/result --to ur" in done.out
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
 
 

@@ -76,7 +76,7 @@ def demo_command(
                 cell, session, lambda share: progress("render", round(share * views), views)
             )
         loaded = Session.load(session)
-        done = run(loaded, progress=progress)
+        done = run(loaded, progress=progress).with_paths(session, result)
         progress("write", 0, 1)
         written = write_outputs(result, loaded, done)
     print_summary(done.calibration, verbose=True)

@@ -31,8 +31,7 @@ def export_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="An output folder, its calibration.json or dynamics.json, a "
-            "recording (.rrd), or "
+            help="An output folder, its calibration.json or dynamics.json, a recording (.rrd), or "
             "a file of frames."
         ),
     ],

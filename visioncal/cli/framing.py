@@ -210,7 +210,8 @@ class FrameLocation:
             )
         result = None if path is None or file is not None else load_result(path)
         folder = None if path is None or file is not None else _folder(path)
-        frames = cls(name, None, result, folder, file)._frames()
+        place = cls(name, None, result, folder, file)
+        frames = place._frames()
         lead = transform_name(kind, "x").removesuffix("x")
         there = [known for known in frames if known.startswith(lead)]
         found = [known for known in there if known in (name, f"{lead}{name}")]
@@ -221,7 +222,7 @@ class FrameLocation:
                 next_step=did_you_mean(f"{lead}{name}", there),
             )
         kept = {known: frame for known, frame in frames.items() if known not in found}
-        return cls(name, None, result, folder, file)._write(kept)
+        return place._write(kept)
 
 
 def _folder(path: Path) -> Path:

@@ -51,8 +51,7 @@ def calibrate(
         corrected: Whether targets are corrected for a calibrated arm before they are sent; else the
             verdict is about picks by the controller's own poses.
         progress: Called with the progress of long work.
-        dense: Whether to fit a board to all pixels of images that the template refuses; needs the
-            extra `dense`.
+        dense: Whether to fit a board to all pixels of images that the template refuses.
         threads: How many images are searched in parallel; one a core where None. The result is the
             same to the bit.
         corners: Corners detected before, by view; None to detect them.

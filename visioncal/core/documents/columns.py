@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.core.documents.tables import TextTable
+from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import READ_AGAIN
@@ -20,8 +20,6 @@ _NORM_TOLERANCE = 1e-3
 # another form of rotation; norms beyond the last are of angles in degrees.
 _FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
 _SHOWN_PROBLEMS = 10
-# Stricter than float(), which also accepts 1_000, nan, and digits of other scripts.
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?[0-9]*\.[0-9]+([eE][+-]?[0-9]+)?")
@@ -214,7 +212,8 @@ def as_number(cell: str) -> float:
     Raises:
         DataError: It is not one.
     """
-    value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+    # float() alone also accepts 1_000 and digits of other scripts.
+    value = float(cell) if is_number(cell) else math.nan
     if not math.isfinite(value):
         why = " (the decimal sign is a point)" if "," in cell else ""
         if _THOUSANDS.fullmatch(cell):

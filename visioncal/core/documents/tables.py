@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from visioncal.core.documents.values import MAX_VALUES, read_plain_text, too_many
+from visioncal.core.documents.values import DECIMAL, MAX_VALUES, read_plain_text, too_many
 from visioncal.core.errors import DataError
 
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.I)
+_NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
 # Other separators of str.splitlines may be inside a cell.
 _LINE_END = re.compile(r"\r\n|\r|\n")

@@ -16,6 +16,8 @@ from visioncal.core.types import FloatArray
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
+# A number as others write it; also `1.`, `.5` and `1e-3`.
+DECIMAL = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
 
 _SHOWN = 60  # characters of a value in a message
 _MOST_AXES = 8

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from visioncal.core.documents.values import (
+    DECIMAL,
     MAX_DEPTH,
     MAX_VALUES,
     matrix_from,
@@ -28,7 +29,7 @@ _CONSTANTS |= {"nan": math.nan, ".nan": math.nan}
 # programs are not so strict: 010 is ten, 1e-3 a number, and a date is text.
 _FORMS = {
     "int": r"[+-]?[0-9]{1,18}$",
-    "float": r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$",
+    "float": rf"{DECIMAL}$",
     "bool": rf"(?i:{'|'.join(map(re.escape, _CONSTANTS))})$",
 }
 
