@@ -239,7 +239,7 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
         assert done.status == 0, done.err
     assert "against the truth" in done.out
     # What to do next can be typed as it is printed.
-    assert "visioncal export demo/result --to ur" in done.out
+    assert "visioncal plan demo/session --add 5" in done.out
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
 
 
