@@ -18,6 +18,8 @@ FIRST = (12, 28, 39, 52, 63)
 OTHERS = (13, 19, 21, 34, 36, 37, 38, 40, 43, 48, 54, 56, 59, 62, 64)
 # Beyond this an error is no chance: in one cell of a million.
 SURPRISING = 5.0
+# Commands whose answer may be a bad verdict.
+SAYS_NO = ("calibrate", "verify")
 
 
 @pytest.mark.parametrize("seed", [*FIRST, *(slow(other) for other in OTHERS)])
@@ -27,7 +29,7 @@ def test_an_ordinary_cell_goes_through_all_commands(seed, tmp_path):
     assert not done.missing
     assert not done.warned
     for step in done.steps:
-        assert step.status in (0, 2) or (step.command, step.status) == ("verify", 3)
+        assert step.status in (0, 2) or (step.status == 3 and step.command in SAYS_NO)
         assert step.status != 2 or step.message
     if done.verdict == "good":
         assert done.error.sigmas < SURPRISING, done.facts

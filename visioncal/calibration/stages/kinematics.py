@@ -334,6 +334,5 @@ def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
         yield (
             f"The arm was calibrated along ({result.level}): stops left out are predicted to "
             f"{figure(result.chosen.held_out_mm)} mm, with the nominal arm to "
-            f"{figure(result.nominal.held_out_mm)} mm. The transforms go with this arm: take its "
-            "poses (calibration.base_from_flange), not the controller's."
+            f"{figure(result.nominal.held_out_mm)} mm."
         )
