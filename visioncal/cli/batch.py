@@ -49,13 +49,6 @@ def batch_command(
         Path | None,
         typer.Option(help="An earlier batch: which results changed by more than their sigmas."),
     ] = None,
-    cells: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml",
-            help="Simulate cells instead of sessions: all combinations of the values in it.",
-        ),
-    ] = None,
     level: Annotated[
         str, typer.Option(metavar="auto|hand-eye|offsets|...", help="As for calibrate.")
     ] = "auto",
@@ -87,7 +80,6 @@ def batch_command(
             need_deg=need.need_deg,
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
             against=against,
-            cells=cells,
             progress=progress,
         )
     _report(found)

@@ -22,7 +22,6 @@ WORDS = {
     "judge": "judge the result",
     "write": "write the result, report and recording",
     "batch": "calibrate the sessions",
-    "cells": "simulate the cells",
     "render": "render the images",
     "candidates": "collect possible stops",
     "information": "compute the information of each stop",

@@ -62,7 +62,6 @@ class FleetRow:
     arm_mm: float | None = None  # Standard deviation of the arm's link errors [mm].
     drift_mm: float | None = None  # Largest thermal drift of the arm [mm].
     focal_px: float | None = None  # Mean focal length [px].
-    error_mm: float | None = None  # True error of the camera's position, in a simulated cell [mm].
     seconds: float | None = None  # Duration of the calibration [s].
     has_picture: bool = False  # Whether its folder has a picture.
     has_report: bool = False  # Whether its folder has a report.
@@ -83,7 +82,9 @@ def row_of(name: str, session: str, calibration: Calibration, version: str) -> F
     size = None if calibration.camera is None else calibration.camera.camera.resolution
     matrix = None if calibration.camera is None else calibration.camera.camera.matrix
     budget, arm, drift = calibration.budget, calibration.arm_errors, calibration.thermal
-    edge = calibration.edges[camera_edge(calibration)]
+    # Of a cell without a camera, the first transform.
+    cameras = (name for name in calibration.edges if "_from_cam" in name)
+    edge = calibration.edges[next(cameras, next(iter(calibration.edges)))]
     noise = {key: value for key, value in calibration.noise.items() if math.isfinite(value)}
     return FleetRow(
         name=name,
@@ -114,49 +115,6 @@ def row_of(name: str, session: str, calibration: Calibration, version: str) -> F
         else max((point.drift_mm for point in drift.course), default=0.0),
         focal_px=None if matrix is None else float(np.mean(matrix[:2])),
     )
-
-
-def camera_edge(calibration: Calibration) -> str:
-    """Name of the camera's transform, or else of the first one."""
-    placed = (edge for edge in calibration.edges if edge.rpartition("_from_")[2].startswith("cam"))
-    return next(placed, next(iter(calibration.edges)))
-
-
-@dataclass(frozen=True)
-class CellFigures:
-    """Statistics of simulated cells of one group; None where none has a result."""
-
-    name: str  # The group.
-    count: int  # Number of cells.
-    results: int  # Number with a result.
-    good: int  # Number with the verdict good.
-    radius95_mm: float | None  # Median of the predicted 95 % radius [mm].
-    sigma_mm: float | None  # Median of the camera position's sigma [mm].
-    error_mm: float | None  # 95 % quantile of the camera position's true error [mm].
-
-
-def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
-    """Statistics of simulated cells by group."""
-    groups: dict[str, list[FleetRow]] = defaultdict(list)
-    for item in sorted(rows, key=lambda row: row.name):
-        groups[item.group].append(item)
-
-    def quantile(members: Sequence[FleetRow], field: str, percent: float) -> float | None:
-        values = [value for row in members if (value := getattr(row, field)) is not None]
-        return float(np.percentile(values, percent)) if values else None
-
-    return [
-        CellFigures(
-            name,
-            len(members),
-            sum(row.state != "failed" for row in members),
-            sum(row.verdict == "good" for row in members),
-            quantile(members, "radius95_mm", 50.0),
-            quantile(members, "sigma_mm", 50.0),
-            quantile(members, "error_mm", 95.0),
-        )
-        for name, members in groups.items()
-    ]
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,22 @@
-"""Calibrates many sessions, and writes their results into a table and a page.
-
-Alternatively it simulates cells: all combinations of given parameters.
-"""
+"""Calibrates many sessions, and writes their results into a table and a page."""
 
 import io
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-
-import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
-from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
 from visioncal.interchange.batch.executors import LOST, rows_of
 from visioncal.interchange.batch.work import Job, Options, jobs_of, kept_row
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.results import Calibration
-from visioncal.results.fleet import FleetRow, camera_edge, cell_figures, with_changes, with_outliers
+from visioncal.results.fleet import FleetRow, with_changes, with_outliers
 
-TABLE, PAGE, _CELLS = "batch.parquet", "index.html", "cells"
+TABLE, PAGE = "batch.parquet", "index.html"
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class Batch:
 
 @typed
 def batch(
-    sessions: Iterable[Path | str] | Path | str = (),
+    sessions: Iterable[Path | str] | Path | str,
     out: Path | str = "out",
     *,
     workers: int | None = None,
@@ -60,7 +54,6 @@ def batch(
     need_deg: float | None = None,
     without: Iterable[str] = (),
     against: Path | str | None = None,
-    cells: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Batch:
     """Calibrates many sessions, each into a folder of its own.
@@ -80,8 +73,6 @@ def batch(
         need_deg: As in `calibrate`.
         without: `report.html` or `recording.rrd`, to leave out.
         against: The folder of an earlier batch to compare with.
-        cells: A file of cells to simulate instead of sessions; see `write_cells`. Their sessions go
-            into `cells` in the folder.
         progress: Called after each session.
 
     Returns:
@@ -94,13 +85,6 @@ def batch(
     folder = Path(out)
     given = [sessions] if isinstance(sessions, Path | str) else list(sessions)
     options = Options(level, need_mm, need_deg, tuple(sorted(without)))
-    if cells is not None:
-        if given:
-            raise DataError("cells are simulated in the place of sessions.", culprits=["--cells"])
-        # Imported late, since sessions need no simulation.
-        from visioncal.interchange.batch.cells import write_cells
-
-        given = [*write_cells(Path(cells), folder / _CELLS, progress)]
     jobs = jobs_of(given, folder, options)
     if against is not None and not Path(against).is_dir():
         raise DataError(f"{against} is no folder of results.", culprits=["--against"])
@@ -122,15 +106,11 @@ def batch(
             lambda name: _result(earlier / name),
             lambda name: None if name in failed else _result(folder / name),
         )
-    if cells is not None:
-        rows = [_with_error(row, folder) for row in rows]
     results = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
     write_atomically(results.table, _table(results.rows))
     from visioncal.present.report.fleet import fleet_page
 
-    write_atomically(
-        results.page, fleet_page(results.rows, cell_figures(rows) if cells is not None else ())
-    )
+    write_atomically(results.page, fleet_page(results.rows))
     return results
 
 
@@ -144,17 +124,6 @@ def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> It
         else:
             yield row
     yield from rows_of(waiting, workers, scheduler)
-
-
-def _with_error(row: FleetRow, folder: Path) -> FleetRow:
-    calibration = _result(folder / row.name)
-    if row.state == "failed" or calibration is None:
-        return row
-    from visioncal.simulation import read_truth
-
-    name = camera_edge(calibration)
-    truth = np.asarray(read_truth(row.session).transforms[name])
-    return replace(row, error_mm=pose_difference(calibration.edges[name].matrix, truth)[0])
 
 
 def _result(folder: Path) -> Calibration | None:

@@ -8,7 +8,7 @@ from itertools import groupby
 from visioncal.core.number_format import significant
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
-from visioncal.results.fleet import FEWEST, CellFigures, FleetRow
+from visioncal.results.fleet import FEWEST, FleetRow
 
 _ICONS = {"good": "good", "check": "check"}
 # Largest number of outstanding sessions listed per group.
@@ -26,7 +26,7 @@ class _Odd:
     more: int
 
 
-def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> str:
+def fleet_page(rows: Sequence[FleetRow]) -> str:
     """Renders the page as HTML text, with links relative to its folder; worst sessions first."""
     states = Counter(row.verdict or row.state for row in rows)
     return template("fleet.html.j2").render(
@@ -35,7 +35,6 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
         subtitle="",
         notes=(),
         rows=rows,
-        cells=_cell_table(cells),
         odd=list(_odd(rows)),
         is_comparable=any(
             count >= FEWEST
@@ -51,24 +50,6 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
         icon_of=lambda value: _ICONS.get(value.verdict, "bad"),
         figure=_figure,
     )
-
-
-def _cell_table(cells: Sequence[CellFigures]) -> Table:
-    """Summaries of simulated sessions by cell."""
-    titles = (
-        "cell",
-        "results",
-        "good",
-        "95 % of picks within [mm]",
-        "sigma of the camera [mm]",
-        "95 % of cameras off by [mm]",
-    )
-    rows = (
-        (cell.name, f"{cell.results} of {cell.count}", str(cell.good),
-         *map(_figure, (cell.radius95_mm, cell.sigma_mm, cell.error_mm)))
-        for cell in cells
-    )  # fmt: skip
-    return Table.of(titles, rows)
 
 
 def _figure(value: float | None) -> str:
