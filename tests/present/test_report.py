@@ -40,6 +40,7 @@ from visioncal.results.views import worst_view
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.vision.finders.imaging import decode_image
 
 
 @pytest.fixture(scope="module")
@@ -348,8 +349,7 @@ def test_pictures_lie_as_their_pixels_are_stored() -> None:
     shown = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     assert shown.shape[:2] == (64, 40), "the tag is not read: this test tests nothing"
-    picture = thumbnail(turned, None, "", 0, 1)
-    assert picture is not None
+    picture = thumbnail(decode_image(turned, colour=True), None, "", 0, 1)
     assert (picture.width, picture.height) == (64, 40)
 
 
@@ -357,9 +357,7 @@ def test_pictures_lie_as_their_pixels_are_stored() -> None:
 def test_pictures_of_one_row_are_drawn(size: tuple[int, int]) -> None:
     """Reduced by their width they have no row left, and a JPEG has a longest side."""
     width, height = size
-    encoded = cv2.imencode(".png", np.full((height, width), 200, np.uint8))[1].tobytes()
-    picture = thumbnail(encoded, None, "", 0, 1)
-    assert picture is not None
+    picture = thumbnail(np.full((height, width, 3), 200, np.uint8), None, "", 0, 1)
     assert (picture.width, picture.height) == size
     assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
 

@@ -17,7 +17,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Camera
 from visioncal.interchange.exports import Selection, document
 from visioncal.interchange.exports.registry import EXPORT_FORMATS, select
-from visioncal.present.report.certificate import CertificateEntries, write_certificate
+from visioncal.present.report.page import write_certificate
 from visioncal.results import CameraResult
 from visioncal.results.lens import sensor_tilt
 from visioncal.simulation import CellOptions, simulate
@@ -94,7 +94,7 @@ def test_a_tilted_sensor_is_a_condition_with_its_size(cell, result):
 
 def test_every_output_carries_it_but_where_no_lens_counts(result, tmp_path):
     (condition,) = result.conditions
-    write_certificate(tmp_path / "page.html", result, None, CertificateEntries())
+    write_certificate(tmp_path / "page.html", result, None, {})
     assert "own lens" in (tmp_path / "page.html").read_text()
     assert "own lens" in result._repr_html_()
     for name in ("ur", "kuka", "urdf", "easy-handeye", "zivid"):

@@ -66,7 +66,9 @@ def show_command(
     if not viewer:
         given_view = {"--web": web or None, "--view": view}
         refuse_given(given_view, "they are for --viewer", "Give that, too, or leave it out.")
-        _write_page(result, out, None if not certificate else (operator, serial or []))
+        signed = {"operator": operator} if operator else {}
+        signed |= dict(map(_serial_number, serial or ()))
+        _write_page(result, out, signed if certificate else None)
         return
     if web and view is not None:
         raise typer.BadParameter("--view goes without --web: a browser opens at the first view.")
@@ -88,21 +90,17 @@ def show_command(
     review_web(file, opened)
 
 
-def _write_page(result: Path, out: Path | None, signed: tuple[str, list[str]] | None) -> None:
-    """Writes the report, or the certificate with its operator and serial numbers."""
+def _write_page(result: Path, out: Path | None, signed: dict[str, str] | None) -> None:
+    """Writes the report, or the certificate with what a person adds to it."""
+    # Imported late, so that --help stays fast.
     from visioncal.interchange.result_files import load_stored
+    from visioncal.present.report.page import write_certificate, write_report
 
     stored = load_stored(result)
     if signed is not None:
-        from visioncal.present.report.certificate import CertificateEntries, write_certificate
-
         out = out or Path("certificate.html")
-        entries = CertificateEntries(signed[0], dict(map(_pair, signed[1])))
-        write_certificate(out, stored.calibration, stored.session, entries)
+        write_certificate(out, stored.calibration, stored.session, signed)
     else:
-        # Imported late, so that --help stays fast.
-        from visioncal.present.report import write_report
-
         out = out or Path("report.html")
         write_report(
             out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
@@ -113,14 +111,14 @@ def _write_page(result: Path, out: Path | None, signed: tuple[str, list[str]] | 
     say(f"wrote {out}")
 
 
-def _pair(text: str) -> tuple[str, str]:
+def _serial_number(text: str) -> tuple[str, str]:
     what, sign, number = text.partition("=")
     if not sign or not what:
         raise DataError(
             f"--serial is {text!r}; what it is of and the number are needed, as camera=1234.",
             culprits=["--serial"],
         )
-    return what, number
+    return f"serial number, {what}", number
 
 
 def _row(file: Path, view: int | None) -> int | None:

@@ -11,8 +11,6 @@ from visioncal.results.picking import select_matching
 from visioncal.results.result import Calibration
 from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
 
-# Former name of a whole cell's result.
-
 __all__ = [
     "HELD_BACK",
     "Calibration",

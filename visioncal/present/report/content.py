@@ -22,6 +22,7 @@ from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import ClockResult, PointResult, TouchTest
+from visioncal.session import Session
 from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
 
@@ -155,8 +156,8 @@ def need_facts(need: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
     return tuple(facts)
 
 
-def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
-    """Method: views, solver, models and clocks."""
+def method_facts(calibration: Calibration, session: Session | None = None) -> tuple[Fact, ...]:
+    """Method: views, solver, models, boards of the session, and clocks."""
     facts = [views_used(calibration)]
     if calibration.cell is None:
         facts.insert(0, Fact("mount", calibration.mount, _MOUNTS[calibration.mount]))
@@ -174,7 +175,11 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
     for name, camera in result_parts.cameras(calibration).items():
         width, height = camera.camera.resolution
         size = f"{camera.camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"
-        facts.append(Fact(name or "camera", size))
+        called = session.camera_name if session is not None and not name else ""
+        facts.append(Fact(name or "camera", size, called))
+    for name, board in ({} if session is None else session.boards).items():
+        squares = f"{board.columns} x {board.rows}, {1e3 * board.square_m:g} mm"
+        facts.append(Fact(f"board{of(name)}", board.name, squares if board.columns else ""))
     if calibration.instrument is not None:
         read = f"it read {calibration.instrument.reads}"
         facts.append(Fact("instrument", calibration.instrument.words, read))

@@ -1,7 +1,6 @@
-"""Composes and writes the report."""
+"""Composes and writes the report, and its selection to print and sign: the certificate."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -15,10 +14,11 @@ from visioncal.present import advice, facts, result_parts
 from visioncal.present.advice import named
 from visioncal.present.report import content, network
 from visioncal.present.report.templates import template
-from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
+from visioncal.present.report.thumbnails import Thumbnail, thumbnail
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
+from visioncal.vision.finders.imaging import decode_image
 
 _MAX_REJECTED_PICTURES = 4
 # Grey level in place of a missing image.
@@ -59,118 +59,125 @@ def render(
     review: str = "",
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
-    cell, suspects = calibration.cell, advice.suspects(calibration)
-    subject = calibration.mount if cell is None else network.kinds(calibration.tree)
+    suspects = advice.suspects(calibration)
     return template("report.html.j2").render(
-        kind="Calibration report",
-        name=calibration.session_name,
-        subtitle=f"{subject} \N{MIDDLE DOT} {facts.readable_time(calibration.created)}",
+        **_head("Calibration report", calibration, session),
         notes=[note] if note else [],
-        judged=calibration.verdict,
         steps=calibration.next_steps,
-        key_figures=content.key_figures(calibration),
-        provenance={
-            "session": calibration.session_name,
-            "sha256": calibration.session_sha256,
-            "created": calibration.created,
-        },
-        calibration=calibration,
-        cell=cell,
-        session=session,
         # Coverage and joint plots are for one camera, one board and one robot.
-        evidence=evidence if cell is None else (),
+        evidence=evidence if calibration.cell is None else (),
         review=f"{review} --view" if review else "",
         suspects=suspects,
         outlying=advice.outlying_views(suspects),
         observed="probe" if calibration.mount == "instrument" else "target",
-        **_pictures(calibration, session, evidence),
+        **_pictures(calibration, session, {view.view: view for view in evidence}),
     )
 
 
-def _pictures(
-    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
-) -> dict[str, object]:
-    seen = {view.view: view for view in evidence}
-    views = calibration.views
-    extremes = _extremes(views, seen)
-    # One magnification for all pictures, so that they can be compared.
-    shown = [seen[view.view] for _, view in extremes]
-    magnify = magnification(shown, result_parts.image_width(calibration) or 0)
-    pictures = None if session is None else _Pictures(session, seen)
+def write_certificate(
+    path: Path, calibration: Calibration, session: Session | None, signed: Mapping[str, str]
+) -> None:
+    """Writes a selection of the report that fits one sheet of A4, with room to sign.
+
+    Args:
+        path: The file; it appears whole or not at all.
+        calibration: Calibration to certify.
+        session: Session of the calibration; None if it is not at hand.
+        signed: What a person adds to it, by label, as the operator and serial numbers.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    head = _head("Certificate of calibration", calibration, session)
+    page = template("certificate.html.j2").render(**head, notes=(), steps=(), signed=signed)
+    write_atomically(path, page)
+
+
+def _head(kind: str, calibration: Calibration, session: Session | None) -> dict[str, object]:
+    """What report and certificate begin and end with."""
+    cell = calibration.cell
+    subject = calibration.mount if cell is None else network.kinds(calibration.tree)
     return {
-        "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],
-        "rejected_pictures": pictures.of_rejected(views) if pictures else [],
-        "magnify": magnify,
+        "kind": kind,
+        "name": calibration.session_name,
+        "subtitle": f"{subject} \N{MIDDLE DOT} {facts.readable_time(calibration.created)}",
+        "judged": calibration.verdict,
+        "key_figures": content.key_figures(calibration),
+        "provenance": {
+            "session": calibration.session_name,
+            "sha256": calibration.session_sha256,
+            "created": calibration.created,
+        },
+        "calibration": calibration,
+        "cell": cell,
+        "session": session,
     }
 
 
-def _extremes(
-    views: Sequence[ViewResult], seen: Mapping[int, ViewEvidence]
-) -> list[tuple[str, ViewResult]]:
-    """Captioned used views with the smallest and the largest reprojection error."""
-    candidates = [
+def _pictures(
+    calibration: Calibration, session: Session | None, seen: Mapping[int, ViewEvidence]
+) -> dict[str, object]:
+    """Used views with the smallest and the largest residuals, and the first that were not used."""
+    measured = [
         (view.rms_px, view)
-        for view in views
+        for view in calibration.views
         if view.used
         and view.rms_px is not None
         and view.view in seen
         and seen[view.view].corners is not None
     ]
-    ranked = sorted(candidates, key=lambda pair: pair[0])
-    extremes = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
-    return [
-        (f"{which} used view: {named(view)}, {significant(rms_px)} px rms", view)
+    ranked = sorted(measured, key=lambda pair: pair[0])
+    extremes = [*ranked[:1], *ranked[1:][-1:]]
+    # One magnification for all pictures, so that they can be compared.
+    shown = [seen[view.view] for _, view in extremes]
+    magnify = magnification(shown, result_parts.image_width(calibration) or 0)
+    captions = [
+        f"{which} used view: {named(view)}, {significant(rms_px)} px rms"
         for which, (rms_px, view) in zip(("Best", "Worst"), extremes, strict=False)
     ]
-
-
-@dataclass(frozen=True)
-class _Pictures:
-    """Pictures of views from the session's images."""
-
-    session: Session
-    seen: Mapping[int, ViewEvidence]
-
-    def of_used(self, captioned: Sequence[tuple[str, ViewResult]], magnify: int) -> list[Thumbnail]:
-        """Pictures with detected and predicted corners."""
-        pictures = [
-            self._of(view, caption, self.seen.get(view.view), magnify)
-            for caption, view in captioned
-        ]
-        return [picture for picture in pictures if picture is not None]
-
-    def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
-        """The first few views that were not used, with their reasons."""
-        pictures = (
-            self._of(
-                view,
-                f"View {named(view)}: {view.reason}",
-                self.seen.get(view.view) if advice.contradicts(view) else None,
-                1,
-            )
-            for view in views
-            if not view.used
+    used = (
+        _picture(session, view, caption, seen.get(view.view), magnify)
+        for caption, (_, view) in zip(captions, extremes, strict=True)
+    )
+    rejected = (
+        _picture(
+            session,
+            view,
+            f"View {named(view)}: {view.reason}",
+            seen.get(view.view) if advice.contradicts(view) else None,
+            1,
         )
-        return list(
-            islice((picture for picture in pictures if picture is not None), _MAX_REJECTED_PICTURES)
-        )
+        for view in calibration.views
+        if not view.used
+    )
+    return {
+        "used_pictures": [*filter(None, used)],
+        "rejected_pictures": [*islice(filter(None, rejected), _MAX_REJECTED_PICTURES)],
+        "magnify": magnify,
+    }
 
-    def _of(
-        self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
-    ) -> Thumbnail | None:
-        """Picture of a view; None if it has no image, as the table of views states."""
-        # Corners of an external detector are drawn on a blank image if theirs is missing.
-        shown = next((row for row in self.session.views if row.number == view.view), None)
-        if shown is None:
-            return None
-        if not shown.image or not self.session.images.exists(shown.image):
-            resolution = self.session.resolution
-            if not shown.has_corners or resolution is None:
-                return None
-            blank = np.full((resolution[1], resolution[0], 3), _PAPER, dtype=np.uint8)
-            return drawn(blank, evidence, caption, view.view, magnify)
+
+def _picture(
+    session: Session | None,
+    view: ViewResult,
+    caption: str,
+    evidence: ViewEvidence | None,
+    magnify: int,
+) -> Thumbnail | None:
+    """Picture of a view; None if it has no readable image, as the table of views states."""
+    row = next((row for row in session.views if row.number == view.view), None) if session else None
+    if session is None or row is None:
+        return None
+    if row.image and session.images.exists(row.image):
         try:
-            data = self.session.images.read(shown.image)
+            pixels = decode_image(session.images.read(row.image), colour=True)
         except DataError:
             return None
-        return thumbnail(data, evidence, caption, view.view, magnify)
+        if isinstance(pixels, str):
+            return None
+    elif row.has_corners and session.resolution is not None:
+        # Corners of an external detector are drawn on a blank image if theirs is missing.
+        pixels = np.full((*session.resolution[::-1], 3), _PAPER, dtype=np.uint8)
+    else:
+        return None
+    return thumbnail(pixels, evidence, caption, view.view, magnify)

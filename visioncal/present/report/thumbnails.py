@@ -17,16 +17,6 @@ _ROOM, _LEAST_SHARE = 1.25, 0.05
 
 
 @dataclass(frozen=True)
-class Residual:
-    """Arrow at one corner in image coordinates [px]: detected position, and tip."""
-
-    x: float
-    y: float
-    tip_x: float
-    tip_y: float
-
-
-@dataclass(frozen=True)
 class Thumbnail:
     """A picture with its overlay, in the full image's pixel coordinates."""
 
@@ -37,9 +27,9 @@ class Thumbnail:
     top: float  # Image y of the upper edge [px].
     width: float  # Width [px].
     height: float  # Height [px].
-    corners: tuple[tuple[float, float], ...] = ()  # (n, 2) detected corners [px].
-    # Arrows from detected corners towards their predictions, magnified.
-    residuals: tuple[Residual, ...] = ()
+    corners: tuple[tuple[float, ...], ...] = ()  # (n, 2) detected corners [px].
+    # (n, 4) arrows from detected corners towards their predictions, magnified: x, y of both ends.
+    residuals: tuple[tuple[float, ...], ...] = ()
 
     @property
     def mark(self) -> float:
@@ -48,54 +38,37 @@ class Thumbnail:
 
 
 def thumbnail(
-    image_bytes: bytes, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
-) -> Thumbnail | None:
+    pixels: Image, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
+) -> Thumbnail:
     """Draws one view, cropped to the target where corners were found.
 
     Args:
-        image_bytes: Encoded image.
+        pixels: (h, w, 3) the image.
         evidence: Evidence of the view, if any.
         caption: Text below it.
         view: The view's number.
         magnify: Magnification of the residuals.
-
-    Returns:
-        The picture; None if the bytes cannot be decoded.
     """
-    pixels = decode_image(image_bytes, colour=True)
-    return None if isinstance(pixels, str) else drawn(pixels, evidence, caption, view, magnify)
-
-
-def drawn(
-    pixels: Image, evidence: ViewEvidence | None, caption: str, view: int, magnify: int
-) -> Thumbnail:
-    """Draws one view on its (h, w, 3) pixels; see `thumbnail`."""
     corners = None if evidence is None else evidence.corners
     if evidence is None or corners is None or len(corners.px) == 0:
         height, width = pixels.shape[:2]
         return Thumbnail(view, caption, _jpeg_uri(pixels), -0.5, -0.5, width, height)
-    left, top, right, bottom = _around(corners.px, pixels.shape[1], pixels.shape[0])
+    px, predicted_px = corners.px, evidence.predicted_px
+    left, top, right, bottom = _around(px, pixels.shape[1], pixels.shape[0])
+    tips = np.zeros((0, 2)) if predicted_px is None else px + magnify * (predicted_px - px)
+    arrows = np.hstack([px[: len(tips)], tips])
+    corner_rows, arrow_rows = (tuple(map(tuple, xy.round(2).tolist())) for xy in (px, arrows))
+    picture = _jpeg_uri(pixels[top:bottom, left:right])
     return Thumbnail(
         view,
         caption,
-        _jpeg_uri(pixels[top:bottom, left:right]),
+        picture,
         left - 0.5,
         top - 0.5,
         right - left,
         bottom - top,
-        tuple((float(x), float(y)) for x, y in corners.px.round(2)),
-        _residuals(corners.px, evidence.predicted_px, magnify),
-    )
-
-
-def _residuals(
-    px: FloatArray, predicted_px: FloatArray | None, magnify: int
-) -> tuple[Residual, ...]:
-    if predicted_px is None:
-        return ()
-    tips = px + magnify * (predicted_px - px)
-    return tuple(
-        Residual(*(float(value) for value in row)) for row in np.hstack([px, tips]).round(2)
+        corner_rows,
+        arrow_rows,
     )
 
 
