@@ -34,7 +34,7 @@ HOMES = {
     "rerun": {"present.recording", "present.viewer"},
     "pinocchio": {"robot"},
     "matplotlib": {"vision.printing", "present.report"},
-    "jinja2": {"present.report"},
+    "jinja2": {"present.report", "present.recording"},
     "pydantic": {"core.arguments", "session"},
     "yaml": {"core.documents", "interchange.exports"},
     "typer": {"cli"},

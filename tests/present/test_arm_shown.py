@@ -184,5 +184,5 @@ def test_a_stated_arm_has_no_tab_but_a_word(sample):
     calibration = with_arm(sample, stays_stated())
     layout = blueprint(sample.session, calibration)
     assert "Arm" not in [tab.name for tab in layout.root_container.contents]
-    assert "No level was taken" in notes.figures_markdown(calibration)
+    assert "No level was taken" in notes.result_markdown("figures", calibration)
     assert ArmPicture.of(sample.session, calibration, 1.0) is None

@@ -268,8 +268,8 @@ def test_notes_cannot_load_or_link_anything(sample: Sample) -> None:
     view = sample.calibration.views[6]
     assert "](http" not in notes.view_markdown(view)
     assert r"\[it\]\(http://example\.org\)" in notes.view_markdown(view)
-    assert "| park | " in notes.solvers_markdown(sample.calibration)
-    assert "# Check before use" in notes.verdict_markdown(sample.calibration)
+    assert "| park | " in notes.result_markdown("solvers", sample.calibration)
+    assert "# Check before use" in notes.result_markdown("verdict", sample.calibration)
 
 
 def test_magnification_fits_the_residuals() -> None:

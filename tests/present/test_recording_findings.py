@@ -31,7 +31,7 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def figures(sample: Sample, calibration: Calibration) -> str:
-    return notes.figures_markdown(calibration, sample.session.boards).replace("\\", "")
+    return notes.result_markdown("figures", calibration, sample.session.boards).replace("\\", "")
 
 
 def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:

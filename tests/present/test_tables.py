@@ -10,7 +10,7 @@ from support.samples import made_up
 from visioncal.core.number_format import significant
 from visioncal.present import facts, result_parts
 from visioncal.present.recording.markdown import table_lines
-from visioncal.present.recording.notes import figures_markdown, verdict_markdown
+from visioncal.present.recording.notes import result_markdown
 from visioncal.present.report.page import render
 from visioncal.present.tables import Table, TableRow
 from visioncal.results import Moved, ViewResult
@@ -49,7 +49,7 @@ def test_page_and_recording_have_the_same_figures():
     sample = made_up()
     for calibration in (sample.calibration, CELL):
         words = Page(render(calibration, None, ())).words
-        text = figures_markdown(calibration).replace("\\", "")
+        text = result_markdown("figures", calibration).replace("\\", "")
         for fact in facts.noise_facts(calibration):
             assert f"{fact.label} {fact.value}" in words
             assert f"- {fact.label}: {fact.value}" in text
@@ -86,12 +86,12 @@ def test_frames_of_a_cell_hang_as_they_did_last():
     assert frames.matrices.keys() == CELL.cell.tree.keys() - CELL.cell.flanges.keys()
     # The frame of the cell is that of its reference.
     np.testing.assert_array_equal(frames.matrices[CELL.cell.reference], np.eye(4))
-    assert "Between stops 4 and 5." in verdict_markdown(moved).replace("\\", "")
+    assert "Between stops 4 and 5." in result_markdown("verdict", moved).replace("\\", "")
 
 
 def test_views_left_out_of_a_cell_say_who_saw_whom():
     of = {"seer": "cam_top", "seen": "target_plate"}
     views = tuple(ViewResult(name, False, "blurred", **of, stop=name) for name in (3, 4))
-    text = verdict_markdown(replace(CELL, views=views))
+    text = result_markdown("verdict", replace(CELL, views=views))
     assert "- views 3 and 4 (cam_top of target_plate): blurred" in text.replace("\\", "")
     assert "0 of 2 views used" in text

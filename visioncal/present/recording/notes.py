@@ -1,25 +1,34 @@
 """Texts and plots of a result: verdict, figures, and residuals of every view."""
 
 import math
+import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from functools import cache
 from types import MappingProxyType
+from typing import Any, Literal
 
 import rerun as rr
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import Target
-from visioncal.core.verdict import Verdict
-from visioncal.present import advice, arms, facts
-from visioncal.present.details import frame_facts, observation_table
+from visioncal.present import advice, arms, details, facts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.markdown import fact_lines, markdown, plain, table_lines
 from visioncal.present.recording.recorder import send_rows
-from visioncal.results import Calibration, Frame, ViewResult
-from visioncal.results.arm import ArmResult, ArmSections
+from visioncal.results import Calibration, ViewResult
 from visioncal.session import View
 
+_Part = Literal["verdict", "figures", "solvers", "tools", "arms"]
+_DOCUMENTS: dict[str, _Part] = {
+    paths.VERDICT: "verdict",
+    paths.FIGURES: "figures",
+    paths.SOLVERS: "solvers",
+    paths.TOOLS: "tools",
+    paths.ARM_NOTE: "arms",
+}
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
     paths.ORIENTATION_DEG: "residual_deg",
@@ -44,15 +53,13 @@ def log_static(
     stream: rr.RecordingStream, calibration: Calibration, targets: Mapping[str, Target]
 ) -> None:
     """Logs the verdict, further texts, and the style of the residual plots."""
-    log_verdict(stream, calibration.verdict, verdict_markdown(calibration))
-    for entity, text in (
-        (paths.FIGURES, figures_markdown(calibration, targets)),
-        (paths.SOLVERS, solvers_markdown(calibration)),
-        (paths.TOOLS, tools_markdown(calibration)),
-        (paths.ARM_NOTE, arms_markdown(calibration)),
-    ):
+    for entity, part in _DOCUMENTS.items():
+        text = result_markdown(part, calibration, targets)
         if text:
             stream.log(entity, markdown(text), static=True)
+    # A point in the verdict's colour, as an empty view would say that it is empty.
+    point = rr.Points2D([[0.0, 0.0]], colors=colours.VERDICT[calibration.verdict.status])
+    stream.log(paths.VERDICT_STRIP, point, static=True)
     for seer in dict.fromkeys(view.seer for view in calibration.views):
         for plot in _PLOTS:
             for name, label, colour, marker, size in _MARKS:
@@ -60,13 +67,6 @@ def log_static(
                     colors=colour, markers=marker, marker_sizes=size, names=label
                 )
                 stream.log(f"{paths.part_of(plot, seer)}/{name}", points, static=True)
-
-
-def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None:
-    """Logs a verdict's text, and a point in its colour, as an empty view would say it is empty."""
-    stream.log(paths.VERDICT, markdown(text), static=True)
-    point = rr.Points2D([[0.0, 0.0]], colors=colours.VERDICT[verdict.status])
-    stream.log(paths.VERDICT_STRIP, point, static=True)
 
 
 def log_views(
@@ -119,75 +119,39 @@ def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, fl
         send_rows(stream, entity, values, rr.Scalars.columns(scalars=list(values.values())))
 
 
-def verdict_markdown(calibration: Calibration) -> str:
-    """Verdict with its reasons, the transforms, and the views left out."""
-    return "\n".join(_verdict_lines(calibration))
-
-
-def _verdict_lines(calibration: Calibration) -> Iterator[str]:
-    verdict, cell, budget = calibration.verdict, calibration.cell, calibration.budget
-    yield from (f"# {verdict.headline}", "", *_list(verdict.top))
-    if calibration.next_steps:
-        yield from ("", "## What to do next", "")
-    for number, step in enumerate(calibration.next_steps, 1):
-        yield f"{number}. {plain(step.words)}" + (
-            f"  \n   `{step.command}`" if step.command else ""
-        )
-    for name, frame in calibration.frames.items():
-        if frame.verdict.status != "good":
-            yield f"- {plain(name)}: {frame.verdict.headline}, see Tools and fixtures."
-    if calibration.unstated_conditions:
-        yield from ("", "## What it is valid for", "", *_list(calibration.unstated_conditions))
-    if verdict.rest:
-        yield from ("", "## What else was found", "", *_list(verdict.rest))
-    if cell is not None:
-        yield from ("", plain(cell.weakest), "")
-        yield from _list(": ".join(row.cells) for row in facts.moved_table(cell).rows)
-        yield f"The frame of the cell is that of {plain(cell.reference)}."
-    yield from table_lines(facts.edge_table(calibration.placed))
-    if budget is not None:
-        yield from ("", plain(" ".join(facts.summary(calibration, budget))))
-    used = sum(view.used for view in calibration.views)
-    yield from ("", f"{used} of {len(calibration.views)} views used.")
-    yield from _list(suspects.words for suspects in advice.left_out(calibration.views))
-
-
-def _list(sentences: Iterable[str]) -> Iterator[str]:
-    return (f"- {plain(sentence)}" for sentence in sentences)
-
-
-def figures_markdown(
-    calibration: Calibration, targets: Mapping[str, Target] = MappingProxyType({})
+def result_markdown(
+    part: _Part,
+    calibration: Calibration,
+    targets: Mapping[str, Target] = MappingProxyType({}),
 ) -> str:
-    """Residuals of fit and validation, noise, uncertainty budget, boards and arms."""
-    return "\n".join(_figure_lines(calibration, targets))
+    """A document on a result; empty where there is nothing to say.
+
+    Args:
+        part: The verdict with the transforms and the views left out; figures of residuals, noise
+            and uncertainty; the solvers compared; tools and fixtures; the arms.
+        calibration: The result.
+        targets: Boards as the session states them, by their names in results.
+    """
+    text = str(getattr(_documents(), part)(calibration, targets)).strip()
+    return re.sub(r"\n{3,}", "\n\n", text)
 
 
-def _figure_lines(calibration: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
-    yield from ("# Residuals, rms", *table_lines(facts.residual_table(calibration)))
-    yield from table_lines(facts.pair_table(calibration))
-    yield from ("", "# Noise, per axis", "", *fact_lines(facts.noise_facts(calibration)))
-    sources, budget = facts.source_table(calibration), calibration.budget
-    if sources is not None:
-        yield from ("", "# Where the uncertainty comes from", "")
-        if budget is not None:
-            yield plain(" ".join(facts.summary(calibration, budget)))
-        yield from table_lines(sources)
-    for name, board in calibration.named_boards.items():
-        if board_lines := facts.board_facts(calibration, board, targets.get(name)):
-            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(board_lines))
-    for name, arm in calibration.by_name.robots.items():
-        of = plain(facts.of(name))
-        if arm.arm_errors is not None:
-            yield from ("", f"# Arm{of}", "", *fact_lines(arms.error_facts(arm.arm_errors)))
-        if arm.arm is not None:
-            yield from ("", f"# Level of the arm{of}", "", plain(arms.level_reason(arm.arm)))
-
-
-def solvers_markdown(calibration: Calibration) -> str:
-    """Comparison of the solvers: residuals, and distances from the result."""
-    table = facts.solver_table(calibration)
-    return "" if table is None else "\n".join(["# Solvers compared", *table_lines(table)])
+@cache
+def _documents() -> Any:  # noqa: ANN401 - a module of macros
+    environment = Environment(
+        loader=PackageLoader("visioncal", "present/recording"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: value if isinstance(value, Markup) else Markup(plain(str(value))),
+    )
+    environment.globals |= vars(facts) | vars(arms) | vars(details) | vars(advice)
+    environment.globals |= {
+        "facts": lambda them: Markup("\n".join(fact_lines(them))),
+        "table": lambda table: Markup("\n".join(table_lines(table))),
+    }
+    return environment.get_template("notes.md.j2").module
 
 
 def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
@@ -219,69 +183,3 @@ def _unseen_markdown(view: View) -> str:
     """Text of a view without any observation of the cell."""
     reason = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
     return f"# View {view.number}\n\n{reason}"
-
-
-def tools_markdown(calibration: Calibration) -> str:
-    """All tools and fixtures: verdict, pose, observations and figures."""
-    return "\n".join(chain.from_iterable(_tool(*frame) for frame in calibration.frames.items()))
-
-
-def _tool(name: str, frame: Frame) -> Iterator[str]:
-    yield from (f"# {plain(name)}: {frame.verdict.headline}", "", *_list(frame.verdict.reasons))
-    yield from (*table_lines(facts.edge_table({name: frame.edge})), "")
-    for observation in frame.observations:
-        if observation.reason or not observation.used:
-            reason = f": {plain(observation.reason)}" if observation.reason else ""
-            state = "used" if observation.used else "not used"
-            yield f"- **{plain(f'{observation.kind} {observation.name}'.strip())} {state}**{reason}"
-    if frame.observations:
-        yield from table_lines(observation_table(frame))
-    yield from ("", *fact_lines(frame_facts(frame)), "")
-
-
-def arms_markdown(calibration: Calibration) -> str:
-    """Model level and drift of each arm."""
-    return "\n".join(
-        chain.from_iterable(
-            _arm(facts.of(name), arm) for name, arm in calibration.by_name.robots.items()
-        )
-    )
-
-
-def _arm(of: str, sections: ArmSections) -> Iterator[str]:
-    if sections.arm is not None:
-        yield from (f"# The arm{plain(of)}", "", *_levels(sections.arm))
-    if sections.arm is not None and sections.elastic is not None:
-        yield from ("", "## Joints that bend", *table_lines(arms.spring_table(sections.elastic)))
-        yield from ("", *fact_lines(arms.spring_facts(sections.elastic)))
-    if sections.thermal is not None:
-        yield from ("", f"# Drift with temperature{plain(of)}", "")
-        yield plain(arms.drift_sentence(sections.thermal))
-        yield from table_lines(arms.drift_table(sections.thermal))
-
-
-def _levels(arm: ArmResult) -> Iterator[str]:
-    """Model level with its reason, parameters, and observability of an arm."""
-    yield from (f"{plain(sentence)}\n" for sentence in arms.arm_sentences(arm))
-    yield from table_lines(arms.level_table(arm))
-    yield from ("", "Ratio: twice the gain in log-likelihood over the arm as stated.")
-    if arm.left_out:
-        yield ""
-        yield (
-            "The plots show the views that were left out in turn, and as diamonds those that the "
-            "session holds back: in orange by the arm as stated, in blue by the calibrated one. "
-            "The orange line in the cell is the arm as stated, its departure magnified as its "
-            "entity says."
-        )
-    if arm.parameters:
-        yield from ("", "## Parameters", "", plain(arms.parameter_note(arm)))
-        for table in arms.parameter_tables(arm):
-            yield from table_lines(table)
-    if arm.observability is not None:
-        yield from ("", "## What the stops determine", "")
-        yield from fact_lines(arms.identifiability_facts(arm))
-    yield from _list(arm.not_determined or ())
-    if arm.stops:
-        yield from ("", "## Influence of each stop", "")
-        yield "By how much the mean variance over the workspace would grow without it:"
-        yield from table_lines(arms.stop_table(arm))
