@@ -1,6 +1,6 @@
 """Layout of the drawing of an aligned cell's network: bodies side by side, and who saw whom."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from visioncal.core.number_format import significant
@@ -42,29 +42,6 @@ def pairs(views: Iterable[ViewResult]) -> tuple[SeenPair, ...]:
     return tuple(summaries)
 
 
-@dataclass(frozen=True, eq=False)
-class RigidGroup:
-    """Frames that are fixed to each other: those of the cell, or of one flange."""
-
-    name: str
-    top: tuple[str, ...]
-    middle: tuple[str, ...]
-    bottom: tuple[str, ...]
-
-    @property
-    def width(self) -> float:
-        """Width in units of the drawing."""
-        return STEP * max(len(self.top), len(self.middle), len(self.bottom), 1)
-
-    def places(self, left: float) -> Iterator[tuple[str, float, float]]:
-        """Name and centre (x, y) of each frame's box."""
-        rows = ((self.top, _TOP), (self.middle, _MIDDLE), (self.bottom, _BOTTOM))
-        for names, height in rows:
-            start = left + 0.5 * (self.width - STEP * len(names))
-            for column, name in enumerate(names):
-                yield name, start + STEP * (column + 0.5), height
-
-
 def weakest_frame(tree: FrameTree) -> str:
     """The frame whose pose on its parent has the largest sigma, at the end of the session."""
     edges = {name: tree.edge_of(name) for name in _placed(tree)}
@@ -85,32 +62,30 @@ def _placed(tree: FrameTree) -> list[str]:
     return [name for name in tree.last if name not in tree.flanges]
 
 
-def bodies(tree: FrameTree) -> list[RigidGroup]:
-    """The cell between the flanges, with the frames on each at the end of the session."""
-    flanges = list(tree.flanges)
+def layout(
+    tree: FrameTree,
+) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, float]]]:
+    """Places in the drawing of the cell, which stands between the flanges, at the session's end.
+
+    Returns:
+        Left and right end of each body, the cell or a flange with what it carries, from left to
+        right; and the centre (x, y) of each frame's box, y upwards.
+    """
+    flanges, left = list(tree.flanges), 0.0
     half = (len(flanges) + 1) // 2
-    groups = []
+    spans: dict[str, tuple[float, float]] = {}
+    places: dict[str, tuple[float, float]] = {}
     for body in [*flanges[:half], "cell", *flanges[half:]]:
         frames = [frame for frame in _placed(tree) if tree.parents[frame] == body]
-        top = tuple(frame for frame in frames if frame.startswith(_SEERS))
-        bottom = tuple(frame for frame in frames if frame.startswith("base"))
-        middle = tuple(frame for frame in frames if frame not in top and frame not in bottom)
-        groups.append(RigidGroup(body, top, middle, bottom))
-    return groups
-
-
-def spans(tree: FrameTree) -> dict[str, tuple[float, float]]:
-    """Left and right end of each body, from left to right."""
-    left, ends = 0.0, {}
-    for body in bodies(tree):
-        ends[body.name] = (left, left + body.width)
-        left += body.width + GAP
-    return ends
-
-
-def places(tree: FrameTree) -> dict[str, tuple[float, float]]:
-    """Position of each frame in the drawing, y upwards; bodies have none."""
-    begins = spans(tree)
-    return {
-        name: (x, y) for body in bodies(tree) for name, x, y in body.places(begins[body.name][0])
-    }
+        top = [frame for frame in frames if frame.startswith(_SEERS)]
+        bottom = [frame for frame in frames if frame.startswith("base")]
+        middle = [frame for frame in frames if frame not in top and frame not in bottom]
+        width = STEP * max(len(top), len(middle), len(bottom), 1)
+        for names, height in ((top, _TOP), (middle, _MIDDLE), (bottom, _BOTTOM)):
+            start = left + 0.5 * (width - STEP * len(names))
+            places |= {
+                name: (start + STEP * (column + 0.5), height) for column, name in enumerate(names)
+            }
+        spans[body] = (left, left + width)
+        left += width + GAP
+    return spans, places

@@ -1,7 +1,7 @@
 """Comparison of two calibrations of one cell: tests of changes against noise."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from visioncal.vision.camera import intrinsics
 FALSE_ALARMS = 0.01
 # Smallest standard deviation in a test [rad, m], for exact data.
 _LEAST_SIGMA = 1e-9
+_NOTHING = "No transform changed: noise explains what differs."
 # Largest relative change of the focal length by focusing.
 _OTHER_LENS = 0.05
 
@@ -159,7 +160,10 @@ def compare(
     levels = (_levels(a), _levels(b))
     lens = _lens_change(a.camera, b.camera, limit)
     return Comparison(
-        mounts=(_mount(a), _mount(b)),
+        mounts=(
+            "whole cell" if a.cell is not None else a.mount,
+            "whole cell" if b.cell is not None else b.mount,
+        ),
         verdicts=(a.verdict.status, b.verdict.status),
         same_session=a.session_sha256 == b.session_sha256,
         edges=edges,
@@ -183,10 +187,6 @@ def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
     if not np.array_equal(first.px, second.px):
         return a.edges[name], b.edges[name]
     return first.transform, second.transform
-
-
-def _mount(calibration: Calibration) -> str:
-    return calibration.mount if calibration.cell is None else "whole cell"
 
 
 def _levels(calibration: Calibration) -> Mapping[str, float]:
@@ -288,7 +288,12 @@ def _findings(
     if "bad" in doubts.values():
         yield "Whether camera or board moved, a bad result does not tell."
     elif a.cell is not None:
-        yield _whole_finding(changed)
+        frames = some_of([name.partition("_from_")[2] for name in changed])
+        yield (
+            f"{frames} moved, or what they hang on was redefined; the others did not."
+            if changed
+            else _NOTHING
+        )
     elif a.mount != b.mount:
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
@@ -331,75 +336,54 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
         return f"{_CAMERA_MOVED[mount]}; the {seen} did not: use the second calibration."
     if board:
         return f"{_BOARD_MOVED[mount]}; the {sensor} did not: its calibration still holds."
-    return "No transform changed: noise explains what differs."
-
-
-def _whole_finding(changed: Sequence[str]) -> str:
-    """Sentence that says which frames of a whole cell moved."""
-    if not changed:
-        return "No transform changed: noise explains what differs."
-    frames = [name.partition("_from_")[2] for name in changed]
-    return f"{some_of(frames)} moved, or what they hang on was redefined; the others did not."
+    return _NOTHING
 
 
 def to_document(comparison: Comparison) -> dict[str, Any]:
     """Document of `visioncal diff --json`; what was not computed is absent."""
+
+    def test(significance: Significance) -> dict[str, Any]:
+        return {"is_change": significance.is_change, **asdict(significance)}
+
     document: dict[str, Any] = {
         "is_change": comparison.is_change,
         "findings": list(comparison.findings),
         "same_session": comparison.same_session,
         "mounts": list(comparison.mounts),
         "verdicts": list(comparison.verdicts),
-        "transforms": {edge.name: _edge_document(edge) for edge in comparison.edges},
+        "transforms": {
+            edge.name: {
+                "is_change": edge.is_change,
+                "moved_mm": edge.moved_mm,
+                "moved_deg": edge.moved_deg,
+                "sigma_mm": edge.sigma_mm,
+                "sigma_deg": edge.sigma_deg,
+                "twist": edge.twist.tolist(),
+                "covariance": edge.covariance.tolist(),
+                "translation": test(edge.translation),
+                "rotation": test(edge.rotation),
+            }
+            for edge in comparison.edges
+        },
         "only_in_first": list(comparison.only_in_a),
         "only_in_second": list(comparison.only_in_b),
         "noise": {
-            noise_change.name: _present({"first": noise_change.a, "second": noise_change.b})
-            for noise_change in comparison.noise
+            level.name: {
+                which: value
+                for which, value in (("first", level.a), ("second", level.b))
+                if value is not None
+            }
+            for level in comparison.noise
         },
     }
-    if comparison.lens is not None:
-        document["camera"] = _lens_document(comparison.lens)
+    lens = comparison.lens
+    if lens is not None:
+        names, values = list(lens.names), {"first": lens.a.tolist(), "second": lens.b.tolist()}
+        document["camera"] = {"is_change": lens.is_change, "names": names, **values}
+        if lens.sigmas is not None and lens.significance is not None:
+            tested = {"sigmas": lens.sigmas.tolist(), "test": test(lens.significance)}
+            document["camera"] |= tested
     return document
-
-
-def _edge_document(edge: EdgeChange) -> dict[str, Any]:
-    return {
-        "is_change": edge.is_change,
-        "moved_mm": edge.moved_mm,
-        "moved_deg": edge.moved_deg,
-        "sigma_mm": edge.sigma_mm,
-        "sigma_deg": edge.sigma_deg,
-        "twist": edge.twist.tolist(),
-        "covariance": edge.covariance.tolist(),
-        "translation": _significance_document(edge.translation),
-        "rotation": _significance_document(edge.rotation),
-    }
-
-
-def _lens_document(lens: LensChange) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "is_change": lens.is_change,
-        "names": list(lens.names),
-        "first": lens.a.tolist(),
-        "second": lens.b.tolist(),
-    }
-    if lens.sigmas is not None and lens.significance is not None:
-        document["sigmas"] = lens.sigmas.tolist()
-        document["test"] = _significance_document(lens.significance)
-    return document
-
-
-def _significance_document(significance: Significance) -> dict[str, Any]:
-    return {
-        "is_change": significance.is_change,
-        "p_value": significance.p_value,
-        "limit": significance.limit,
-    }
-
-
-def _present(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)

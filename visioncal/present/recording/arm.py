@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -14,6 +15,8 @@ from visioncal.present.recording.recorder import send_rows
 _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
 # Radius of joints, as a share of their link's.
 _JOINT_RADIUS = 1.2
+_LINKS: dict[str, Any] = {"colors": colours.LINK, "fill_mode": "solid"}
+_JOINTS: dict[str, Any] = {"colors": colours.JOINT, "fill_mode": "solid"}
 
 # Half width of the floor that is drawn, as a share of the cell's size.
 _FLOOR = 1.3
@@ -23,23 +26,9 @@ _BELOW_M = 0.004
 
 def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
     """Draws an arm at the stream's current time, by its (n, 4, 4) link frames in the base [m]."""
-    shapes = _Shapes.of(link_frames[None])
-    capsules = rr.Capsules3D(
-        lengths=shapes.lengths_m,
-        radii=shapes.radii_m,
-        translations=shapes.begins_m,
-        quaternions=shapes.quaternions,
-        colors=colours.LINK,
-        fill_mode="solid",
-    )
-    stream.log(f"{paths.ROBOT}/links", capsules)
-    balls = rr.Ellipsoids3D(
-        centers=shapes.joints_m,
-        half_sizes=shapes.half_sizes_m,
-        colors=colours.JOINT,
-        fill_mode="solid",
-    )
-    stream.log(f"{paths.ROBOT}/joints", balls)
+    capsules, balls = _shapes(link_frames[None])
+    stream.log(f"{paths.ROBOT}/links", rr.Capsules3D(**capsules, **_LINKS))
+    stream.log(f"{paths.ROBOT}/joints", rr.Ellipsoids3D(**balls, **_JOINTS))
 
 
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
@@ -74,52 +63,35 @@ def log_arms(
     """Draws an arm in every view by (n, 4, 4) link frames; None clears the previous view's arm."""
     known_views = [view for view in views if view is not None]
     link_frames, rows = np.array(known_views or [np.zeros((0, 4, 4))]), range(len(views))
-    drawn = [view is not None for view in views]
-    shapes, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
-    capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
-    stream.log(links, capsules, static=True)
-    columns = rr.Capsules3D.columns(
-        lengths=shapes.lengths_m,
-        radii=shapes.radii_m,
-        translations=shapes.begins_m,
-        quaternions=shapes.quaternions,
-    )
-    counts = link_frames.shape[1] * np.array(drawn)
-    send_rows(stream, links, rows, columns.partition(counts))
-    balls = rr.Ellipsoids3D.from_fields(colors=colours.JOINT, fill_mode="solid")
-    stream.log(joints, balls, static=True)
-    columns = rr.Ellipsoids3D.columns(centers=shapes.joints_m, half_sizes=shapes.half_sizes_m)
-    send_rows(stream, joints, rows, columns.partition(np.maximum(counts - 1, 0)))
+    counts = link_frames.shape[1] * np.array([view is not None for view in views])
+    (capsules, balls), links, joints = _shapes(link_frames), f"{entity}/links", f"{entity}/joints"
+    stream.log(links, rr.Capsules3D.from_fields(**_LINKS), static=True)
+    send_rows(stream, links, rows, rr.Capsules3D.columns(**capsules).partition(counts))
+    stream.log(joints, rr.Ellipsoids3D.from_fields(**_JOINTS), static=True)
+    parts = rr.Ellipsoids3D.columns(**balls).partition(np.maximum(counts - 1, 0))
+    send_rows(stream, joints, rows, parts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Shapes:
-    """Capsules and balls of m arms with n links each, arm after arm."""
+def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Capsules and balls of arms by their (m, n, 4, 4) frames of joints and flange [m].
 
-    lengths_m: FloatArray  # (m n,) lengths of the capsules [m].
-    radii_m: FloatArray  # (m n,) radii of the capsules [m].
-    begins_m: FloatArray  # (m n, 3) start points of the capsules [m].
-    quaternions: FloatArray  # (m n, 4) rotations x, y, z, w of the capsules from the z axis.
-    # (m (n - 1), 3) centres of the balls [m]; neither base nor flange is a joint.
-    joints_m: FloatArray
-    half_sizes_m: FloatArray  # (m (n - 1), 3) radii of the balls [m].
-
-    @classmethod
-    def of(cls, link_frames: FloatArray) -> "_Shapes":
-        """Shapes of (m, n, 4, 4) frames of joints and flanges."""
-        origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
-        links = np.diff(origins, axis=1)
-        lengths_m = np.linalg.norm(links, axis=2)
-        shares = np.linspace(_BASE_RADIUS, _FLANGE_RADIUS, links.shape[1])
-        radii_m = lengths_m.sum(axis=1)[:, None] * shares
-        return cls(
-            lengths_m.ravel(),
-            radii_m.ravel(),
-            origins[:, :-1].reshape(-1, 3),
-            _from_z_to(links.reshape(-1, 3)),
-            origins[:, 1:-1].reshape(-1, 3),
-            np.repeat(_JOINT_RADIUS * radii_m[:, :-1].reshape(-1, 1), 3, axis=1),
-        )
+    Returns:
+        For m n links their lengths, radii, start points and rotations from the z axis, and for
+        m (n - 1) joints their centres and radii, arm after arm; neither base nor flange is a joint.
+    """
+    origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
+    links = np.diff(origins, axis=1)
+    lengths_m = np.linalg.norm(links, axis=2)
+    shares = np.linspace(_BASE_RADIUS, _FLANGE_RADIUS, links.shape[1])
+    radii_m = lengths_m.sum(axis=1)[:, None] * shares
+    capsules = {
+        "lengths": lengths_m.ravel(),
+        "radii": radii_m.ravel(),
+        "translations": origins[:, :-1].reshape(-1, 3),
+        "quaternions": _from_z_to(links.reshape(-1, 3)),
+    }
+    half_sizes = np.repeat(_JOINT_RADIUS * radii_m[:, :-1].reshape(-1, 1), 3, axis=1)
+    return capsules, {"centers": origins[:, 1:-1].reshape(-1, 3), "half_sizes": half_sizes}
 
 
 def _from_z_to(directions: FloatArray) -> FloatArray:

@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 from visioncal.present import coverage
 from visioncal.present.coverage import PointChart
 from visioncal.present.recording import colours, paths
@@ -35,40 +34,26 @@ class JointChart:
 
     def log(self, stream: rr.RecordingStream) -> None:
         """Draws the bars of all views."""
-        bars = rr.BarChart(
-            list(self.residual_mm.values()),
-            abscissa=np.array(list(self.angle_deg.values())),
-            widths=np.full(len(self.angle_deg), self._width_deg),
-            color=colours.USED,
-        )
+        bars = self._bars([*self.angle_deg], colours.USED)
         stream.log(f"{paths.over_joint(self.joint)}/{paths.USED}", bars, static=True)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks the current view's bar, for all views, by row in the session, in one message."""
-        heights = _single_tensors([self.residual_mm.get(view) for view in rows])
-        angles_deg = _single_tensors([self.angle_deg.get(view) for view in rows])
-        colour = rr.components.ColorBatch([colours.THIS_VIEW] * len(rows))
-        widths_deg = rr.components.LengthBatch([self._width_deg] * len(rows))
-        columns = {
-            rr.BarChart.descriptor_values(): heights,
-            rr.BarChart.descriptor_abscissa(): angles_deg,
-            rr.BarChart.descriptor_color(): colour.as_arrow_array(),
-            rr.BarChart.descriptor_widths(): widths_deg.as_arrow_array(),
-        }
-        send_rows(
-            stream,
-            f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}",
-            rows.values(),
-            [
-                rr.ComponentColumn(key, rr.AnyBatchValue(key, array))
-                for key, array in columns.items()
-            ],
-        )
+        """Marks the current view's bar, for all views, by row in the session."""
+        # Rerun cannot send the tensors of several rows in one message.
+        for view, row in rows.items():
+            mark = self._bars([view] if view in self.angle_deg else [], colours.THIS_VIEW)
+            stream.set_time(paths.TIMELINE, sequence=row)
+            stream.log(f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}", mark)
 
-    @property
-    def _width_deg(self) -> float:
-        """Width of a bar; visible also for a joint that did not move."""
-        return _BAR * max(float(np.ptp(list(self.angle_deg.values()))), 1.0)
+    def _bars(self, views: Sequence[int], colour: tuple[int, int, int]) -> rr.BarChart:
+        # Visible also for a joint that did not move.
+        width_deg = _BAR * max(float(np.ptp(list(self.angle_deg.values()))), 1.0)
+        return rr.BarChart(
+            np.array([self.residual_mm[view] for view in views]),
+            abscissa=np.array([self.angle_deg[view] for view in views]),
+            widths=np.full(len(views), width_deg),
+            color=colour,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,38 +127,6 @@ class Charts:
             positions = chart.points.get(view, np.zeros((0, 2)))
             points = rr.Points2D.from_fields(positions=positions)
             stream.log(f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}", points)
-
-
-def _single_tensors(values: Sequence[float | None]) -> pa.Array:
-    """Tensors of one number each, or of none; rerun itself cannot batch them."""
-    tensor_type = rr.components.TensorDataBatch(np.zeros(1)).as_arrow_array().type
-    union, count = tensor_type.field("buffer").type, len(values)
-    sizes = np.array([value is not None for value in values], dtype=np.int64)
-    numbers = pa.array([value for value in values if value is not None], pa.float64())
-    children = [pa.nulls(0, field.type) for field in union]
-    type_code = [field.name for field in union].index("F64")
-    # Built from buffers: arrays that arrow builds may hold nulls, which changes their type.
-    children[type_code] = _from_buffers(union[type_code].type, count, [_offsets(sizes)], [numbers])
-    type_codes, indices = np.full(count, type_code, dtype=np.int8), np.arange(count, dtype=np.int32)
-    buffer = _from_buffers(
-        union, count, [pa.py_buffer(type_codes), pa.py_buffer(indices)], children
-    )
-    shapes = pa.array(sizes, pa.uint64())
-    shape = _from_buffers(
-        tensor_type.field("shape").type, count, [_offsets(np.ones(count, dtype=np.int64))], [shapes]
-    )
-    names = pa.nulls(count, tensor_type.field("names").type)
-    return pa.StructArray.from_arrays([shape, names, buffer], fields=list(tensor_type))
-
-
-def _offsets(sizes: IntArray) -> pa.Buffer:
-    return pa.py_buffer(np.append(0, np.cumsum(sizes)).astype(np.int32))
-
-
-def _from_buffers(
-    kind: pa.DataType, count: int, buffers: list[pa.Buffer], children: list[pa.Array]
-) -> pa.Array:
-    return pa.Array.from_buffers(kind, count, [None, *buffers], children=children)
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:

@@ -26,6 +26,7 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
 
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
+_UNREADABLE = "cannot be read or was changed after it was written"
 _SHOWN_ROWS = 10
 _ELSEWHERE: Mapping[str, ImagesKept] = {"thumbnail": "thumbnail", "none": "none"}
 # Errors of chunks whose names or shapes were damaged in ways that Arrow cannot detect.
@@ -49,6 +50,24 @@ def read_session(path: Path) -> Session:
     records = _read_records(scanned)
     complete = _complete_rows(path, records)
     cells = [records.header.cells(records.rows[row]) for row in complete]
+    seals = records.header.stream_seals
+    damaged = [
+        name
+        for name, seal in seals.items()
+        if name not in records.streams or codec.fact_seal(records.streams[name]) != seal
+    ]
+    if damaged:
+        what = f"the stream {', '.join(damaged)} {_UNREADABLE}"
+        raise _damaged(path, what, damaged)
+    corners = records.corners
+    if not records.header.corners:
+        corners = None
+    elif corners is None or codec.fact_seal(corners) != records.header.corners:
+        what = "the corners of its views cannot be read or were changed after it was written"
+        raise _damaged(path, what, ["corners"])
+    else:
+        view_column = records.header.columns.index("view")
+        corners = corners.of_views([int(row[view_column]) for row in cells])
     session = Session.assemble(
         parse_toml(records.header.session_toml, "session.toml"),
         records.header.columns,
@@ -56,8 +75,8 @@ def read_session(path: Path) -> Session:
         _images_of(path, records, complete),
         target_document=codec.from_json(records.header.target_json),
         robot_document=codec.from_json(records.header.robot_json),
-        corners=_corners_of(path, records, cells),
-    ).with_streams(_whole_streams(path, records))
+        corners=corners,
+    ).with_streams({name: records.streams[name] for name in seals})
     warnings = (*session.warnings, *_losses(scanned, records, len(complete)))
     return replace(session, warnings=warnings)
 
@@ -209,7 +228,8 @@ def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
     if damaged:
         problem = "is damaged: the session's declaration cannot be read"
     elif scanned.finished:
-        problem, next_step = "holds no session of visioncal", "Give the .rrd that visioncal wrote."
+        problem = "holds no session of visioncal"
+        next_step = "Give the .rrd that visioncal wrote."
     else:
         problem = "was cut off before the session's declaration was complete: no view is in it"
     return DataError(
@@ -217,40 +237,8 @@ def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
     )
 
 
-def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
-    """Streams in the order of the header, after a check of their seals."""
-    streams, seals = records.streams, records.header.stream_seals
-    damaged = [
-        name
-        for name, seal in seals.items()
-        if name not in streams or codec.fact_seal(streams[name]) != seal
-    ]
-    if damaged:
-        raise DataError(
-            f"{path} is damaged: the stream {', '.join(damaged)} cannot be read or was changed "
-            "after it was written.",
-            culprits=damaged,
-            next_step=_AGAIN,
-        )
-    return {name: streams[name] for name in seals}
-
-
-def _corners_of(
-    path: Path, records: _Records, cells: Sequence[Sequence[str]]
-) -> CornerTable | None:
-    """Corners of the complete views; None if the session has none."""
-    seal, corners = records.header.corners, records.corners
-    if not seal:
-        return None
-    if corners is None or codec.fact_seal(corners) != seal:
-        raise DataError(
-            f"{path} is damaged: the corners of its views cannot be read or were changed after it "
-            "was written.",
-            culprits=["corners"],
-            next_step=_AGAIN,
-        )
-    view_column = records.header.columns.index("view")
-    return corners.of_views([int(row[view_column]) for row in cells])
+def _damaged(path: Path, what: str, culprits: Sequence[str]) -> DataError:
+    return DataError(f"{path} is damaged: {what}.", culprits=culprits, next_step=_AGAIN)
 
 
 def _complete_rows(path: Path, records: _Records) -> list[int]:
@@ -266,12 +254,7 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
         for row in islice((row for row in range(written) if row not in rows), _SHOWN_ROWS)
     ]
     if missing:
-        raise DataError(
-            f"{path} is damaged: {', '.join(missing)} of the table cannot be read or was changed "
-            "after it was written.",
-            culprits=missing,
-            next_step=_AGAIN,
-        )
+        raise _damaged(path, f"{', '.join(missing)} of the table {_UNREADABLE}", missing)
     if records.header.images:
         return sorted(rows)
     absent = [row for row in rows if rows[row].image_sha256 and row not in images]
@@ -280,17 +263,10 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
     ]
     changed += [row for row in absent if row < written]
     if changed:
-        raise _changed_images(path, [records.image_name(row) for row in sorted(changed)])
+        names = [records.image_name(row) for row in sorted(changed)]
+        what = f"the image {', '.join(names)} cannot be read or does not match its SHA-256"
+        raise _damaged(path, what, names)
     return sorted(set(rows) - set(absent))
-
-
-def _changed_images(path: Path, names: Sequence[str]) -> DataError:
-    return DataError(
-        f"{path} is damaged: the image {', '.join(names)} cannot be read or does not match its "
-        "SHA-256.",
-        culprits=names,
-        next_step=_AGAIN,
-    )
 
 
 def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:

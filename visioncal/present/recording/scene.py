@@ -10,7 +10,7 @@ import rerun as rr
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present import result_parts
-from visioncal.present.network_layout import pairs, places, sigma_words, spans
+from visioncal.present.network_layout import layout, pairs, sigma_words
 from visioncal.present.placements import target_frames
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
@@ -432,19 +432,16 @@ def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
 
 
 def log_pose(
-    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray | None
+    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray
 ) -> None:
-    """Places a frame; an unknown pose clears that of the previous view."""
-    if base_from_frame is None:
-        stream.log(entity, rr.Clear(recursive=False))
-        return
+    """Places a frame in the base at the stream's current time."""
     stream.log(entity, placed(base_from_frame, paths.BASE_FRAME, frame))
 
 
 def _log_poses(
     stream: rr.RecordingStream, parent: str, frame: str, poses: Sequence[FloatArray | None]
 ) -> None:
-    """Places a frame on its parent in each view; see `log_pose`."""
+    """Places a frame on its parent in each view; an unknown pose clears that of the view before."""
     entity = paths.entity_of(frame)
     known = {row: pose for row, pose in enumerate(poses) if pose is not None}
     for row in (index for index in range(len(poses)) if index not in known):
@@ -477,11 +474,9 @@ def _send_strips(
 
 def log_network(stream: rr.RecordingStream, calibration: Calibration) -> None:
     """Draws the network as a graph: frames with their sigmas, and who saw whom."""
-    nodes: dict[str, tuple[float, float]] = {}
     tree = calibration.tree
-    for body, (left, right) in spans(tree).items():
-        nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
-    nodes |= places(tree)
+    spans, places = layout(tree)
+    nodes = {body: (0.5 * sum(span), _BODY_HEIGHT) for body, span in spans.items()} | places
     captions = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
     captions[paths.CELL_FRAME] = f"the frame of {tree.reference}"
     labels = [f"{node}\n{captions.get(node) or sigma_words(tree, node)}" for node in nodes]

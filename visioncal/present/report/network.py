@@ -13,10 +13,9 @@ from visioncal.core.types import FloatArray
 from visioncal.present.facts import DEGREE
 from visioncal.present.network_layout import (
     SeenPair,
+    layout,
     pairs,
-    places,
     sigma_words,
-    spans,
     weakest_frame,
 )
 from visioncal.present.report.plotting import (
@@ -97,7 +96,7 @@ def graph(calibration: Calibration) -> tuple[Figure, str]:
     Each frame's box has the sigma of its pose on its parent.
     """
     tree = calibration.tree
-    bodies, frames = spans(tree), places(tree)
+    bodies, frames = layout(tree)
     right = max(span[1] for span in bodies.values())
     margin = 0.5 * max(_NARROWEST_IN / _INCHES - (right + 0.3), 0.0)
     figure, ((axes,),) = panels(max(_INCHES * (right + 0.3), _NARROWEST_IN), _INCHES * 4.5)
