@@ -1,6 +1,6 @@
 """Views that deserve a look: outliers of the fit, and views that were left out of it."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,15 +46,15 @@ def suspects(calibration: Calibration) -> tuple[FlaggedViews, ...]:
     A good result has no outlying views: that one view sees the board less well is no reason for
     doubt.
     """
-    views, by_pair = calibration.views, dict[str, list[ViewResult]]()
-    for view in views if calibration.verdict.status != "good" else ():
+    by_pair = dict[str, list[ViewResult]]()
+    for view in calibration.views if calibration.verdict.status != "good" else ():
         by_pair.setdefault(_pair_words(view), []).append(view)
     outlying = (
         FlaggedViews((number,), used=True, why=why, of=of)
         for of, pair_views in by_pair.items()
         for number, why in _outlying(pair_views).items()
     )
-    return (*outlying, *left_out(views))
+    return (*outlying, *left_out(calibration.views))
 
 
 def left_out(views: Iterable[ViewResult]) -> Iterator[FlaggedViews]:
@@ -96,17 +96,10 @@ def mark_of(view: ViewResult) -> str:
 
 def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
     """Words for the used views whose residual exceeds a multiple of the median, by view."""
-    measures: list[tuple[str, Callable[[ViewResult], float | None]]] = [
-        ("mm", lambda view: view.residual_mm),
-        ("deg", lambda view: view.residual_deg),
-    ]
     words: dict[int, list[str]] = {}
-    for unit, value_of in measures:
-        values = {
-            view.view: value
-            for view in views
-            if view.used and (value := value_of(view)) is not None
-        }
+    for unit, name in (("mm", "residual_mm"), ("deg", "residual_deg")):
+        measured = {view.view: getattr(view, name) for view in views if view.used}
+        values = {view: value for view, value in measured.items() if value is not None}
         median = float(np.median(list(values.values()))) if values else 0.0
         for view, value in values.items():
             if value > _OUTLIER_FACTOR * median > 0.0:

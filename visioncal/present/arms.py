@@ -107,25 +107,21 @@ def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
         if errors.estimated
         else ("not taken out", "no joint angles with a known robot model: only their size is known")
     )
-    extrapolated: tuple[Fact, ...] = ()
-    if errors.away_mm is not None and errors.away_deg is not None:
-        predicted = _size(errors.away_predicted_mm, errors.away_predicted_deg)
-        extrapolated = (
-            Fact(
-                "at postures away from the views it errs by",
-                _size(errors.away_mm, errors.away_deg),
-                f"parts of the postures left out in turn; predicted {predicted}",
-            ),
-        )
-    return (
-        Fact(
-            f"{'the flange' if errors.of else 'a link'} is typically off by",
-            _size(errors.sigma_mm, errors.sigma_deg),
-        ),
-        *extrapolated,
-        Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15"),
-        Fact("its errors were", *treatment),
+    off_by = Fact(
+        f"{'the flange' if errors.of else 'a link'} is typically off by",
+        _size(errors.sigma_mm, errors.sigma_deg),
     )
+    ratio = Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15")
+    facts = (off_by, ratio, Fact("its errors were", *treatment))
+    if errors.away_mm is None or errors.away_deg is None:
+        return facts
+    predicted = _size(errors.away_predicted_mm, errors.away_predicted_deg)
+    away = Fact(
+        "at postures away from the views it errs by",
+        _size(errors.away_mm, errors.away_deg),
+        f"parts of the postures left out in turn; predicted {predicted}",
+    )
+    return (off_by, away, *facts[1:])
 
 
 def _size(mm: float | None, deg: float | None) -> str:
@@ -138,9 +134,18 @@ def level_table(arm: ArmResult) -> Table | None:
         return None
     titles = ("what is free", "values", "fit, mm", "fit, deg", "left out, mm", "left out, deg",
               "likelihood ratio")  # fmt: skip
-    return Table.of(
-        titles, [_level_row(level, chosen=level.level == arm.level) for level in arm.levels]
-    )
+    rows = []
+    for level in arm.levels:
+        is_taken, is_nominal = level.level == arm.level, level.level == NOMINAL
+        residuals = (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
+        cells = (
+            level_words(level.level) + (" (taken)" if is_taken else ""),
+            str(level.unknowns),
+            *map(significant, residuals),
+            significant(None) if is_nominal else f"{level.likelihood_ratio:.0f}",
+        )
+        rows.append(TableRow(cells, "taken" if is_taken else ""))
+    return Table.of(titles, rows)
 
 
 def level_note(observed: str) -> str:
@@ -151,15 +156,6 @@ def level_note(observed: str) -> str:
         f"arm as stated; chance stays under {SIGNIFICANT:.0f}. Levels that explain no more than "
         "chance are not listed."
     )
-
-
-def _level_row(level: ArmLevel, *, chosen: bool) -> TableRow:
-    words = level_words(level.level) + (" (taken)" if chosen else "")
-    residuals = map(
-        significant, (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
-    )
-    ratio = significant(None) if level.level == NOMINAL else f"{level.likelihood_ratio:.0f}"
-    return TableRow((words, str(level.unknowns), *residuals, ratio), "taken" if chosen else "")
 
 
 def parameter_tables(arm: ArmResult, count: int = 1) -> list[Table]:
@@ -293,17 +289,15 @@ def drift_table(thermal: ThermalResult) -> Table:
         "time constant [min]",
         "",
     )
-    rows = []
-    for joint in thermal.joints:
-        growth_is_prior = f"growth of {joint.joint}" in thermal.not_determined
-        rows.append(
-            (
-                joint.joint,
-                f"{1e6 * joint.growth_per_k:.1f} {PLUS_MINUS} {1e6 * joint.growth_sigma_per_k:.1f}",
-                f"{1e6 * joint.drift_rad_per_k:.1f} {PLUS_MINUS} "
-                f"{1e6 * joint.drift_sigma_rad_per_k:.1f}",
-                significant(joint.tau_s / 60.0),
-                "growth as known before" if growth_is_prior else "",
-            )
+    rows = [
+        (
+            joint.joint,
+            f"{1e6 * joint.growth_per_k:.1f} {PLUS_MINUS} {1e6 * joint.growth_sigma_per_k:.1f}",
+            f"{1e6 * joint.drift_rad_per_k:.1f} {PLUS_MINUS} "
+            f"{1e6 * joint.drift_sigma_rad_per_k:.1f}",
+            significant(joint.tau_s / 60.0),
+            "growth as known before" * (f"growth of {joint.joint}" in thermal.not_determined),
         )
+        for joint in thermal.joints
+    ]
     return Table.of(titles, rows, (0, 4))

@@ -58,15 +58,11 @@ def frame_facts(frame: Frame) -> tuple[Fact, ...]:
 def observation_table(frame: Frame) -> Table:
     """Residual and status of each observation."""
     rows = []
-    for observation in frame.observations:
-        mark = "left-out" if not observation.used else "look" if observation.reason else "used"
+    for seen in frame.observations:
+        mark = "left-out" if not seen.used else "look" if seen.reason else "used"
         words = {"left-out": "left out", "look": "look", "used": "yes"}[mark]
-        rows.append(
-            TableRow(
-                (observation.name, observation.kind, significant(observation.residual_mm), words),
-                mark,
-            )
-        )
+        cells = (seen.name, seen.kind, significant(seen.residual_mm), words)
+        rows.append(TableRow(cells, mark))
     return Table.of(("observation", "kind", "mm", "used"), rows, (0, 1, 3))
 
 
@@ -80,30 +76,18 @@ def details(document: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str
         if isinstance(value, Mapping):
             yield from details(value, path)
             continue
-        text = _text(value, _digits(path), " to " if path in _RANGES else ", ")
+        digits = 6 if path in _RATIOS else 2 if path in _RANGES or "sigma" in path else 4
+        text = _text(value, digits, " to " if path in _RANGES else ", ")
         if text:
             # The keys of points are their names; the unit is that of their parent.
             suffix = _suffix(parent if parent in _LABELS else name)
-            yield _label(parent, name), text, _UNITS.get(suffix, "")
+            words = (key.removesuffix(_suffix(key)).replace("_", " ") for key in path.split("."))
+            label = _LABELS.get(path) or _LABELS.get(parent, "").format(name) or ": ".join(words)
+            yield label, text, _UNITS.get(suffix, "")
 
 
 def _suffix(key: str) -> str:
     return next((unit for unit in _UNITS if key.endswith(unit)), "")
-
-
-def _label(parent: str, name: str) -> str:
-    path = f"{parent}.{name}" if parent else name
-    if path in _LABELS:
-        return _LABELS[path]
-    if parent in _LABELS:
-        return _LABELS[parent].format(name)
-    return ": ".join(key.removesuffix(_suffix(key)).replace("_", " ") for key in path.split("."))
-
-
-def _digits(path: str) -> int:
-    if path in _RATIOS:
-        return 6
-    return 2 if path in _RANGES or "sigma" in path else 4
 
 
 def _text(value: object, digits: int, separator: str) -> str:

@@ -226,21 +226,15 @@ def summary(calibration: Calibration, budget: UncertaintyResult) -> tuple[str, .
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """Noise levels, with their 95 % intervals where known."""
-    return tuple(
-        _noise_fact(of, name, value, levels.intervals.get(name))
-        for of, levels in result_parts.noise(calibration).items()
-        for name, value in levels.sigmas.items()
-    )
-
-
-def _noise_fact(of: str, name: str, value: float, interval: tuple[float, float] | None) -> Fact:
-    suffix = next((unit for unit in _UNITS if name.endswith(unit)), "")
-    label = f"{of} {name.removesuffix(suffix).replace('_', ' ')}".strip()
-    note = ""
-    if interval is not None:
-        low, high = interval
-        note = f"95 %: {significant(low)} to {significant(high)}"
-    return Fact(label, f"{significant(value)} {_UNITS.get(suffix, '')}".strip(), note)
+    facts = []
+    for of, levels in result_parts.noise(calibration).items():
+        for name, value in levels.sigmas.items():
+            suffix = next((unit for unit in _UNITS if name.endswith(unit)), "")
+            label = f"{of} {name.removesuffix(suffix).replace('_', ' ')}".strip()
+            interval = " to ".join(map(significant, levels.intervals.get(name, ())))
+            size = f"{significant(value)} {_UNITS.get(suffix, '')}".strip()
+            facts.append(Fact(label, size, f"95 %: {interval}" if interval else ""))
+    return tuple(facts)
 
 
 def board_facts(
@@ -252,10 +246,9 @@ def board_facts(
     if answering_solver(calibration) not in (None, "joint"):
         return (Fact("size and shape", "as stated", "a closed form takes them as they are"),)
     facts = [] if target is None else list(_size_facts(board, target))
-    if board.is_bent:
-        facts.append(Fact("bend", f"{significant(board.bend_mm)} mm", "of depth over its corners"))
-    else:
-        facts.append(Fact("bend", "none", "flat within what is seen"))
+    is_bent, depth = board.is_bent, f"{significant(board.bend_mm)} mm"
+    flat = Fact("bend", "none", "flat within what is seen")
+    facts.append(Fact("bend", depth, "of depth over its corners") if is_bent else flat)
     if "shear" in board.estimated:
         angle, sigma = np.rad2deg([board.shape["shear"], board.sigma["shear"]])
         tolerance = f"{PLUS_MINUS} {significant(sigma)}"

@@ -27,11 +27,15 @@ from visioncal.present.tables import Table, TableRow
 
 # Width of a stop's bars, and the largest number of labels below them.
 _BAR, _MOST_LABELS = 0.38, 20
+# Words for the states of triggers, in the order of the table.
+_STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
 
 
 def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
     """Renders the page of a check as HTML text."""
-    undone = _undone(check)
+    change = check.named[0] if check.named else None
+    # The change that can be undone, unlike mere noise.
+    undone = "" if change is None or change.name == NOISE else change_words(check, change)
     stops = [", ".join(map(str, views)) for views in check.predicted.views]
     before, after = _lengths(check.residuals), _lengths(check.remaining)
     return template("check.html.j2").render(
@@ -44,7 +48,14 @@ def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) ->
         provenance={},
         undone=undone,
         changes=_change_table(check),
-        triggers=_trigger_table(triggers),
+        triggers=_reasons(
+            TableRow(
+                (_STATES[state], "", trigger.words), "look" if state == "fired" else "rejected"
+            )
+            for state in _STATES
+            for trigger in triggers
+            if trigger.state == state
+        ),
         not_used=_reasons(
             TableRow((str(view), "not used", reason), "rejected")
             for view, reason in sorted(check.predicted.observed.reasons.items())
@@ -94,12 +105,6 @@ def _residuals(
     return figure, "Residuals of each stop, before and after the change"
 
 
-def _undone(check: Check) -> str:
-    """Words for the change that can be undone; empty if there is none, as for mere noise."""
-    change = check.named[0] if check.named else None
-    return "" if change is None or change.name == NOISE else change_words(check, change)
-
-
 def _change_table(check: Check) -> Table:
     """Changes that were compared: their probability, and whether the check found them."""
     rows = []
@@ -112,19 +117,6 @@ def _change_table(check: Check) -> Table:
         )
         rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return _reasons(rows, ("share", "", "change"))
-
-
-def _trigger_table(triggers: Sequence[Outcome]) -> Table:
-    """Triggers for a new calibration, those that fired first."""
-    words = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
-    states = [*words]
-    return _reasons(
-        TableRow(
-            (words[outcome.state], "", outcome.words),
-            "look" if outcome.state == "fired" else "rejected",
-        )
-        for outcome in sorted(triggers, key=lambda trigger: states.index(trigger.state))
-    )
 
 
 def _reasons(rows: Iterable[TableRow], titles: tuple[str, str, str] = ("", "", "")) -> Table:

@@ -21,7 +21,7 @@ from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
-from visioncal.results.sections import ClockResult, PointResult, TouchTest
+from visioncal.results.sections import ClockResult, TouchTest
 from visioncal.session import Session
 from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
@@ -41,9 +41,9 @@ def edge_meaning(name: str) -> str:
 
 def edge_facts(name: str, edge: Edge) -> list[Fact]:
     """Components of a transform with standard deviations and units."""
-    rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
-    covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
+    parent_from_child = edge.matrix[:3, :3]
+    covariance_m2 = parent_from_child @ edge.covariance[3:, 3:] @ parent_from_child.T
     sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
     translation_mm = 1e3 * edge.transform.translation
     rows = [
@@ -51,26 +51,17 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
     if edge.oriented:
-        rows += _rotation_facts(edge)
+        axis_deg, rotation = edge.sigma_deg / np.sqrt(3.0), edge.transform.rotation
+        decimals = decimals_for(0.5 * np.deg2rad(axis_deg))
+        vector = ", ".join(matched(value, axis_deg) for value in rotation.as_rotvec(degrees=True))
+        quaternion = ", ".join(fixed(value, decimals) for value in rotation.as_quat())
+        rows.append(Fact("rotation vector", f"[{vector}]", "deg"))
+        rows.append(Fact("quaternion x, y, z, w", f"[{quaternion}]"))
     else:
         parent = frame_words(name.partition("_from_")[0])
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
     rotation_sigma = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
     return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")]
-
-
-def _rotation_facts(edge: Edge) -> list[Fact]:
-    sigma_axis_deg = edge.sigma_deg / np.sqrt(3.0)
-    decimals = decimals_for(0.5 * np.deg2rad(sigma_axis_deg))
-    rotation = edge.transform.rotation
-    rotvec_deg = ", ".join(
-        matched(value, sigma_axis_deg) for value in rotation.as_rotvec(degrees=True)
-    )
-    quaternion = ", ".join(fixed(value, decimals) for value in rotation.as_quat())
-    return [
-        Fact("rotation vector", f"[{rotvec_deg}]", "deg"),
-        Fact("quaternion x, y, z, w", f"[{quaternion}]"),
-    ]
 
 
 def matrix_text(matrix: FloatArray) -> str:
@@ -83,8 +74,15 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     """The few figures that most readers look for."""
     validation = calibration.validation
     facts = [*need_facts(calibration.need, calibration.verdict)]
-    sigmas = _camera_sigmas if calibration.cell is None else _cell_sigmas
-    facts += sigmas(calibration)
+    if calibration.cell is None:
+        edge = next(iter(calibration.edges.values()))
+        sensor = "instrument" if calibration.mount == "instrument" else "camera"
+        facts += [
+            Fact(f"{sensor} position, sigma", f"{significant(edge.sigma_mm)} mm"),
+            Fact(f"{sensor} orientation, sigma", f"{significant(edge.sigma_deg)}{DEGREE}"),
+        ]
+    else:
+        facts += _cell_sigmas(calibration)
     for name, arm in calibration.by_name.robots.items():
         if arm.arm is not None and arm.arm.workspace_sigma_mm is not None:
             sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
@@ -104,15 +102,6 @@ def views_used(calibration: Calibration) -> Fact:
     return Fact("views used", f"{used} of {len(calibration.views)}")
 
 
-def _camera_sigmas(calibration: Calibration) -> list[Fact]:
-    edge = next(iter(calibration.edges.values()))
-    sensor = "instrument" if calibration.mount == "instrument" else "camera"
-    return [
-        Fact(f"{sensor} position, sigma", f"{significant(edge.sigma_mm)} mm"),
-        Fact(f"{sensor} orientation, sigma", f"{significant(edge.sigma_deg)}{DEGREE}"),
-    ]
-
-
 def _cell_sigmas(calibration: Calibration) -> list[Fact]:
     """Sigmas of the robots' bases relative to the first one, and the least known frame."""
     tree = calibration.tree
@@ -120,11 +109,8 @@ def _cell_sigmas(calibration: Calibration) -> list[Fact]:
     facts = []
     for base in bases[1:]:
         edge = tree.between(bases[0], base)
-        sigma, sigma_deg = (
-            f"{significant(edge.sigma_mm)} mm",
-            f"{significant(edge.sigma_deg)}{DEGREE}",
-        )
-        facts.append(Fact(f"{base} in {bases[0]}, sigma", sigma, sigma_deg))
+        sigma_mm, sigma_deg = significant(edge.sigma_mm), f"{significant(edge.sigma_deg)}{DEGREE}"
+        facts.append(Fact(f"{base} in {bases[0]}, sigma", f"{sigma_mm} mm", sigma_deg))
     worst = weakest_frame(tree)
     if worst:
         facts.append(Fact("least known", worst, f"{significant(tree.edge_of(worst).sigma_mm)} mm"))
@@ -183,7 +169,11 @@ def method_facts(calibration: Calibration, session: Session | None = None) -> tu
     if calibration.instrument is not None:
         read = f"it read {calibration.instrument.reads}"
         facts.append(Fact("instrument", calibration.instrument.words, read))
-        facts += [_point_fact(point) for point in calibration.points]
+        for point in calibration.points:
+            xyz_mm = (1e3 * value for value in (point.x_m, point.y_m, point.z_m))
+            place = ", ".join(matched(value, point.sigma_mm / np.sqrt(3.0)) for value in xyz_mm)
+            note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
+            facts.append(Fact(f"point {point.point}", f"[{place}] mm", note))
     for name, clock in calibration.by_name.details.clocks.items():
         facts += _clock_facts(clock, f"clock{of(name)}" if name else "camera's clock")
     return tuple(facts)
@@ -191,13 +181,10 @@ def method_facts(calibration: Calibration, session: Session | None = None) -> tu
 
 def touch_table(test: TouchTest) -> Table:
     """Measured and predicted gaps of a touch test."""
-    rows = [
-        TableRow(
-            (point.name, significant(point.gap_mm), significant(point.radius95_mm)),
-            "left-out" if point.gap_mm > point.radius95_mm else "",
-        )
-        for point in test.points
-    ]
+    rows = []
+    for point in test.points:
+        cells = (point.name, significant(point.gap_mm), significant(point.radius95_mm))
+        rows.append(TableRow(cells, "left-out" if point.gap_mm > point.radius95_mm else ""))
     return Table.of(("point", "gap [mm]", "predicted, 95 % [mm]"), rows)
 
 
@@ -218,15 +205,6 @@ def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
         yield Fact(f"{shutter.kind} shutter", readout, note)
 
 
-def _point_fact(point: PointResult) -> Fact:
-    axis_mm = point.sigma_mm / np.sqrt(3.0)
-    position = ", ".join(
-        matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m)
-    )
-    note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
-    return Fact(f"point {point.point}", f"[{position}] mm", note)
-
-
 def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
     """Intrinsics, with standard deviations where estimated."""
     values, count = intrinsics(result.camera), len(result.camera.matrix)
@@ -237,12 +215,10 @@ def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
     for index, (name, value, sigma) in enumerate(
         zip(intrinsics_names(result.camera), values, sigmas, strict=True)
     ):
-        unit = "px" if index < count else ""
-        stated = f"{value:.2f}" if index < count else f"{value:.5g}"
+        unit, stated = ("px", f"{value:.2f}") if index < count else ("", f"{value:.5g}")
         tolerance = f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip()
-        facts.append(
-            Fact(name, matched(value, sigma), tolerance) if sigma else Fact(name, stated, unit)
-        )
+        cells = (matched(value, sigma), tolerance) if sigma else (stated, unit)
+        facts.append(Fact(name, *cells))
     return tuple(facts)
 
 

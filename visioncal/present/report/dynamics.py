@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from visioncal.core.number_format import matched, significant
-from visioncal.core.types import FloatArray
 from visioncal.dynamics import (
     Identified,
     Prediction,
@@ -62,7 +61,10 @@ def render_dynamics(run: Run) -> str:
         key_figures=tuple(_key_figures(identified)),
         provenance={name: value for name, value in origin.items() if value},
         identified=identified,
-        counts=_counts(identified),
+        counts="; ".join(
+            f"{kind}: {identified.determined.count(kind)}"
+            for kind in dict.fromkeys(("2 %", "10 %", *identified.determined))
+        ),
         humps=tuple(_hump_facts(identified)),
         plots=tuple((f"{each.label}, {use}", torques(each)) for each, use in shown),
         friction_plot=friction(identified, run.predictions),
@@ -81,12 +83,6 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
         yield Fact("error on unseen motion", f"{median} %", f"up to {high} % (joint {worst + 1})")
     samples = sum(stream.samples for stream in identified.streams)
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
-
-
-def _counts(identified: Identified) -> str:
-    shares = identified.determined
-    kinds = dict.fromkeys(("2 %", "10 %", *shares))
-    return "; ".join(f"{kind}: {shares.count(kind)}" for kind in kinds)
 
 
 def _hump_facts(identified: Identified) -> Iterator[Fact]:
@@ -149,9 +145,13 @@ def friction(
 def _draw_friction(
     axes: Axes, identified: Identified, predictions: Sequence[Prediction], joint: int
 ) -> None:
-    samples = np.concatenate(
-        [_samples(identified, prediction, joint) for prediction in predictions]
+    shown = (
+        np.column_stack(
+            [prediction.dq[:, joint], measured_friction(identified, prediction)[:, joint]]
+        )[prediction.used[:, joint]]
+        for prediction in predictions
     )
+    samples = np.concatenate([*shown])
     samples = samples[:: max(len(samples) // _MOST_MARKS, 1)]
     max_speed = max(float(np.abs(samples[:, 0]).max(initial=0.0)), 1e-3)
     # Small steps near standstill, where dry friction changes sign.
@@ -162,11 +162,3 @@ def _draw_friction(
     dots(axes, samples, color=MUTED, alpha=0.5)
     axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
     few_ticks(axes, 5, 5)
-
-
-def _samples(identified: Identified, prediction: Prediction, joint: int) -> FloatArray:
-    """(k, 2) speed and friction torque of the samples in the fit."""
-    friction_nm = measured_friction(identified, prediction)
-    return np.column_stack([prediction.dq[:, joint], friction_nm[:, joint]])[
-        prediction.used[:, joint]
-    ]

@@ -2,8 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import groupby
 
 from visioncal.core.number_format import significant
 from visioncal.present.report.templates import template
@@ -13,17 +11,6 @@ from visioncal.results.fleet import FEWEST, FleetRow
 _ICONS = {"good": "good", "check": "check"}
 # Largest number of outstanding sessions listed per group.
 _MOST_NAMED = 6
-
-
-@dataclass(frozen=True)
-class _Odd:
-    """Outstanding sessions of one group, such as one robot, with the reasons of the worst."""
-
-    title: str
-    count: str
-    reasons: tuple[str, ...]
-    rows: tuple[FleetRow, ...]
-    more: int
 
 
 def fleet_page(rows: Sequence[FleetRow]) -> str:
@@ -56,15 +43,18 @@ def _figure(value: float | None) -> str:
     return "" if value is None else significant(value)
 
 
-def _odd(rows: Sequence[FleetRow]) -> Iterator[_Odd]:
-    """Groups of outstanding sessions, in the order of the worst of each."""
-    outstanding = [row for row in rows if row.score > 0.0]
-    order = list(dict.fromkeys(row.group or row.name for row in outstanding))
+def _odd(rows: Sequence[FleetRow]) -> Iterator[dict[str, object]]:
+    """Groups of outstanding sessions, such as of one robot, in the order of the worst of each."""
+    groups: dict[str, list[FleetRow]] = {}
+    for row in rows:
+        if row.score > 0.0:
+            groups.setdefault(row.group or row.name, []).append(row)
     sizes = Counter(row.group or row.name for row in rows)
-    grouped = sorted(outstanding, key=lambda value: order.index(value.group or value.name))
-    for name, members in groupby(grouped, key=lambda value: value.group or value.name):
-        worst_first = tuple(members)
-        reasons = tuple(worst_first[0].stands_out.split("; "))
-        count = f"{len(worst_first)} of {sizes[name]} sessions" if sizes[name] > 1 else ""
-        listed = worst_first[:_MOST_NAMED]
-        yield _Odd(name, count, reasons, listed, len(worst_first) - len(listed))
+    for name, members in groups.items():
+        yield {
+            "title": name,
+            "count": f"{len(members)} of {sizes[name]} sessions" if sizes[name] > 1 else "",
+            "reasons": members[0].stands_out.split("; "),
+            "rows": members[:_MOST_NAMED],
+            "more": len(members[_MOST_NAMED:]),
+        }
