@@ -4,7 +4,7 @@ Ellipsoids and single views' target positions are too small to be seen at true s
 magnified by one factor, which their names state.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import log_scalars
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration, Edge
-from visioncal.results.arm import ArmResult, UnseenView
+from visioncal.results.arm import ArmResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.session import Session, View
@@ -62,12 +62,10 @@ class ArmPicture:
         cls, session: Session, calibration: Calibration | None, size_m: float
     ) -> "ArmPicture | None":
         """Collects what to draw; None if the arm was not calibrated."""
-        if calibration is None:
+        result = None if calibration is None else calibration.arm
+        if calibration is None or result is None or result.robot is None:
             return None
-        result, nominal = calibration.arm, calibration.robot
-        robot = None if result is None else result.robot
-        if result is None or robot is None:
-            return None
+        robot, nominal = result.robot, calibration.robot
         off_m = {
             view.number: _deviations(view, view.joints_rad, robot, nominal)
             for view in session.views
@@ -101,26 +99,22 @@ class ArmPicture:
     def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
         """Draws the nominal arm in each view, by row, and plots the residuals of both arms."""
         drawn = [self.deviations_m[view] for view in rows if view in self.deviations_m]
-        strips = [
-            np.vstack([np.zeros(3), origins + self.factor * deviations])
-            for origins, deviations in drawn
-        ]
+        strips = [np.vstack([np.zeros(3), ends + self.factor * off_m]) for ends, off_m in drawn]
         entity = paths.magnified_arm(self.factor)
         style = rr.LineStrips3D.from_fields(colors=colours.STATED, radii=_LINE * self.size_m)
         stream.log(entity, style, static=True)
-        lines = rr.LineStrips3D.columns(strips=strips)
-        send_rows(
-            stream,
-            entity,
-            rows.values(),
-            lines.partition([view in self.deviations_m for view in rows]),
-        )
+        parts = [view in self.deviations_m for view in rows]
+        lines = rr.LineStrips3D.columns(strips=strips).partition(parts)
+        send_rows(stream, entity, rows.values(), lines)
         for held, views in ((False, self.result.left_out), (True, self.result.holdout)):
-            _log_unseen(
-                stream,
-                {rows[view.view]: view for view in views if view.view in rows},
-                is_holdout=held,
-            )
+            for plot, unit in ((paths.UNSEEN_MM, "mm"), (paths.UNSEEN_DEG, "deg")):
+                for name, attribute in ((_STATED, f"nominal_{unit}"), (_CALIBRATED, unit)):
+                    residuals = {
+                        rows[view.view]: float(residual)
+                        for view in views
+                        if view.view in rows and (residual := getattr(view, attribute)) is not None
+                    }
+                    log_scalars(stream, _series(plot, name, is_holdout=held), residuals)
 
 
 def log_map(
@@ -128,45 +122,26 @@ def log_map(
 ) -> None:
     """Draws standard deviations (w,) [mm] at (w, 3) points, sized for a cell of `size_m` [m]."""
     low, high = np.percentile(sigma_mm, [_LOW_PERCENT, _HIGH_PERCENT])
-    frame = rr.CoordinateFrame(paths.BASE_FRAME)
-    places = rr.Points3D(
-        places_m,
-        colors=_colours(sigma_mm, low, high),
-        radii=_PLACE * size_m,
-        labels=[f"{significant(value)} mm" for value in sigma_mm],
-        show_labels=False,
-    )
-    stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
     steps_mm = np.linspace(low, high, _LEGEND_STEPS)
-    # A column beside the map, of the same height.
-    bottom, top = places_m[:, 2].min(), places_m[:, 2].max()
+    # The legend is a column beside the map, of the same height.
     column = np.zeros((_LEGEND_STEPS, 3))
     column[:, :2] = places_m[:, :2].min(axis=0)
-    column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
-    labels = [f"{significant(step)} mm" for step in steps_mm]
-    labels[-1] += " sigma of a tool's place"
-    legend = rr.Points3D(
-        column,
-        colors=_colours(steps_mm, low, high),
-        radii=_LEGEND * size_m,
-        labels=labels,
-        show_labels=True,
-    )
-    stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
-
-
-def _log_unseen(
-    stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, is_holdout: bool
-) -> None:
-    for plot, before, after in (
-        (paths.UNSEEN_MM, "nominal_mm", "mm"),
-        (paths.UNSEEN_DEG, "nominal_deg", "deg"),
+    column[:, 2] = np.linspace(places_m[:, 2].min(), places_m[:, 2].max(), _LEGEND_STEPS)
+    for entity, positions, values, radius, shown in (
+        ("sigma_of_a_tool_s_place", places_m, sigma_mm, _PLACE, False),
+        ("legend", column, steps_mm, _LEGEND, True),
     ):
-        pairs = {row: (getattr(view, before), getattr(view, after)) for row, view in seen.items()}
-        known = {row: pair for row, pair in pairs.items() if None not in pair}
-        for index, name in enumerate((_STATED, _CALIBRATED)):
-            entity = _series(plot, name, is_holdout=is_holdout)
-            log_scalars(stream, entity, {row: pair[index] for row, pair in known.items()})
+        labels = [f"{significant(value)} mm" for value in values]
+        labels[-1] += " sigma of a tool's place" if shown else ""
+        points = rr.Points3D(
+            positions,
+            colors=_colours(values, low, high),
+            radii=radius * size_m,
+            labels=labels,
+            show_labels=shown,
+        )
+        frame = rr.CoordinateFrame(paths.BASE_FRAME)
+        stream.log(f"{paths.WORKSPACE}/{entity}", frame, points, static=True)
 
 
 def _series(plot: str, name: str, *, is_holdout: bool) -> str:
@@ -245,21 +220,36 @@ class Uncertainty:
         """Draws the ellipsoids, and the target positions by all views."""
         for name, edge in self.edges.items():
             self._log_ellipsoid(stream, name, edge)
-        for name, colour, is_used in (
-            (paths.USED, colours.USED, True),
-            (paths.REJECTED, colours.REJECTED, False),
-        ):
-            views = [view for view in self.scatter_m if (view in self.used) is is_used]
-            for frame in self._frames_of(views):
-                positions_m = self._positions_m(views, frame)
-                points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
-                entity = f"{self._placements(frame)}/{name}"
-                stream.log(entity, rr.CoordinateFrame(frame), points, static=True)
-        for frame in self._frames_of(self.scatter_m):
-            self._log_beyond(stream, frame)
+        for frame in self._target_frames:
+            in_frame, placements = rr.CoordinateFrame(frame), self._placements(frame)
+            views = [view for view in self.scatter_m if self.frames[view] == frame]
+            for name, colour, is_used in (
+                (paths.USED, colours.USED, True),
+                (paths.REJECTED, colours.REJECTED, False),
+            ):
+                shown = [view for view in views if (view in self.used) is is_used]
+                if shown:
+                    places_m = self._positions_m(shown)
+                    points = rr.Points3D(places_m, colors=colour, radii=_POINT * self.size_m)
+                    stream.log(f"{placements}/{name}", in_frame, points, static=True)
+            # Arrows towards positions that lie too far out to be drawn.
+            beyond = [
+                view
+                for view in views
+                if np.linalg.norm(self.factor * self.scatter_m[view]) > _REACH * self.size_m
+            ]
+            if beyond:
+                arrows = rr.Arrows3D(
+                    vectors=self._positions_m(beyond),
+                    origins=np.zeros((len(beyond), 3)),
+                    colors=colours.REJECTED,
+                    radii=_FINE_LINE * self.size_m,
+                )
+                stream.log(f"{placements}/{paths.BEYOND}", in_frame, arrows, static=True)
 
-    def _frames_of(self, views: Iterable[int]) -> list[str]:
-        return sorted({self.frames[view] for view in views})
+    @property
+    def _target_frames(self) -> list[str]:
+        return sorted({self.frames[view] for view in self.scatter_m})
 
     def _log_ellipsoid(self, stream: rr.RecordingStream, name: str, edge: Edge) -> None:
         child = name.rpartition("_from_")[2]
@@ -288,9 +278,11 @@ class Uncertainty:
 
     def log_views(self, stream: rr.RecordingStream, views: Sequence[int]) -> None:
         """Marks the current view's target position, for all views of the session in order."""
-        for frame in self._frames_of(self.scatter_m):
+        for frame in self._target_frames:
             # For other targets, an empty part clears the mark of the previous view.
-            marked = [self._positions_m([view] * (view in self.scatter_m), frame) for view in views]
+            marked = [
+                self._positions_m([view] if self._frame_of(view) == frame else []) for view in views
+            ]
             entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
             radius = 1.5 * _POINT * self.size_m
             style = rr.Points3D.from_fields(colors=colours.THIS_VIEW, radii=radius)
@@ -299,35 +291,17 @@ class Uncertainty:
             parts = points.partition([len(array) for array in marked])
             send_rows(stream, entity, range(len(views)), parts)
 
-    def _positions_m(self, views: Iterable[int], frame: str) -> FloatArray:
-        """(k, 3) drawn positions of a target by some views, in its frame."""
-        shown = [view for view in views if self.frames[view] == frame]
-        places_m = [self._within_reach(self.factor * self.scatter_m[view]) for view in shown]
-        return np.reshape(places_m, (-1, 3))
+    def _frame_of(self, view: int) -> str:
+        return self.frames[view] if view in self.scatter_m else ""
+
+    def _positions_m(self, views: Sequence[int]) -> FloatArray:
+        """(k, 3) drawn positions of targets by some views, in their frames."""
+        drawn_m = np.reshape([self.factor * self.scatter_m[view] for view in views], (-1, 3))
+        lengths = np.maximum(np.linalg.norm(drawn_m, axis=1, keepdims=True), 1e-12)
+        return np.asarray(drawn_m * np.minimum(1.0, _REACH * self.size_m / lengths))
 
     def _placements(self, frame: str) -> str:
         return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
-
-    def _log_beyond(self, stream: rr.RecordingStream, frame: str) -> None:
-        """Arrows towards positions that lie too far out to be drawn."""
-        deviations = [
-            vector for view, vector in self.scatter_m.items() if self.frames[view] == frame
-        ]
-        drawn_m = [self.factor * vector for vector in deviations]
-        beyond = [vector for vector in drawn_m if np.linalg.norm(vector) > _REACH * self.size_m]
-        if beyond:
-            arrows = rr.Arrows3D(
-                vectors=[self._within_reach(vector) for vector in beyond],
-                origins=np.zeros((len(beyond), 3)),
-                colors=colours.REJECTED,
-                radii=_FINE_LINE * self.size_m,
-            )
-            entity = f"{self._placements(frame)}/{paths.BEYOND}"
-            stream.log(entity, rr.CoordinateFrame(frame), arrows, static=True)
-
-    def _within_reach(self, drawn_m: FloatArray) -> FloatArray:
-        reach_m = _REACH * self.size_m
-        return drawn_m * min(1.0, reach_m / max(float(np.linalg.norm(drawn_m)), 1e-12))
 
 
 def _principal_sigmas(edge: Edge) -> tuple[FloatArray, FloatArray]:

@@ -70,17 +70,13 @@ class Overlay:
             (paths.magnified_residuals(self.factor), self.factor, True),
             (paths.RESIDUALS_TO_SCALE, 1, False),
         ):
-            paired = [
-                len(ends) == len(begins) and (view.view in self.used) is is_used
+            pairs_px = [
+                (begins, ends)
+                if len(ends) == len(begins) and (view.view in self.used) is is_used
+                else (empty, empty)
                 for view, begins, ends in zip(seen, px, predicted_px, strict=True)
             ]
-            begins_px = [
-                array if is_paired else empty for array, is_paired in zip(px, paired, strict=True)
-            ]
-            ends_px = [
-                array if is_paired else empty
-                for array, is_paired in zip(predicted_px, paired, strict=True)
-            ]
+            begins_px, ends_px = zip(*pairs_px, strict=True)
             origins = np.vstack(begins_px)
             vectors = factor * (np.vstack(ends_px) - origins)
             arrows = rr.Arrows2D.columns(vectors=vectors, origins=origins + _CENTRE)

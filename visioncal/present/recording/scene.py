@@ -120,9 +120,9 @@ class SceneDrawing:
     # State of each robot, where known, by flange and view number.
     states: Mapping[str, Mapping[int, RobotState]]
     size_m: float  # Size of the cell, which drawn sizes refer to [m].
-    uncertainty: Uncertainty | None  # Drawing of the result's uncertainty.
-    charts: Charts | None  # Charts over all views.
-    arm: ArmPicture | None  # Drawing of a calibrated arm.
+    uncertainty: Uncertainty | None = None  # Drawing of the result's uncertainty.
+    charts: Charts | None = None  # Charts over all views.
+    arm: ArmPicture | None = None  # Drawing of a calibrated arm.
 
     @classmethod
     def of(
@@ -133,7 +133,7 @@ class SceneDrawing:
         states = robot_states(session, calibration, evidence)
         size_m = _size_m(frames, states)
         if calibration is None:
-            return cls(session, None, frames, states, size_m, None, None, None)
+            return cls(session, None, frames, states, size_m)
         return cls(
             session,
             calibration,
@@ -147,12 +147,16 @@ class SceneDrawing:
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Logs what is the same in all views."""
+        tools = () if self.calibration is None else self.calibration.frames
         for frame, parent in self.frames.parents.items():
             entity = paths.entity_of(frame)
             if frame in self.frames.matrices:
                 pose = placed(self.frames.matrices[frame], parent, frame)
                 stream.log(entity, pose, static=True)
-            self._log_axes(stream, entity, frame)
+            is_tool = any(tool.endswith(f"_from_{frame}") for tool in tools)
+            share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
+            axes = rr.TransformAxes3D(share * _AXIS * self.size_m, show_frame=True)
+            stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
         for flange, name in self.frames.robots.items():
             base = rr.CoordinateFrame(self.frames.parents[flange])
             for part in ("links", "joints", "reach"):
@@ -234,13 +238,6 @@ class SceneDrawing:
     def _radius(self, share: float) -> float:
         return share * self.size_m
 
-    def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str) -> None:
-        tools = () if self.calibration is None else self.calibration.frames
-        is_tool = any(tool.endswith(f"_from_{frame}") for tool in tools)
-        share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
-        axes = rr.TransformAxes3D(share * _AXIS * self.size_m, show_frame=True)
-        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
-
     def _carried_by(self, flange: str) -> list[str]:
         return [name for name, parent in self.frames.parents.items() if parent == flange]
 
@@ -259,15 +256,11 @@ class SceneDrawing:
         """All positions of a flange; those of unused views in another colour."""
         stops = paths.part_of(paths.STOPS, self.frames.robots[flange])
         frame = rr.CoordinateFrame(self.frames.parents[flange])
-        poses_by_view = {
-            view: state.pose for view, state in self.states[flange].items() if not state.is_past
-        }
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
-            is_rejected = name == paths.REJECTED
             poses = [
-                array
-                for view, array in poses_by_view.items()
-                if (view in self._rejected) is is_rejected
+                state.pose
+                for view, state in self.states[flange].items()
+                if not state.is_past and (view in self._rejected) is (name == paths.REJECTED)
             ]
             if not poses:
                 continue
@@ -308,12 +301,11 @@ class SceneDrawing:
             {} if self.calibration is None else result_parts.calibrated_robots(self.calibration)
         )
         robot, entity = models.get(name), paths.named(paths.ROBOT, name)
-        arms: list[FloatArray | None] = []
-        strips: list[list[FloatArray]] = []
-        for state in states:
-            arms.append(None if state is None else state.link_frames(robot))
-            is_line = state is not None and arms[-1] is None
-            strips.append([np.array([np.zeros(3), state.pose[:3, 3]])] if state and is_line else [])
+        arms = [None if state is None else state.link_frames(robot) for state in states]
+        strips = [
+            [np.array([np.zeros(3), state.pose[:3, 3]])] if state and links is None else []
+            for state, links in zip(states, arms, strict=True)
+        ]
         log_arms(stream, arms, entity)
         style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
         stream.log(f"{entity}/reach", style, static=True)

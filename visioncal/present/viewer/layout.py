@@ -138,19 +138,14 @@ def _overview(
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
         return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
     title = "Image: green detected, blue predicted, red residual"
-    image = image_view(title, paths.IMAGE, _bounds(contents))
+    # With several cameras, room for the largest image.
+    cameras = {} if contents.cell is None else contents.cell.cameras
+    sizes = np.array([camera.camera.resolution for camera in cameras.values()], dtype=float)
+    width, height = sizes.max(axis=0) if len(sizes) else (0.0, 0.0)
+    bounds = rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height)) if width else None
+    image = image_view(title, paths.IMAGE, bounds)
     right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
-
-
-def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
-    """Bounds of the largest image of several cameras; None for one camera."""
-    cameras = {} if contents.cell is None else contents.cell.cameras
-    sizes = [camera.camera.resolution for camera in cameras.values()]
-    if not sizes:
-        return None
-    width, height = (float(max(pair)) for pair in zip(*sizes, strict=True))
-    return rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
 
 
 def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
@@ -166,17 +161,10 @@ def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.C
         note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
         tabs.append(rrb.Horizontal(note, name="Arm"))
     if any(section.thermal is not None for section in sections):
-        tabs.append(_warming())
+        drift = rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM)
+        rise = rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K)
+        tabs.append(rrb.Vertical(drift, rise, name="Temperature"))
     return tabs
-
-
-def _warming() -> rrb.Container:
-    """Drift of the arm by view, and the temperature rise of the warmest link."""
-    return rrb.Vertical(
-        rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM),
-        rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K),
-        name="Temperature",
-    )
 
 
 def _arm(arm: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
@@ -198,22 +186,16 @@ def _arm(arm: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
-def verdict_views(verdict: Verdict | None) -> rrb.Container | rrb.View:
-    """The verdict's text, below a strip in its colour if there is a verdict."""
-    text = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
-    if verdict is None:
-        return text
-    strip = rrb.Spatial2DView(
-        name=verdict.headline,
-        origin=paths.VERDICT_STRIP,
-        background=[*colours.VERDICT[verdict.status]],
-    )
-    return rrb.Vertical(strip, text, row_shares=[1, 8], name="Verdict")
-
-
 def _verdict(contents: _Contents, verdict: Verdict | None) -> rrb.Container | rrb.View:
-    """The verdict, with tools and fixtures in a second tab."""
-    view = verdict_views(verdict)
+    """The verdict's text below a strip in its colour, with tools and fixtures in a second tab."""
+    view: rrb.Container | rrb.View = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    if verdict is not None:
+        strip = rrb.Spatial2DView(
+            name=verdict.headline,
+            origin=paths.VERDICT_STRIP,
+            background=[*colours.VERDICT[verdict.status]],
+        )
+        view = rrb.Vertical(strip, view, row_shares=[1, 8], name="Verdict")
     if not contents.frames:
         return view
     tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
@@ -252,24 +234,19 @@ def _coverage(contents: _Contents) -> rrb.Container:
 
 def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
     """Charts of viewing directions and rotation axes."""
-    directions = _disc(
-        "Where the camera looks from, about the target's normal",
-        paths.DIRECTIONS,
-        DIRECTIONS_RINGS_DEG,
-    )
-    axes = _disc(
-        "Axes of rotation from view to view, about the flange's z",
-        paths.ROTATION_AXES,
-        AXES_RINGS_DEG,
-    )
-    return directions, axes
-
-
-def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DView:
-    """A chart of directions, with room for labels around its rim."""
-    reach_deg = 1.2 * rings_deg[-1]
-    bounds = rrb.VisualBounds2D(x_range=(-reach_deg, reach_deg), y_range=(-reach_deg, reach_deg))
-    return image_view(f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})", entity, bounds)
+    views = []
+    for name, entity, rings_deg in (
+        ("Where the camera looks from, about the target's normal", paths.DIRECTIONS,
+         DIRECTIONS_RINGS_DEG),
+        ("Axes of rotation from view to view, about the flange's z", paths.ROTATION_AXES,
+         AXES_RINGS_DEG),
+    ):  # fmt: skip
+        # With room for labels around the rim.
+        reach_deg = (-1.2 * rings_deg[-1], 1.2 * rings_deg[-1])
+        bounds = rrb.VisualBounds2D(x_range=reach_deg, y_range=reach_deg)
+        title = f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})"
+        views.append(image_view(title, entity, bounds))
+    return views[0], views[1]
 
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
