@@ -109,36 +109,25 @@ _OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation conditio
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
     """Content of calibration.json; what was not computed is absent."""
-    if calibration.cell is not None:
-        return write(CellForm, _cell_form(calibration, calibration.cell))
-    form = CalibrationForm(
-        # Derived from other sections; written for other readers.
-        ray_frame=calibration.ray_frame,
-        conditions=calibration.conditions,
-        **_head(calibration),
-        **{name: getattr(calibration, name) for name in _OF_PAIR},
-    )
-    return write(CalibrationForm, form) | write(CalibrationSections, calibration)
-
-
-def _cell_form(calibration: "Calibration", cell: CellResult) -> CellForm:
-    validation = calibration.validation
-    return CellForm(
-        views=tuple(CellView.of(cell.tree, view) for view in calibration.views),
-        validation=validation if validation.is_of_unseen else None,
-        conditions=calibration.conditions,
-        **_head(calibration),
-        **{name: getattr(calibration, name) for name in _OF_CELL},
-    )
-
-
-def _head(calibration: "Calibration") -> dict[str, Any]:
-    """Fields of all forms that a calibration holds in other types."""
-    return {
+    # Conditions and `ray_frame` derive from other sections, and are written for other readers.
+    head: dict[str, Any] = {
         "schema": SCHEMA,
         "session": SessionForm(calibration.session_name, calibration.session_sha256),
         "joint_covariance": JointCovariance.of(calibration.edges, calibration.joint_covariance),
+        "conditions": calibration.conditions,
     }
+    cell, validation = calibration.cell, calibration.validation
+    if cell is None:
+        fields = {name: getattr(calibration, name) for name in _OF_PAIR}
+        form = CalibrationForm(ray_frame=calibration.ray_frame, **head, **fields)
+        return write(CalibrationForm, form) | write(CalibrationSections, calibration)
+    whole = CellForm(
+        views=tuple(CellView.of(cell.tree, view) for view in calibration.views),
+        validation=validation if validation.is_of_unseen else None,
+        **head,
+        **{name: getattr(calibration, name) for name in _OF_CELL},
+    )
+    return write(CellForm, whole)
 
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,57 +137,30 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         DataError: It is of another schema, or no calibration; the message names the field.
     """
     check_schema(document)
+    form: CalibrationForm | CellForm
     if "tree" in document:
-        return _cell_fields(read(CellForm, document, ""))
-    form = read(CalibrationForm, document, "")
-    _check_camera(form)
-    known_keys = set().union(*(entry.keys for entry in entries(CalibrationForm)))
-    rest = {key: value for key, value in document.items() if key not in known_keys}
-    fields = {name: getattr(form, name) for name in _OF_PAIR}
-    return _head_fields(form) | fields | read_fields(CalibrationSections, rest, "")
-
-
-def _head_fields(form: CalibrationForm | CellForm) -> dict[str, Any]:
-    """Inverse of `_head`."""
-    return {
+        form = read(CellForm, document, "")
+        cell, views = form.cell, tuple(view.result(form.cell.tree) for view in form.views)
+        # What is derived is not on disk.
+        fields: dict[str, Any] = {"mount": cell.mount, "solvers": {}, "noise": {}, "views": views}
+        fields |= {"rms": rms_of(views), "validation": form.validation or Validation.of("", views)}
+        fields |= {name: getattr(form, name) for name in _OF_CELL}
+    else:
+        form = read(CalibrationForm, document, "")
+        camera = edge_names(form.mount)[0]
+        if camera not in form.edges:
+            raise DataError(
+                f"transforms.{camera} is missing, and mount is {form.mount!r}.",
+                culprits=[f"transforms.{camera}"],
+                next_step="Calibrate the session again.",
+            )
+        known_keys = set().union(*(entry.keys for entry in entries(CalibrationForm)))
+        rest = {key: value for key, value in document.items() if key not in known_keys}
+        fields = {name: getattr(form, name) for name in _OF_PAIR}
+        fields |= read_fields(CalibrationSections, rest, "")
+    return fields | {
         # As a session's: nothing in it may steer a terminal.
         "session_name": one_line(form.session.name),
         "session_sha256": form.session.sha256,
         "joint_covariance": form.joint_covariance.matrix,
-    }
-
-
-def _check_camera(form: CalibrationForm) -> None:
-    """Checks that the camera's transform is present.
-
-    Raises:
-        DataError: It is not.
-    """
-    camera = edge_names(form.mount)[0]
-    if camera not in form.edges:
-        raise DataError(
-            f"transforms.{camera} is missing, and mount is {form.mount!r}.",
-            culprits=[f"transforms.{camera}"],
-            next_step="Calibrate the session again.",
-        )
-
-
-def _cell_fields(form: CellForm) -> dict[str, Any]:
-    views = tuple(view.result(form.cell.tree) for view in form.views)
-    fields = _head_fields(form) | _derived_fields(form.cell, views)
-    if form.validation is not None:
-        fields["validation"] = form.validation
-    return fields | {name: getattr(form, name) for name in _OF_CELL}
-
-
-def _derived_fields(cell: CellResult, views: tuple[ViewResult, ...]) -> dict[str, Any]:
-    """Fields of a whole cell's calibration that are derived and not on disk."""
-    return {
-        "cell": cell,
-        "mount": cell.mount,
-        "solvers": {},
-        "noise": {},
-        "views": views,
-        "rms": rms_of(views),
-        "validation": Validation.of("", views),
     }

@@ -33,7 +33,18 @@ def selected_fields(
         DataError: See `Calibration.of`.
     """
     chosen = _chosen(whole, choice, needs)
-    chain = _transforms(whole.tree, chosen)
+    in_hand = chosen.mount == "eye-in-hand"
+    on_camera, on_target = ("flange", "base") if in_hand else ("base", "flange")
+    frames = {"flange": chosen.flange, "base": chosen.base}
+    # Camera and target, each with its Jacobian by all edges.
+    chain = {
+        name: whole.tree.compose(frames[parent], child)
+        for name, parent, child in (
+            (f"{on_camera}_from_cam", on_camera, chosen.camera),
+            (f"{on_target}_from_target", on_target, chosen.target),
+        )
+        if child
+    }
     empty = np.zeros((0, len(whole.joint_covariance)))
     jacobian = np.concatenate([empty, *(pair[1] for pair in chain.values())])
     covariance = jacobian @ whole.joint_covariance @ jacobian.T
@@ -47,6 +58,8 @@ def selected_fields(
     method = whole.validation.method if whole.validation.is_of_unseen else ""
     rms, target = rms_of(views), object_name(chosen.target, "target")
     camera = cell.lenses.get(chosen.camera)
+    by_robot = {} if cell.uncertainty is None else cell.uncertainty.noise_95
+    intervals = {f"robot_{name}": pair for name, pair in by_robot.get(robot, {}).items()}
     return {
         "mount": chosen.mount,
         "edges": {
@@ -64,7 +77,7 @@ def selected_fields(
         "frames": _frames(whole.tree, chosen),
         **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
         "clock": cell.details.clocks.get(f"{chosen.camera} and robot {robot}"),
-        "uncertainty": _intervals(cell, chosen),
+        "uncertainty": NoiseIntervals(noise_95=intervals) if intervals else None,
         "board": whole.boards.get(target),
         "boards": {},
         "rig": whole.rigs.get(target),
@@ -113,18 +126,6 @@ def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Ch
     )
 
 
-def _transforms(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Transforms of camera and target by name, each with its Jacobian by all edges."""
-    in_hand = chosen.mount == "eye-in-hand"
-    camera_parent, target_parent = ("flange", "base") if in_hand else ("base", "flange")
-    frames = {"flange": chosen.flange, "base": chosen.base}
-    ends = {
-        f"{camera_parent}_from_cam": (frames[camera_parent], chosen.camera),
-        f"{target_parent}_from_target": (frames[target_parent], chosen.target),
-    }
-    return {name: tree.compose(*pair) for name, pair in ends.items() if pair[1]}
-
-
 def _noise(cell: CellResult, chosen: Chosen, rms: Rms) -> dict[str, float]:
     """Noise levels of corners and robot."""
     # For measured poses without corners, the combined noise is from this pair's scatter: the
@@ -154,14 +155,6 @@ def _frames(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:
         elif parent.startswith("base") and not robots_between(tree.parents, chosen.base, parent):
             frames[f"base_from_{child}"] = replace(frame, edge=tree.between(chosen.base, child))
     return frames
-
-
-def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:
-    """Intervals of the robot's noise levels."""
-    by_robot = {} if cell.uncertainty is None else cell.uncertainty.noise_95
-    intervals = by_robot.get(chosen.robot or "robot", {})
-    prefixed = {f"robot_{name}": pair for name, pair in intervals.items()}
-    return NoiseIntervals(noise_95=prefixed) if prefixed else None
 
 
 def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:

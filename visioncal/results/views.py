@@ -141,25 +141,20 @@ class Validation:
         """
         if not method:
             return cls(_NOT_LEFT_OUT, rms_of(views), holdout_rms(views))
-        pairs = _pair_residuals(views) if by_pair else ()
+        groups: dict[tuple[str, str], list[ViewResult]] = {}
+        for view in views if by_pair else ():
+            if view.left_out_mm is not None:
+                groups.setdefault((view.seer, view.seen), []).append(view)
+        pairs = tuple(
+            PairResiduals(views=len(group), rms=left_out_rms(group), **_names(group[0]))
+            for group in groups.values()
+        )
         return cls(method, left_out_rms(views), holdout_rms(views), pairs)
 
     @property
     def is_of_unseen(self) -> bool:
         """Whether views were left out; else these are residuals of the fit."""
         return self.method != _NOT_LEFT_OUT
-
-
-def _pair_residuals(views: Iterable[ViewResult]) -> tuple[PairResiduals, ...]:
-    """Residuals of left-out views by camera and target."""
-    pairs: dict[tuple[str, str], list[ViewResult]] = {}
-    for view in views:
-        if view.left_out_mm is not None:
-            pairs.setdefault((view.seer, view.seen), []).append(view)
-    return tuple(
-        PairResiduals(views=len(mine), rms=left_out_rms(mine), **_names(mine[0]))
-        for mine in pairs.values()
-    )
 
 
 def rms_of(views: Iterable[ViewResult]) -> Rms:
