@@ -26,7 +26,6 @@ from visioncal.simulation.layout import (
     Second,
     Swept,
 )
-from visioncal.simulation.observing import simulate
 from visioncal.simulation.optics import (
     CAMERAS,
     fine_camera,
@@ -36,12 +35,11 @@ from visioncal.simulation.optics import (
     wide_camera,
 )
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
+from visioncal.simulation.recordings import Round, WarmUpOptions, simulate, simulate_warm_up, sweep
 from visioncal.simulation.records import cell_session, measured_poses, write_session
 from visioncal.simulation.render import RenderScene, prepare_scene, render
-from visioncal.simulation.sweep import sweep
 from visioncal.simulation.touching import touch
 from visioncal.simulation.truth import Truth, read_truth, truth_path
-from visioncal.simulation.warmup import Round, WarmUpOptions, simulate_warm_up
 
 __all__ = [
     "BOARDS",

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
 from visioncal.session import frame_name
-from visioncal.simulation import network_postures, one_robot
+from visioncal.simulation import network_postures
 from visioncal.simulation.arms import DhArm, arm_named, forward, inverse
+from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
 from visioncal.simulation.cell import (
     InstrumentReading,
     SimulatedCell,
@@ -21,63 +21,64 @@ from visioncal.simulation.cell import (
 )
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.heat import Heat, heated_flanges, warm_up
-from visioncal.simulation.imaging import board_in_view, detected, visible_corners
 from visioncal.simulation.layout import CellOptions, NetworkOptions
-from visioncal.simulation.poses import Viewpoints, filling_m
-from visioncal.simulation.sweep_path import with_sweep
+from visioncal.simulation.optics import project, sees
+from visioncal.simulation.options import CameraOptions
+from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX, Viewpoints, filling_m
 
+# Corners closer to the image's edge are not detected [px].
+EDGE_PX = 2.0
+# Smallest cosine of the angle between view and board normal.
+_LEAST_COSINE = 0.5
 # Corresponding sources of randomness in cells with several robots.
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
 
 
-@typed
-def simulate(
-    options: CellOptions | NetworkOptions, postures: FloatArray | None = None
-) -> SimulatedCell:
-    """Builds a cell, moves its robots and observes its boards.
+def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
+    """(s,) mask of stops at which a board is in view and not too oblique."""
+    points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
+    points = points + cam_from_target[:, None, :3, 3]
+    directions = points / np.linalg.norm(points, axis=2, keepdims=True)
+    facing = np.einsum("mni,mi->mn", directions, cam_from_target[:, :3, 2]) > _LEAST_COSINE
+    visible = facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1)
+    if not visible.any():
+        return np.asarray(visible)
+    share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
+    visible[visible] = share >= (LEAST_SHARE if detectable_in_part(sheet.target) else 1.0)
+    return np.asarray(visible)
 
-    Args:
-        options: Options of the cell. The same options give the same cell.
-        postures: (m, n) joint angles of the robot of `CellOptions`, one row per stop, whether or
-            not the camera sees the board there [rad]; None draws postures with a board in the
-            image.
 
-    Returns:
-        The cell with true and reported values.
+def visible_corners(
+    camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int
+) -> Corners:
+    """Exact corners of a sheet inside the image of one view."""
+    points = corners_m(sheet) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    ids = np.flatnonzero(sees(camera.camera, points, EDGE_PX)).astype(np.int64)
+    return Corners(view, ids, project(camera.camera, points[ids]), camera.blur_px)
 
-    Raises:
-        DataError: An arm is unknown, a camera's coefficients do not fit its model, or a robot
-            cannot reach enough poses with a board in view.
+
+def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
+    """Corners of a view as detected, with noise.
+
+    The numbering of a symmetric board starts at the upper left.
     """
-    if isinstance(options, CellOptions):
-        cell = observed(_one_robot_cell(options, postures))
-        wrong = [sight.view for sight in cell.sights if sight.stop in cell.robot.wrong_stops]
-        return replace(cell, wrong_views=tuple(wrong))
-    if postures is not None:
-        raise DataError("simulation: postures are taken by a cell of one robot alone.")
-    mountings = network_postures.mounted(options)
-    cell = observed(_moved_cell(options, mountings, network_postures.postures(options, mountings)))
-    cell = with_faults(cell)
-    pushed = replace(
-        cell, mountings={name: array[-1] for name, array in _parent_poses(cell).items()}
-    )
-    for swept in options.sweeps:
-        cell = with_sweep(cell, swept, pushed)
-    return cell
+    corners = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
+    if not is_symmetric(sheet.target) or not len(corners.ids):
+        return corners
+    if corners.px[0].sum() <= corners.px[-1].sum():
+        return corners
+    last = sheet.target.columns * sheet.target.rows - 1
+    return replace(corners, ids=(last - corners.ids)[::-1], px=corners.px[::-1])
 
 
-def _one_robot_cell(options: CellOptions, postures: FloatArray | None) -> SimulatedCell:
-    """A cell of one robot and one camera, before observations."""
-    mountings = one_robot.mounted(options)
-    if postures is None:
-        joints = one_robot.postures(options, mountings)
-    else:
-        joints = np.array(postures, dtype=float)
-        options = replace(options, views=len(joints))
-    return _moved_cell(options, one_robot.pushed(options, mountings), {"": joints})
+def is_symmetric(target: Target) -> bool:
+    """Whether a board is invariant under a half turn."""
+    if target.kind == "circles":
+        return not target.asymmetric or target.rows % 2 == 0
+    return target.kind == "checkerboard" and (target.columns + target.rows) % 2 == 0
 
 
-def _moved_cell(
+def moved_cell(
     options: CellOptions | NetworkOptions,
     mountings: Mapping[str, FloatArray],
     joints_by_robot: Mapping[str, FloatArray],
@@ -197,7 +198,7 @@ def _need(cell: SimulatedCell, needed: dict[str, bool], first: str, second: str)
         needed[robot] = needed.get(robot, False) or position == 0
 
 
-def _parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
+def parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
     """(s, 4, 4) poses of the frames on their parents at each stop."""
     layout = cell.layout
     poses = {
@@ -219,7 +220,7 @@ def _parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
 
 def _cell_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
     """(s, 4, 4) true poses of the frames in the cell at each stop."""
-    poses = _parent_poses(cell)
+    poses = parent_poses(cell)
     flanges = {frame_name("flange", name): robot for name, robot in cell.robots.items()}
     for (flange, robot), name in zip(flanges.items(), cell.robots, strict=True):
         base = poses.get(frame_name("base", name), np.eye(4))

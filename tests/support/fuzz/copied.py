@@ -18,7 +18,7 @@ from visioncal.simulation import (
     sweep,
 )
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
-from visioncal.simulation.warmup import Round
+from visioncal.simulation.recordings import Round
 
 _PLACES = tuple(f"{of}{axis}_m" for of in ("", "cft_", "meas_") for axis in "xyz")
 _MOUNTS = ("eye-in-hand", "eye-to-hand")
