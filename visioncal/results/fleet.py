@@ -187,31 +187,20 @@ def _figure_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
                 camera = row.camera if field == "focal_px" else ""
                 groups[row.robot, camera].append((row.name, value))
         for members in groups.values():
-            if len(members) >= FEWEST:
-                outliers += _outliers(members, measure)
+            if len(members) < FEWEST:
+                continue
+            logs = np.log([value for _, value in members])
+            median = float(np.median(logs))
+            spread = max(_MAD * float(np.median(np.abs(logs - median))), measure.spread)
+            scores = (logs - median) / spread
+            scores = scores if measure.is_worse_above else np.abs(scores)
+            usual = f"where {figure(math.exp(median))} {measure.unit} is usual"
+            outliers += [
+                (name, score, f"{measure.words} {figure(value)} {measure.unit}, {usual}")
+                for (name, value), score in zip(members, scores.tolist(), strict=True)
+                if score > _LIMIT
+            ]
     return outliers
-
-
-def _outliers(
-    members: Sequence[tuple[str, float]], measure: _Measure
-) -> list[tuple[str, float, str]]:
-    logs = np.log([value for _, value in members])
-    median = float(np.median(logs))
-    spread = max(_MAD * float(np.median(np.abs(logs - median))), measure.spread)
-    scores = (logs - median) / spread
-    if not measure.is_worse_above:
-        scores = np.abs(scores)
-    usual = float(np.exp(median))
-    return [
-        (
-            name,
-            score,
-            f"{measure.words} {figure(value)} {measure.unit}, "
-            f"where {figure(usual)} {measure.unit} is usual",
-        )
-        for (name, value), score in zip(members, scores.tolist(), strict=True)
-        if score > _LIMIT
-    ]
 
 
 def with_changes(

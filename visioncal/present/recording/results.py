@@ -100,7 +100,7 @@ def _draw(
     calibration: Calibration | None,
     evidence: Mapping[int, ViewEvidence],
 ) -> None:
-    stream = recorder.stream
+    stream, views = recorder.stream, dict(enumerate(session.views))
     scene = SceneDrawing.of(session, calibration, evidence)
     overlay = overlays.Overlay.of(session, calibration, evidence)
     scene.log_static(stream)
@@ -110,25 +110,17 @@ def _draw(
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)
     if calibration is not None:
-        _log_views(stream, session, calibration, scene)
+        rows = {view.number: row for row, view in views.items()}
+        sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
+        unposed = {row: scene.unposed(view.number) for row, view in views.items()}
+        notes.log_views(stream, sights, views, unposed)
+        for name, arm in calibration.by_name.robots.items():
+            drifts = () if arm.thermal is None else arm.thermal.views
+            shown = {rows[drift.view]: drift for drift in drifts if drift.view in rows}
+            for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
+                values = {row: float(getattr(drift, attribute)) for row, drift in shown.items()}
+                notes.log_scalars(stream, paths.part_of(plot, name), values)
     recorder.keep()
-
-
-def _log_views(
-    stream: rr.RecordingStream, session: Session, calibration: Calibration, scene: SceneDrawing
-) -> None:
-    """Logs each view's status, and the drift of the arms."""
-    views = dict(enumerate(session.views))
-    rows = {view.number: row for row, view in views.items()}
-    sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
-    unposed = {row: scene.unposed(view.number) for row, view in views.items()}
-    notes.log_views(stream, sights, views, unposed)
-    for name, arm in calibration.by_name.robots.items():
-        drifts = () if arm.thermal is None else arm.thermal.views
-        for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
-            values = {rows[drift.view]: float(getattr(drift, attribute)) for drift in drifts
-                      if drift.view in rows}  # fmt: skip
-            notes.log_scalars(stream, paths.part_of(plot, name), values)
 
 
 def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, index: int) -> None:

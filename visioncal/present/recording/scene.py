@@ -161,7 +161,15 @@ class SceneDrawing:
             base = rr.CoordinateFrame(self.frames.parents[flange])
             for part in ("links", "joints", "reach"):
                 stream.log(f"{paths.named(paths.ROBOT, name)}/{part}", base, static=True)
-            self._log_mount(stream, flange)
+            # Lines from the flange to what it carries.
+            for child in self._carried_by(flange):
+                line = rr.LineStrips3D(
+                    [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
+                    colors=colours.JOINT,
+                    radii=self._radius(2 * _LINE),
+                )
+                entity = f"{paths.entity_of(flange)}/{flange}_from_{child}"
+                stream.log(entity, rr.CoordinateFrame(flange), line, static=True)
             self._log_stops(stream, flange)
         if self.calibration is not None:
             self._log_things(stream, self.calibration)
@@ -240,17 +248,6 @@ class SceneDrawing:
 
     def _carried_by(self, flange: str) -> list[str]:
         return [name for name, parent in self.frames.parents.items() if parent == flange]
-
-    def _log_mount(self, stream: rr.RecordingStream, flange: str) -> None:
-        """Draws lines from a flange to what it carries."""
-        for child in self._carried_by(flange):
-            line = rr.LineStrips3D(
-                [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
-                colors=colours.JOINT,
-                radii=self._radius(2 * _LINE),
-            )
-            entity = f"{paths.entity_of(flange)}/{flange}_from_{child}"
-            stream.log(entity, rr.CoordinateFrame(flange), line, static=True)
 
     def _log_stops(self, stream: rr.RecordingStream, flange: str) -> None:
         """All positions of a flange; those of unused views in another colour."""
@@ -349,15 +346,11 @@ class SceneDrawing:
                 continue
             ends = [self.in_cell(name, view.number) for name in (sight.seer, sight.seen)]
             if ends[0] is not None and ends[1] is not None:
-                strips[row] = [np.array([ends[0][:3, 3], self._middle(sight.seen, ends[1])])]
+                target = self._boards.get(sight.seen)
+                middle = np.zeros(3) if target is None else board.outline(target).mean(axis=0)
+                strips[row] = [np.array([ends[0][:3, 3], apply(ends[1], middle[None])[0]])]
         self._send_lines(stream, paths.SIGHT_LINE, strips, rejected, 2.0 * _LINE)
         log_image_frames(stream, paths.IMAGE, image_frames(self.session, self.calibration))
-
-    def _middle(self, frame: str, cell_from_frame: FloatArray) -> FloatArray:
-        """Centre of what was seen, in the cell."""
-        target = self._boards.get(frame)
-        middle = np.zeros(3) if target is None else board.outline(target).mean(axis=0)
-        return np.asarray(cell_from_frame[:3, :3] @ middle + cell_from_frame[:3, 3])
 
     def _send_lines(
         self,

@@ -1,6 +1,6 @@
 """Plots of an arm: residuals before and after calibration, uncertainty, springs and drift."""
 
-from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ from visioncal.present.report.plotting import (
     logarithmic,
     panels,
 )
-from visioncal.results.arm import ArmResult, ElasticResult, ThermalResult, UnseenView
+from visioncal.results.arm import ArmResult, ElasticResult, ThermalResult
 
 # Gap between cross-validation views and hold-out views, in views; most labelled views.
 _GAP, _MOST_LABELS = 1.5, 25
@@ -41,8 +41,6 @@ _PANELS = 3
 
 _BEFORE, _AFTER = CHECK, ACCENT
 
-_Pair = Callable[[UnseenView], tuple[float | None, float | None]]
-
 
 @drawn
 def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
@@ -52,12 +50,11 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
     views, count = [*arm.left_out, *arm.holdout], len(arm.left_out)
     positions = np.arange(float(len(views)))
     positions[count:] += _GAP
-    kinds: list[tuple[str, _Pair]] = [("position [mm]", lambda view: (view.nominal_mm, view.mm))]
-    if all(view.deg is not None for view in views):
-        kinds.append(("orientation [deg]", lambda view: (view.nominal_deg, view.deg)))
+    kinds = [("position [mm]", "nominal_mm", "mm"), ("orientation [deg]", "nominal_deg", "deg")]
+    kinds = kinds if all(view.deg is not None for view in views) else kinds[:1]
     figure, grid = panels(WIDE_IN, 1.7 * len(kinds) + 0.2, len(kinds), sharex=True)
-    for axes, (label, pair) in zip(grid[:, 0], kinds, strict=True):
-        pairs = np.maximum(np.array([pair(view) for view in views], dtype=float), _LEAST)
+    for axes, (label, *names) in zip(grid[:, 0], kinds, strict=True):
+        pairs = np.maximum([[getattr(view, name) for name in names] for view in views], _LEAST)
         logarithmic(axes.yaxis)
         axes.set_ylabel(label)
         axes.grid(visible=False, axis="x")
@@ -85,36 +82,35 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
 
 
 @drawn
-def side_map(arm: ArmResult, stops_m: FloatArray) -> tuple[Figure, str]:
-    """Map of the workspace from the side, with the stops' (m, 3) flange positions [m]."""
-    labels = ("distance from the base's axis [m]", "base z [m]")
-    return _map(arm, _from_the_side(arm.map_places_m), _from_the_side(stops_m), labels, "side")
-
-
-@drawn
-def top_map(arm: ArmResult, stops_m: FloatArray) -> tuple[Figure, str]:
-    """Map of the workspace from above; see `side_map`."""
-    return _map(arm, arm.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top")
-
-
-def _from_the_side(places_m: FloatArray) -> FloatArray:
-    return np.stack([np.hypot(places_m[:, 0], places_m[:, 1]), places_m[:, 2]], axis=1)
-
-
-def _map(
-    arm: ArmResult, places_m: FloatArray, stops_m: FloatArray, labels: tuple[str, str], name: str
+def workspace(
+    arm: ArmResult, stops_m: FloatArray, side: Literal["side", "top"]
 ) -> tuple[Figure, str]:
-    """Draws (k, 2) places with the largest sigmas on top, and the stops as crosses."""
-    order = np.argsort(arm.map_sigmas_mm)
+    """Map of the workspace with the largest sigmas on top, and the stops as crosses.
+
+    Args:
+        arm: The arm.
+        stops_m: (m, 3) flange positions of the stops [m].
+        side: Seen from the side, by distance from the base's axis and height; or from the top.
+    """
+
+    def seen(places_m: FloatArray) -> FloatArray:
+        if side == "top":
+            return places_m[:, :2]
+        return np.stack([np.hypot(places_m[:, 0], places_m[:, 1]), places_m[:, 2]], axis=1)
+
+    order, stops = np.argsort(arm.map_sigmas_mm), seen(stops_m)
     low, high = np.percentile(arm.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
     figure, ((axes,),) = panels(MIDDLE_IN, 0.8 * MIDDLE_IN)
+    labels = ("base x [m]", "base y [m]")
+    labels = labels if side == "top" else ("distance from the base's axis [m]", "base z [m]")
     axes.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
-    shown = dots(axes, places_m[order], arm.map_sigmas_mm[order], vmin=low, vmax=high, s=26.0)
-    axes.plot(stops_m[:, 0], stops_m[:, 1], "x", color=INK, markersize=4.5)
+    places, sigmas_mm = seen(arm.map_places_m)[order], arm.map_sigmas_mm[order]
+    shown = dots(axes, places, sigmas_mm, vmin=low, vmax=high, s=26.0)
+    axes.plot(stops[:, 0], stops[:, 1], "x", color=INK, markersize=4.5)
     axes.plot([0.0], [0.0], "s", color=INK, markersize=6.0)
     colour_bar(axes, shown, "sigma [mm]")
     sigmas = f"{significant(low)} to {significant(high)} mm"
-    return figure, f"The workspace from the {name}, sigma {sigmas}"
+    return figure, f"The workspace from the {side}, sigma {sigmas}"
 
 
 @drawn

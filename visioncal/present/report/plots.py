@@ -1,7 +1,6 @@
 """Plots of the report: residuals by view and joint angle, coverage, tools and fixtures."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import log, nearest_rotation
-from visioncal.core.types import FloatArray
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import directions_chart
 from visioncal.present.placements import placement, target_frames
@@ -35,7 +33,7 @@ from visioncal.present.report.plotting import (
     legend,
     panels,
 )
-from visioncal.results import Calibration, Frame, Observation, Rms, ViewResult
+from visioncal.results import Calibration, Frame, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session
@@ -49,35 +47,34 @@ _MOST_CHARACTERS, _LONGEST, _MOST_LABELS = 36, 12, 24
 _HEADROOM = 1.25
 
 
-@dataclass(frozen=True)
-class Bar:
-    """One bar of a bar chart."""
-
-    label: str  # Axis label.
-    value: float | None  # Height; None where unknown.
-    used: bool  # Whether it was used; used bars define the scale.
-    colour: str  # Colour of the bar and its mark.
-
-
-def draw_bars(axes: Axes, bars: Sequence[Bar], rms: float | None, limit: float | None) -> None:
+def draw_bars(
+    axes: Axes,
+    heights: Sequence[float | None],
+    used: Sequence[bool],
+    colours: Sequence[str],
+    rms: float | None,
+    limit: float | None = None,
+) -> None:
     """Draws a bar chart, clipped to the scale of the used bars.
 
     Args:
         axes: Axes to draw in.
-        bars: Bars from left to right.
+        heights: Heights of the bars from left to right; None where unknown.
+        used: Whether each was used.
+        colours: Colour of each bar and its mark.
         rms: Root mean square of the used bars, drawn as a line; None for no line.
         limit: Value where doubt begins: a line if the scale contains it, else a text. None for
             neither.
     """
-    values = np.array([np.nan if bar.value is None else bar.value for bar in bars])
-    used = np.array([bar.used for bar in bars])
-    shown = values[used & np.isfinite(values)] if used.any() else values[np.isfinite(values)]
+    values, is_used = np.array(heights, dtype=float), np.array(used, dtype=bool)
+    shown = values[is_used] if is_used.any() else values
+    shown = shown[np.isfinite(shown)]
     top = _HEADROOM * float(shown.max(initial=0.0)) or 1.0
-    places, colours = np.arange(len(bars)), [bar.colour for bar in bars]
+    places = np.arange(len(values))
     axes.bar(places, np.minimum(np.nan_to_num(values), top), 0.7, color=colours, alpha=0.9)
     axes.set_ylim(0.0, 1.2 * top)
     few_ticks(axes, y=4)
-    for place in places[~used]:
+    for place in places[~is_used]:
         value, colour = values[place], colours[place]
         clipped = bool(value > top)
         height = 0.05 * top if np.isnan(value) else min(value, top)
@@ -100,28 +97,12 @@ def draw_bars(axes: Axes, bars: Sequence[Bar], rms: float | None, limit: float |
                   va="top", transform=axes.transAxes)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Measure:
-    """A kind of residual: its label, its value for a view and for many, and where doubt begins."""
-
-    label: str
-    value_of: Callable[[ViewResult], float | None]
-    rms_of: Callable[[Rms], float | None]
-    limit: float | None
-
-
 _LIMITS = CalibrationLimits()
-_MEASURES = (
-    _Measure(
-        "position [mm]", lambda view: view.residual_mm, lambda rms: rms.mm, _LIMITS.scatter_mm[0]
-    ),
-    _Measure(
-        "orientation [deg]",
-        lambda view: view.residual_deg,
-        lambda rms: rms.deg,
-        _LIMITS.scatter_deg[0],
-    ),
-    _Measure("reprojection [px]", lambda view: view.rms_px, lambda rms: rms.px, None),
+# Kinds of residuals: label, attributes of a view and of `Rms`, and where doubt begins.
+_MEASURES: tuple[tuple[str, str, str, float | None], ...] = (
+    ("position [mm]", "residual_mm", "mm", _LIMITS.scatter_mm[0]),
+    ("orientation [deg]", "residual_deg", "deg", _LIMITS.scatter_deg[0]),
+    ("reprojection [px]", "rms_px", "px", None),
 )
 
 
@@ -136,30 +117,32 @@ def residuals(
         outlying: Numbers of used views to highlight, beside the unused ones.
     """
     is_cell = calibration.cell is not None
-    measures = (replace(_MEASURES[0], limit=None),) if is_cell else _MEASURES
     by_seer: dict[str, list[ViewResult]] = {}
     for view in calibration.views:
         by_seer.setdefault(view.seer, []).append(view)
     shown = [
         (seer, views, measure)
         for seer, views in by_seer.items()
-        for measure in measures
-        if any(measure.value_of(view) is not None for view in views)
+        for measure in (_MEASURES[:1] if is_cell else _MEASURES)
+        if any(getattr(view, measure[1]) is not None for view in views)
     ]
     if not shown:
         return None
     figure, grid = panels(WIDE_IN, (1.6 if is_cell else 1.3) * len(shown) + 0.25, len(shown))
-    for axes, (seer, views, measure) in zip(grid[:, 0], shown, strict=True):
-        bars = [
-            Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
-            for view in views
-        ]
-        draw_bars(axes, bars, measure.rms_of(rms_of(views)), measure.limit)
+    for axes, (seer, views, (label, name, unit, limit)) in zip(grid[:, 0], shown, strict=True):
+        draw_bars(
+            axes,
+            [getattr(view, name) for view in views],
+            [view.used for view in views],
+            [_colour(view, outlying) for view in views],
+            getattr(rms_of(views), unit),
+            None if is_cell else limit,
+        )
         is_last = axes is grid[-1, 0]
-        label_x(axes, [bar.label for bar in bars], 25, "view" if is_last else "")
+        label_x(axes, [str(view.view) for view in views], 25, "view" if is_last else "")
         # With several cameras, each panel has other views.
         axes.tick_params(labelbottom=is_last or is_cell)
-        axes.set_ylabel(measure.label)
+        axes.set_ylabel(label)
         axes.set_title(seer, loc="left")
     return figure, "Bars: residuals of each view"
 
@@ -179,8 +162,16 @@ def image_coverage(
     seen = [view for view in evidence if view.corners is not None and view.view in used]
     if not seen or calibration.camera is None:
         return None
-    px = np.concatenate([view.corners.px for view in seen if view.corners is not None])
-    errors = np.concatenate([_corner_errors(view) for view in seen])
+    pairs = [(view.corners.px, view.predicted_px) for view in seen if view.corners is not None]
+    px = np.concatenate([detected for detected, _ in pairs])
+    # NaN without predictions.
+    predicted_px = np.concatenate(
+        [
+            np.full_like(detected, np.nan) if predicted is None else predicted
+            for detected, predicted in pairs
+        ]
+    )
+    errors = np.linalg.norm(px - predicted_px, axis=1)
     known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
     figure, ((axes,),) = panels(NARROW_IN, 0.6 + 0.75 * NARROW_IN * height / width)
@@ -194,15 +185,6 @@ def image_coverage(
         shown = dots(axes, px[known], errors[known], vmin=0.0, vmax=top, s=4.0)
         colour_bar(axes, shown, "reprojection error [px]")
     return figure, "Corners of all used views over the image"
-
-
-def _corner_errors(evidence: ViewEvidence) -> FloatArray:
-    """Reprojection errors of a view's corners [px]; NaN without predictions."""
-    if evidence.corners is None:
-        return np.zeros(0)
-    if evidence.predicted_px is None:
-        return np.full(len(evidence.corners.px), np.nan)
-    return np.asarray(np.linalg.norm(evidence.corners.px - evidence.predicted_px, axis=1))
 
 
 @drawn
@@ -316,7 +298,8 @@ def residuals_over_joints(
 @drawn
 def frame_plot(name: str, frame: Frame) -> tuple[Figure, str] | None:
     """Residual of each observation of a tool or a fixture; outliers in red."""
-    if all(observation.residual_mm is None for observation in frame.observations):
+    heights = [seen.residual_mm for seen in frame.observations]
+    if all(height is None for height in heights):
         return None
     labels = [
         seen.name
@@ -325,18 +308,12 @@ def frame_plot(name: str, frame: Frame) -> tuple[Figure, str] | None:
         for seen in frame.observations
     ]
     vertical = sum(map(len, labels)) > _MOST_CHARACTERS
-    bars = [
-        Bar(label, seen.residual_mm, seen.used, _observation_colour(seen))
-        for label, seen in zip(labels, frame.observations, strict=True)
+    used = [seen.used for seen in frame.observations]
+    colours = [
+        BAD if not seen.used else CHECK if seen.reason else ACCENT for seen in frame.observations
     ]
     figure, ((axes,),) = panels(MIDDLE_IN, 2.1 if vertical else 1.7)
-    draw_bars(axes, bars, frame.rms_mm, None)
+    draw_bars(axes, heights, used, colours, frame.rms_mm)
     label_x(axes, labels, _MOST_LABELS, "", vertical=vertical)
     axes.set_ylabel("off by [mm]")
     return figure, f"Bars: what each observation of {name} is off"
-
-
-def _observation_colour(observation: Observation) -> str:
-    if not observation.used:
-        return BAD
-    return CHECK if observation.reason else ACCENT

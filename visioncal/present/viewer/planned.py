@@ -34,30 +34,16 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     return with_panels(rrb.Tabs(_overview(places), _coverage(), active_tab=0))
 
 
-def _cell(name: str, places: FloatArray, *more: str) -> rrb.Spatial3DView:
-    entities = (
-        paths.BASE,
-        paths.ROBOT,
-        paths.FLANGE,
-        paths.CAMERA,
-        paths.TARGET,
-        paths.OBSTACLES,
-        *more,
-    )
-    # The predicted corners would clutter the frustum.
-    contents = [
-        *(f"+ {entity}/**" for entity in entities),
-        f"- {paths.IMAGE}/**",
-        f"+ {paths.IMAGE}",
-    ]
-    return space_view(name, contents, eye_on(places))
-
-
 def _overview(places: FloatArray) -> rrb.Container:
+    kinds = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET, paths.OBSTACLES)
+    entities = (*kinds, paths.STOPS, paths.WAY)
+    # The predicted corners would clutter the frustum.
+    hidden = (f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}")
+    contents = [*(f"+ {entity}/**" for entity in entities), *hidden]
+    cell = space_view("Cell: stops in blue, way in orange", contents, eye_on(places))
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
     stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
     image = image_view("The board in the image, as predicted", paths.IMAGE)
-    cell = _cell("Cell: stops in blue, way in orange", places, paths.STOPS, paths.WAY)
     right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
     return rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
 
@@ -108,8 +94,12 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
 
 def dynamics_blueprint(run: Run) -> rrb.Blueprint:
     """Layout of torques over time beside the moving arm."""
-    tabs = rrb.Tabs(_torques(run), _figures(), active_tab=0)
-    return with_panels(tabs, paths.MOTION_TIMELINE)
+    figures = rrb.Horizontal(
+        rrb.TextDocumentView(name="How well torques are predicted", origin=paths.DYNAMICS_NOTE),
+        rrb.TextDocumentView(name="Base parameters", origin=paths.PARAMETERS_NOTE),
+        name="Figures",
+    )
+    return with_panels(rrb.Tabs(_torques(run), figures, active_tab=0), paths.MOTION_TIMELINE)
 
 
 def _torques(run: Run) -> rrb.Container:
@@ -133,12 +123,4 @@ def _torques(run: Run) -> rrb.Container:
         rrb.Grid(*torques, grid_columns=2),
         name="Torques: measured grey, predicted blue, by what was known before brown",
         column_shares=[1, 2],
-    )
-
-
-def _figures() -> rrb.Container:
-    return rrb.Horizontal(
-        rrb.TextDocumentView(name="How well torques are predicted", origin=paths.DYNAMICS_NOTE),
-        rrb.TextDocumentView(name="Base parameters", origin=paths.PARAMETERS_NOTE),
-        name="Figures",
     )
