@@ -18,11 +18,11 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.identifiability import Indices
 from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import free_parameters, parameter_moves
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
 from visioncal.robot import Robot, convert_table, load_robot, table_of

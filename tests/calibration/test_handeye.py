@@ -15,6 +15,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import (
     estimate_noise,
@@ -22,7 +23,6 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.estimation.variance import PriorInformation
 from visioncal.simulation import CellOptions, measured_poses, simulate
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")

@@ -7,13 +7,13 @@ import pytest
 from support.problems import ROBOT_SIGMAS, moved, observed, true_state, world
 
 from visioncal.estimation.budget import Sources, covariance_by_source
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
 )
-from visioncal.estimation.variance import PriorInformation
 
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
 SOURCES = Sources(

@@ -17,12 +17,12 @@ from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.mixed import profile_interval
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import (
     covariance_of,
 )
-from visioncal.estimation.variance import profile_interval
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.records import cell_session

@@ -117,26 +117,6 @@ def test_noise_at_both_ends_is_no_error_of_the_arm():
     assert np.median(lasts) > SIGNIFICANT
 
 
-def test_the_slope_is_that_of_the_likelihood():
-    problem, fit = fitted(smooth, 1)
-    stops = np.arange(22)
-    likelihood = pose_errors._Likelihood.of(problem, fit.state, fit.noise, ROBOT, stops)
-    for model in pose_errors._models(problem.poses[ROBOT], fit.noise.robots[0], stops):
-        common = [
-            np.array([block.common(process) for process in model.processes])
-            for block in likelihood.blocks
-        ]
-        logs = np.log(np.append(0.8 * fit.noise.robots[0], [0.5] * len(model.processes)))
-        here = likelihood._step(common, logs)
-        for at in range(len(logs)):
-            step = 1e-4 * np.eye(len(logs))[at]
-            ends = [likelihood._step(common, logs + value).value for value in (step, -step)]
-            # The third order of a step of 1e-4, and rounding of a value of some hundreds.
-            assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(
-                here.gradient[at], abs=1e-4, rel=1e-4
-            )
-
-
 def test_many_stops_are_put_by_some_columns():
     problem, fit = fitted(lasting, 2, stops=240)
     found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)

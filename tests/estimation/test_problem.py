@@ -9,6 +9,7 @@ from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_sta
 from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import Move
 from visioncal.estimation.normal_equations import normal_equations
@@ -25,7 +26,6 @@ from visioncal.estimation.solve import (
     posterior,
     solve_problem,
 )
-from visioncal.estimation.variance import PriorInformation
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))

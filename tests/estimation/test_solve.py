@@ -10,27 +10,21 @@ from support.cells import calibrated
 from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
 from visioncal.estimation.intervals import expected_levels
+from visioncal.estimation.mixed import (
+    PriorInformation,
+)
 from visioncal.estimation.normal_equations import (
     equations_and_cost,
     normal_equations,
 )
 from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.estimation.robot_likelihood import (
-    RATIO_PRIOR,
     robot_likelihood,
 )
 from visioncal.estimation.solve import (
     fit_problem,
     left_out_residuals,
     solve_problem,
-)
-from visioncal.estimation.variance import (
-    Components,
-    PriorInformation,
-    WeightedResiduals,
-    estimate_sigmas,
-    likelihood,
-    likely_sigma,
 )
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -127,24 +121,6 @@ def test_a_level_that_may_be_zero_is_expected_to_be_what_the_corners_hide():
     assert 1e-6 < expected < 1e-4
 
 
-@LENS
-def test_the_likelihood_jacobian_as_its_differences_say(given):
-    problem, fit = answered(given, views=10, seed=4)
-    state = fit.state.moved(np.full(problem.size, 1e-5))
-    found = robot_likelihood(problem, state, fit.noise)
-    errors, jacobian = found.reduced.errors, found.reduced.jacobian[:, :, found.moving]
-
-    def at(logs):
-        return likelihood(errors, jacobian, found.components, found.known, logs, RATIO_PRIOR)
-
-    logs, step = np.log(2.0 * fit.noise.robots[0]), 1e-4
-    for level in range(2):
-        shift = step * np.eye(2)[level]
-        slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
-        # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
-        assert at(logs).gradient[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
-
-
 @pytest.mark.parametrize("kind", ["one a stop", "two a stop", "places", "combined"])
 def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
     problem, fit = answered(False, views=8, seed=6)
@@ -172,42 +148,6 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
     found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
     assert found == pytest.approx(values, abs=1e-5)
-
-
-@pytest.mark.parametrize("true_size", [0.0, 2e-3])
-def test_the_likeliest_size_of_effects_is_that_of_the_likelihood_beside_given_levels(true_size):
-    problem, fit = answered(True, views=20, seed=6)
-    found, rng = robot_likelihood(problem, fit.state, fit.noise), np.random.default_rng(0)
-    moves, count = rng.standard_normal((20, 6, 8)), 8
-    moved = found.moved(0, moves)
-    effects = true_size * rng.standard_normal(count)
-    errors, logs = found.reduced.errors + moved @ effects, np.log(fit.noise.robots[0])
-    wider, known = found.beside(0, moves), found.known.beside(count)
-
-    def value(size):
-        information = known.information.copy()
-        information[-count:, -count:] += np.eye(count) / size**2
-        given = replace(known, information=information)
-        jacobian, parts = wider.jacobian, found.components
-        return WeightedResiduals.of(errors, jacobian, parts, given, logs).value + count * np.log(
-            size
-        )
-
-    without = WeightedResiduals.of(errors, found.jacobian, found.components, found.known, logs)
-    size, gain = without.likely_size(moved, np.ones(20, dtype=bool))
-    # Effects that look like the unknowns alone are of any size, and pull at nothing.
-    taken = found.jacobian[:, :, :3]
-    more = np.concatenate([moved, taken], axis=2)
-    assert without.likely_size(more, np.ones(20, dtype=bool)) == pytest.approx((size, gain))
-    sizes = np.exp(np.arange(np.log(1e-7), np.log(1.0), 0.1))
-    values = np.array([value(item) for item in sizes])
-    # Sizes are compared in steps of a fifth, and between two of them a value is hardly larger.
-    assert gain == pytest.approx(max(without.value - values.min(), 0.0), abs=0.1)
-    if true_size:
-        assert size == pytest.approx(sizes[values.argmin()], rel=0.15)
-        assert without.value - value(size) == pytest.approx(gain, abs=1e-3)
-    else:
-        assert size < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["one a stop", "two a stop", "combined"])
@@ -262,32 +202,3 @@ def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
     monkeypatch.setattr(joint, "fit_problem", runs_away)
     with pytest.raises(ConvergenceError, match="poses of other views than the images"):
         calibrated(simulate(replace(FINE, views=6)))
-
-
-def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
-    """Only the first coordinate errs: what both have of their own is lost in the rounding."""
-    common = np.random.default_rng(2).normal(0.0, 1.0, (40, 1))
-    parts = np.tile([[1.0, 0.0], [1.0, 1.0]], (40, 1, 1))
-    sigmas, value = estimate_sigmas(
-        np.hstack([common, np.zeros((40, 1))]),
-        np.tile([[1.0], [0.0]], (40, 1, 1)),
-        Components(np.zeros((40, 2, 2)), parts.swapaxes(0, 1)),
-        PriorInformation(np.zeros((1, 1)), np.zeros(1)),
-        np.array([3.0, 3.0]),
-        np.ones(2, dtype=bool),
-    )
-    assert np.isfinite(value)
-    # Forty of them tell a level to a ninth.
-    assert sigmas[0] == pytest.approx(1.0, rel=0.4)
-    assert sigmas[1] < 1e-5
-
-
-def test_a_size_is_expected_as_large_as_values_are_beyond_their_noise():
-    covariance = np.diag([1.0, 4.0])
-    assert likely_sigma(np.array([0.5, -1.0]), covariance) == 0.0
-    # Values of fifty times their noise: their own root mean square, two of them.
-    values = np.array([50.0, 80.0])
-    expected = np.sqrt(np.mean(values**2))
-    assert likely_sigma(values, covariance) == pytest.approx(expected, rel=0.01)
-    # At twice the noise the size is as likely to be nothing.
-    assert 0.3 < likely_sigma(np.array([2.0]), np.eye(1)) < 1.0

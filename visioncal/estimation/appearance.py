@@ -21,9 +21,9 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, field_modes
 from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.variance import PriorInformation
 from visioncal.vision.camera import intrinsics, with_intrinsics
 from visioncal.vision.targets import corner_positions
 

@@ -7,7 +7,7 @@ The part that is the same in all views is absorbed by the edges: its share of th
 price of an uncalibrated arm.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,11 +15,11 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation, level_weight
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood
-from visioncal.estimation.variance import LEAST_SIGMA, Components, PriorInformation, level_weight
 from visioncal.robot import Robot
 
 # Arms are off by some 0.5 mm for each mrad.
@@ -150,51 +150,21 @@ def find_arm_errors(
     levels, start = likelihood.start_beside(robot, basis)
     if start <= _NOTHING:
         return None
-    widened = likelihood.beside(robot, basis)
     if min_gain is None:
         # Every arm has link errors: their size counts even where it hardly gains likelihood.
         min_gain = 0.0 if of_links else _LIKELY
     white_value = likelihood.white[1]
-    sigma, value = _most_likely_size(widened, size, levels, start, white_value - 0.5 * min_gain)
-    gain = 2.0 * (white_value - value)
-    if gain <= min_gain:
-        return None
-    return ArmErrors(basis, float(np.sqrt(level_weight(gain))) * sigma, gain, of_links)
-
-
-def _most_likely_size(
-    likelihood: RobotLikelihood, size: int, levels: FloatArray, start: float, enough: float
-) -> tuple[float, float]:
-    """Maximum-likelihood size of the last unknowns as random effects, with the robots' levels."""
-    # Pseudo-observations of zero, in units of their own, are one more variance component. The
-    # search stops early where the likelihood seems not to reach `enough`.
-    reduced, components = likelihood.reduced, likelihood.components
-    width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]
-    units, places = np.divmod(np.arange(size), width)
-    count = int(units[-1]) + 1
-    jacobian, part = np.zeros((count, width, columns)), np.zeros((count, width))
-    jacobian[units, places, columns - size + np.arange(size)] = 1.0
-    part[units, places] = 1.0
-    parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width))
-    parts[:-1, :-count], parts[-1, -count:] = components.parts, part
-    # Padding of the last unit belongs to no unknown.
-    padding = np.eye(width) * (1.0 - part)[:, None, :]
-    extended = replace(
-        likelihood,
-        reduced=replace(
-            reduced,
-            errors=np.pad(reduced.errors, ((0, count), (0, 0))),
-            jacobian=np.concatenate([reduced.jacobian, jacobian]),
-        ),
-        components=Components(np.concatenate([components.known, padding]), parts),
-    )
-    sigmas, value = extended.most_likely(
+    sigmas, value = likelihood.beside(robot, basis, np.ones((size, 1))).most_likely(
         np.append(levels, start),
         np.append(np.repeat(likelihood.seen, 2), True),
         np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
-        enough=enough,
+        # The search stops early where the likelihood seems not to reach the least gain.
+        enough=white_value - 0.5 * min_gain,
     )
-    return float(sigmas[-1]), value
+    gain = 2.0 * (white_value - value)
+    if gain <= min_gain:
+        return None
+    return ArmErrors(basis, float(np.sqrt(level_weight(gain)) * sigmas[-1]), gain, of_links)
 
 
 def rows_of(problem: Problem, robot: str) -> Mask:

@@ -8,10 +8,10 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import whitened
-from visioncal.estimation.variance import PriorInformation
 from visioncal.robot import Loads
 
 # Least torque at which a stop determines a joint's bend [N m], and its least share of the greatest

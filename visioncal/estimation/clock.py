@@ -18,6 +18,7 @@ from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
 from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.outliers import closed_form
 from visioncal.estimation.problem import Problem
@@ -27,7 +28,6 @@ from visioncal.estimation.solve import (
     fit_problem,
 )
 from visioncal.estimation.trajectory import Trajectory
-from visioncal.estimation.variance import PriorInformation
 
 # Frames for a start; most and fewest frames of a fit.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4

@@ -15,11 +15,11 @@ import numpy as np
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram, spectrum
-from visioncal.estimation.variance import (
+from visioncal.estimation.mixed import (
     LEAST_SIGMA,
-    Components,
-    PriorInformation,
-    estimate_sigmas,
+    MOST_SIGMA,
+    MixedModel,
+    Units,
     profile_interval,
 )
 
@@ -56,27 +56,27 @@ class Groups:
 
     def covariance(self, sigma: float) -> FloatArray:
         """Covariances (m, d, d) at a noise level [m]; identity where nothing was observed."""
-        return self._components().total(np.array([sigma]))
+        return self._units().total(np.log([sigma]))
 
-    def _components(self) -> Components:
+    def _units(self) -> Units:
         both = self.observed[:, :, None] & self.observed[:, None, :]
-        absent = np.eye(self.observed.shape[1]) * ~self.observed[:, None, :]
-        return Components(
-            np.where(both, self.known, 0.0) + absent, self.observed[None].astype(np.float64)
+        identity = np.eye(self.observed.shape[1])
+        absent = identity * ~self.observed[:, None, :]
+        return Units(
+            self.residuals,
+            self.jacobian,
+            np.where(both, self.known, 0.0) + absent,
+            (identity * self.observed[:, None, :])[None],
+            np.zeros(1, dtype=np.int64),
         )
 
     def level(self, start: float, *, free: bool = True) -> tuple[float, float]:
         """Maximum-likelihood noise [m] and its negative log-likelihood; at the start if held."""
-        size = self.jacobian.shape[2]
-        sigmas, value = estimate_sigmas(
-            self.residuals,
-            self.jacobian,
-            self._components(),
-            PriorInformation(np.zeros((size, size)), np.zeros(size)),
-            np.array([start]),
-            np.array([free]),
-        )
-        return float(sigmas[0]), value
+        model = MixedModel((self._units(),), (), np.zeros((self.jacobian.shape[2], 1)))
+        logs = np.log([max(start, LEAST_SIGMA)])
+        low, high = (np.log([bound]) if free else logs for bound in (LEAST_SIGMA, MOST_SIGMA))
+        found = model.maximised(logs, low, high)
+        return float(np.exp(found.logs[0])), found.value
 
     def information(self, sigma: float) -> FloatArray:
         """Fisher information (p, p) of the unknowns at a noise level [m]."""

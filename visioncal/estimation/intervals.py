@@ -6,13 +6,14 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.types import FloatArray
+from visioncal.estimation.mixed import profile_interval
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import (
-    RATIO_PRIOR,
+    RATIO_LOG_SIGMA,
+    TYPICAL_RATIO,
     robot_likelihood,
 )
-from visioncal.estimation.variance import profile_interval
 
 # Logarithms of the integration's scales, from a hundredth, below which levels add nothing to a
 # variance, to nine: dense at one, as a level of thousands of stops is known to 1 %.
@@ -48,7 +49,7 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
         rotation, translation = noise.robots[robot]
         ratio = translation / rotation
         if min(rotation, translation) < _NOTHING:
-            typical, width = RATIO_PRIOR.ratio, np.exp(RATIO_PRIOR.log_sigma)
+            typical, width = TYPICAL_RATIO, np.exp(RATIO_LOG_SIGMA)
             ratio = np.clip(ratio, typical / width, typical * width)
         middle, levels = max(float(translation), _LEAST_MIDDLE_M), noise.robots.copy()
         levels[robot] = middle / ratio, middle

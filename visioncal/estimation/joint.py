@@ -19,6 +19,7 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
@@ -30,7 +31,6 @@ from visioncal.estimation.solve import (
     fit_problem,
     fitted_covariance,
 )
-from visioncal.estimation.variance import PriorInformation
 
 # False-alarm probability of the test for freeing unknowns.
 _FALSE_ALARM = 1e-4

@@ -10,31 +10,20 @@ and Cullis 1995 for the steps, Harville 1977 for the likelihood).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, lapack
+from scipy.linalg import LinAlgError
 from scipy.special import ive
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT
-from visioncal.estimation.linalg import gram, weighted_gram
+from visioncal.estimation.linalg import gram
+from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.robot_likelihood import (
-    RobotLikelihood,
-    ratio_prior,
-    robot_likelihood,
-)
-from visioncal.estimation.variance import (
-    LEAST_SIGMA,
-    MOST_SIGMA,
-    LikelihoodValue,
-    PriorInformation,
-    WeightedResiduals,
-    most_likely,
-)
+from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 
 # Least twice gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0
@@ -60,9 +49,9 @@ _TYPICAL = {
     "second": 1e-4,
     HARMONICS: 2e-4,
 }
-_TORQUE_NM, _SPREAD, _START_RAD = 10.0, 1.0, 2e-4
-# Least gain in log-likelihood of a step; relative ridge of the information.
-_LITTLE, _RIDGE = 1e-2, 1e-12
+_TORQUE_NM, _START_RAD = 10.0, 2e-4
+# Least gain in log-likelihood of a step.
+_LITTLE = 1e-2
 # Least ratio of data to prior information of combinations that are unknowns; others keep their
 # prior.
 _INFORMATIVE = 0.05
@@ -130,11 +119,11 @@ def find_joint_functions(
     if without is None:
         return None
     # The longest length has no longer one to compare with.
-    chosen, best, worse, weighted = None, without, -1, plain.weighed(without)
+    chosen, best, worse = None, without, -1
     for length in _LENGTHS_RAD:
         arm = _ArmLikelihood.of(nominal, index, bases, _Waves.of(harmonics, length), torque_nm)
         # Skips the search where the gain seems too small.
-        _, gain = weighted.likely_size(arm.functions, arm.mine)
+        _, gain = without.likely_size(arm.functions, arm.mine)
         sizes = None
         if 2.0 * gain > _LEAST_SHARE * SIGNIFICANT:
             sizes = arm.most_likely(
@@ -198,16 +187,13 @@ class _Waves:
 class _ArmLikelihood:
     """Likelihood of an arm with groups of errors of unknown sizes."""
 
-    nominal: RobotLikelihood  # The likelihood without errors of the arm.
+    likelihood: RobotLikelihood  # With the arm's errors as the last unknowns.
     mine: Mask  # (u,) the units of the robot: no other depends on its errors.
-    own: FloatArray  # (m, 6 w, p) Jacobian of these units by the unknowns, the arm's errors last.
-    others: FloatArray  # (u - m, 6 w, p - q) that of the other units, without the arm's errors.
-    known: PriorInformation  # Prior information on the unknowns.
     names: tuple[str, ...]  # The groups, in the order of the sizes.
     shares: FloatArray  # (q, g) variance of each error per unit variance of each group.
+    typical: FloatArray  # (g,) logarithms of typical sizes of the groups.
     bases: Mapping[str, FloatArray]  # The columns of each block but the harmonics.
     waves: _Waves  # The harmonics.
-    torque_nm: float  # The torque of a unit compliance [N m].
 
     @classmethod
     def of(
@@ -218,12 +204,11 @@ class _ArmLikelihood:
         waves: _Waves,
         torque_nm: float,
     ) -> "_ArmLikelihood":
+        """Appends the arm's errors; `torque_nm` is the torque of a unit compliance."""
         basis = np.concatenate([*bases.values(), waves.columns], axis=2)
-        size, mine = basis.shape[2], (nominal.members == robot).any(axis=1)
-        own = np.concatenate([nominal.jacobian[mine], nominal.moved(robot, basis)], axis=2)
         names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
         groups = np.repeat(np.arange(len(bases)), [base.shape[2] for base in bases.values()])
-        shares = np.zeros((size, len(names)))
+        shares = np.zeros((basis.shape[2], len(names)))
         shares[np.arange(len(groups)), groups] = 1.0
         second = slice(len(groups), len(groups) + waves.seconds)
         shares[second, len(bases)] = 1.0
@@ -231,129 +216,51 @@ class _ArmLikelihood:
             shares[second, -1], shares[second.stop :, -1] = waves.series[1], 1.0
             # The process's own first harmonic is among those of eccentric gears.
             shares[:, -1] += waves.series[0] * shares[:, names.index("eccentricity")]
-        others, known = nominal.jacobian[~mine], nominal.known.beside(size)
-        return cls(nominal, mine, own, others, known, names, shares, bases, waves, torque_nm)
+        factor = {COMPLIANCE: torque_nm / _TORQUE_NM}
+        typical = np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in names])
+        mine = (nominal.members == robot).any(axis=1)
+        likelihood = nominal.beside(robot, basis, shares, typical)
+        return cls(likelihood, mine, names, shares, typical, bases, waves)
 
     @property
-    def random(self) -> slice:
-        """Slice of the arm's errors among the unknowns."""
-        return slice(self.others.shape[2], None)
+    def own(self) -> FloatArray:
+        """(m, 6 w, q) Jacobian of the robot's units by the arm's errors."""
+        return self.likelihood.jacobian[self.mine, :, -len(self.shares) :]
 
     @property
     def functions(self) -> FloatArray:
-        """(m, 6 w, q) Jacobian of the units by the process, for a size of one."""
-        return np.asarray(self.own[:, :, self.random] * np.sqrt(self.shares[:, -1]))
+        """(m, 6 w, q) Jacobian of these units by the process, for a size of one."""
+        return np.asarray(self.own * np.sqrt(self.shares[:, -1]))
 
-    def weighed(self, step: "_SizesAt") -> WeightedResiduals:
-        """The units, weighted by some levels and sizes."""
-        components, known = self.nominal.components, self.known
-        levels, count = len(components.parts), self.others.shape[2]
-        jacobian = np.zeros((*self.nominal.reduced.errors.shape, self.own.shape[2]))
-        jacobian[self.mine], jacobian[~self.mine, :, :count] = self.own, self.others
-        information = known.information.copy()
-        random = np.arange(count, len(information))
-        information[random, random] += 1.0 / (self.shares @ np.exp(2.0 * step.logs[levels:]))
-        return WeightedResiduals.of(
-            self.nominal.reduced.errors,
-            jacobian,
-            components,
-            replace(known, information=information),
-            step.logs[:levels],
-        )
+    def effects(self, estimate: MixedEstimate) -> FloatArray:
+        """(q,) the most likely errors of the arm; residuals have the opposite sign."""
+        return -estimate.values[-len(self.shares) :]
 
-    def compliances_of(self, step: "_SizesAt") -> FloatArray:
+    def compliances_of(self, estimate: MixedEstimate) -> FloatArray:
         """(n,) the compliances at some sizes; empty without any."""
         column = 0
         for name, base in self.bases.items():
             if name == COMPLIANCE:
-                return step.effects[column : column + base.shape[2]]
+                return self.effects(estimate)[column : column + base.shape[2]]
             column += base.shape[2]
         return np.zeros(0)
 
     def start(self) -> FloatArray:
         """Logarithms of the robots' levels, and of the sizes of the groups."""
-        levels = np.maximum(self.nominal.rms, LEAST_SIGMA)
-        count = len(self.nominal.components.parts) // 2
-        return np.concatenate([np.log(np.tile(levels, count)), self._typical])
+        levels = np.maximum(self.likelihood.rms, LEAST_SIGMA)
+        return np.append(np.log(np.tile(levels, len(self.likelihood.before))), self.typical)
 
-    @property
-    def _typical(self) -> FloatArray:
-        """(g,) logarithms of typical sizes of the groups."""
-        factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
-        return np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.names])
-
-    def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_SizesAt | None":
+    def most_likely(self, start: FloatArray, enough: float = np.inf) -> MixedEstimate | None:
         """Maximum-likelihood levels and sizes; None where the start is singular."""
-        low, high = (np.full(len(start), np.log(value)) for value in (LEAST_SIGMA, MOST_SIGMA))
+        low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
         try:
-            return most_likely(self._likelihood, start, low, high, 0.0, enough, little=_LITTLE)[1]
+            return self.likelihood.model.maximised(start, low, high, 0.0, enough, _LITTLE)
         except LinAlgError:
             return None
 
-    def _likelihood(self, logs: FloatArray) -> "_SizesAt":
-        components, known, mine = self.nominal.components, self.known, self.mine
-        residuals, levels, plain = self.nominal.reduced.errors, len(components.parts), self.others
-        count = plain.shape[2]
-        inner = np.s_[:count, :count]
-        sigmas, squares = np.exp(logs[:levels]), np.exp(2.0 * logs[levels:])
-        total, variances = components.total(sigmas), self.shares @ squares
-        weights = np.linalg.inv(total)
-        weighted, rest = weights[mine] @ self.own, weights[~mine] @ plain
-        information = gram(self.own, weighted) + known.information
-        information[inner] += gram(plain, rest)
-        diagonal = np.arange(count, len(information))
-        information[diagonal, diagonal] += 1.0 / variances
-        inverse, log_determinant = _inverted(information)
-        gradient = gram(weighted, residuals[mine]) + known.gradient
-        gradient[:count] += gram(rest, residuals[~mine])
-        estimate, residual_left = inverse @ gradient, residuals.copy()
-        residual_left[mine] -= self.own @ estimate
-        residual_left[~mine] -= plain @ estimate[:count]
-        weighted_residuals = (weights @ residual_left[:, :, None])[:, :, 0]
-        effects = estimate[self.random]
-        value = 0.5 * float(
-            np.linalg.slogdet(total)[1].sum()
-            + log_determinant
-            + np.log(variances).sum()
-            + np.einsum("ui,ui->", residual_left, weighted_residuals)
-            + estimate @ (known.information @ estimate - 2.0 * known.gradient)
-            + np.sum(effects**2 / variances)
-        )
-        growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
-        traces = np.array([
-            np.sum(inverse * weighted_gram(weighted, value[mine]))
-            + np.sum(inverse[inner] * weighted_gram(rest, value[~mine]))
-            for value in growth
-        ])  # fmt: skip
-        own = np.diagonal(weights, axis1=1, axis2=2)
-        by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - weighted_residuals**2) - traces)
-        growth_residuals = growth * weighted_residuals
-        size_variances = self.shares * squares
-        posterior = np.diag(inverse)[self.random] + effects**2
-        by_sizes = (1.0 / variances - posterior / variances**2) @ size_variances
-        # Working variates: derivatives of the covariance by each level and size times the weighted
-        # residuals; their products give the average information.
-        effect_growth = 2.0 * size_variances * (effects / variances)[:, None]
-        working = np.zeros((*residuals.shape, levels + len(squares)))
-        working[..., :levels] = np.moveaxis(growth_residuals, 0, 2)
-        working[mine, :, levels:] = self.own[:, :, self.random] @ effect_growth
-        projected = gram(weighted, working[mine])
-        projected[:count] += gram(rest, working[~mine])
-        curvature = 0.5 * (gram(working, weights @ working) - projected.T @ inverse @ projected)
-        gradients = np.concatenate([by_levels, by_sizes])
-        deviation = (logs[levels:] - self._typical) / _SPREAD
-        gradients[levels:] += deviation / _SPREAD
-        curvature[levels:, levels:] += np.eye(len(deviation)) / _SPREAD**2
-        value += 0.5 * float(deviation @ deviation)
-        full = ratio_prior(range(levels // 2)).beside(
-            LikelihoodValue(value, gradients, curvature), logs
-        )
-        # Residuals have the opposite sign of the prediction.
-        return _SizesAt(full.value, full.gradient, full.curvature, logs, -effects)
-
-    def assembled(self, step: "_SizesAt", gain: float) -> JointFunctions:
-        """The errors of all blocks with the sizes at some step."""
-        sizes = np.exp(step.logs[-len(self.names) :])
+    def assembled(self, estimate: MixedEstimate, gain: float) -> JointFunctions:
+        """The errors of all blocks with the sizes of an estimate."""
+        sizes = np.exp(estimate.logs[-len(self.names) :])
         variances, sigma = self.shares @ sizes**2, float(sizes[-1])
         block_gain, errors, start = gain / (len(self.bases) + 1), {}, 0
         for name, basis in self.bases.items():
@@ -361,13 +268,13 @@ class _ArmLikelihood:
             errors[name] = ArmErrors(basis, size_rad, block_gain, of_links=True)
             start += basis.shape[2]
         own, waves = np.sqrt(variances[start:]), self.waves
-        determined = own[:, None] * self._determined(step.logs, own) / sigma
+        determined = own[:, None] * self._determined(estimate.logs, own) / sigma
         errors[HARMONICS] = ArmErrors(waves.columns @ determined, sigma, block_gain, of_links=True)
         order_sizes = np.sqrt(waves.series[1:])
         order_sizes[0] = own[0] / sigma
         return JointFunctions(
             errors,
-            np.exp(step.logs[: -len(self.names)]).reshape(-1, 2),
+            np.exp(estimate.logs[: -len(self.names)]).reshape(-1, 2),
             np.tile(np.repeat(order_sizes, 2), waves.seconds // 2),
             waves.expanded @ determined,
             sigma,
@@ -377,34 +284,8 @@ class _ArmLikelihood:
 
     def _determined(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
         """(q, r) orthonormal combinations, in units of (q,) sizes, of determined harmonics."""
-        components = self.nominal.components
-        weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)]))[self.mine])
+        (units,) = self.likelihood.model.units
+        weights = np.linalg.inv(units.total(logs)[self.mine])
         jacobian = self.own[:, :, -len(sizes) :] * sizes
         values, vectors = np.linalg.eigh(gram(jacobian, weights @ jacobian))
         return np.asarray(vectors[:, values > _INFORMATIVE])
-
-
-@dataclass(frozen=True, eq=False)
-class _SizesAt(LikelihoodValue):
-    """Likelihood at some levels and sizes; its curvature is average information."""
-
-    logs: FloatArray  # The logarithms of levels and sizes.
-    effects: FloatArray  # (q,) the most likely errors of the arm.
-
-
-def _inverted(information: FloatArray) -> tuple[FloatArray, float]:
-    """Inverse of (p, p) information, and the logarithm of its determinant.
-
-    Raises:
-        LinAlgError: It is singular.
-    """
-    diagonal = np.diag(information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = information * np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-    factor, failed = lapack.dpotrf(scaled, lower=1)
-    if failed:
-        raise LinAlgError("the information has no inverse")
-    inverse, _ = lapack.dpotri(factor, lower=1)
-    inverse = np.tril(inverse) + np.tril(inverse, -1).T
-    logarithm = 2.0 * float(np.log(np.diag(factor)).sum() - np.log(scale).sum())
-    return inverse * np.outer(scale, scale), logarithm

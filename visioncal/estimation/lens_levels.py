@@ -4,29 +4,24 @@ The corners of one camera and its observations (the chains of frames through it)
 once. Random effects are the modes of the distortion field, focus breathing, one focus jitter a
 view, and one error of each flange a stop; fixed effects are frames, lens, board and whatever else
 the fit moves. Errors of single views are eliminated view by view, so that an evaluation of the
-restricted likelihood costs one Cholesky factorisation of some hundred unknowns. Newton steps are
-used because the likelihood is flat where a level is small: a search by gradients alone would stop
-there at rounding errors.
+restricted likelihood costs one Cholesky factorisation of some hundred unknowns.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
-from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import HARDLY, CommonRows, MixedEstimate, MixedModel, Units
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import ratio_prior
-from visioncal.estimation.variance import HARDLY, LikelihoodValue, most_likely
 
 # Candidate correlation lengths of the field, as shares of the image's width; index of the first
 # that is tried, and least gain in log-likelihood of a change to another one.
@@ -73,213 +68,46 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class _Likelihood:
-    """Restricted likelihood of the levels' logarithms, at one correlation length of the field.
+    """Restricted likelihood of the levels' logarithms, at one correlation length of the field."""
 
-    Corner quantities are in units of the corner noise. The q unknowns are the t of the
-    observations, breathing, and the field's modes.
-    """
-
-    rows: float  # Number of residuals.
-    information: FloatArray  # (q, q) on the unknowns, with the errors of single views at zero.
-    gradient: FloatArray  # (q,) half the gradient of the squared error.
-    cost: float  # The squared error.
-    # (v, l, l) information on the errors of single views: of flanges, then of the focus.
-    local: FloatArray
-    cross: FloatArray  # (v, l, q) information between these and the unknowns.
-    pulls: FloatArray  # (v, l) half the gradient by the errors of single views.
-    kinds: IntArray  # (v, l) the level of each of these errors; -1 for none.
-    known: FloatArray  # (t, t) information on the observations' unknowns from everything else.
-    known_gradient: FloatArray  # (t,) half the gradient of everything else.
-    # (2,) RMS corner residuals with lens, board and field all free, and with lens and board alone.
+    model: MixedModel  # Sizes are the levels.
+    counts: FloatArray  # (k,) number of random values of each level; zero for the corner noise.
+    # RMS corner residuals with lens, board and field all free, and with lens and board alone [px].
     noise_px: tuple[float, float]
-    flanges: int  # Number of robots.
-
-    @cached_property
-    def modes(self) -> IntArray:
-        """(m,) the levels of the random unknowns, which follow the t others."""
-        levels = np.full(len(self.gradient) - len(self.known), _FIELD)
-        levels[0] = _BREATHING
-        return levels
-
-    @cached_property
-    def counts(self) -> FloatArray:
-        """Number of random values of each level; zero for the corner noise."""
-        kinds = np.concatenate([self.kinds[self.kinds >= 0], self.modes])
-        return np.bincount(kinds, minlength=_FLANGES + 2 * self.flanges).astype(float)
-
-    @cached_property
-    def _members(self) -> tuple[FloatArray, FloatArray]:
-        """Indicators of each value's level: (v, l, k) of single views, (q, k) of unknowns."""
-        levels = np.flatnonzero(self.counts)
-        modes = np.zeros((len(self.gradient), len(levels)))
-        modes[len(self.known) :] = self.modes[:, None] == levels
-        return (self.kinds[:, :, None] == levels).astype(float), modes
-
-    def __call__(self, logs: FloatArray, *, is_sloped: bool = True) -> LikelihoodValue:
-        """Negative log-likelihood, gradient and Hessian; these two are zero without `is_sloped`."""
-        # Where the Hessian is not positive definite, the average information replaces it (Gilmour,
-        # Thompson and Cullis 1995), which is never negative.
-        t, variances, is_random = len(self.known), np.exp(2.0 * logs), self.kinds >= 0
-        weight, behind = 1.0 / variances[_NOISE], np.arange(t, len(self.gradient))
-        precision = np.where(is_random, 1.0 / variances[self.kinds], 1.0)
-        prior = 1.0 / variances[self.modes]
-        local, cross = weight * self.local, weight * self.cross
-        diagonal = np.arange(local.shape[1])
-        local[:, diagonal, diagonal] += precision
-        root = np.linalg.cholesky(local)
-        outward = np.linalg.inv(root)
-        half = outward @ cross
-        inward = np.swapaxes(outward, 1, 2)
-        inverse, taken = inward @ outward, inward @ half
-        information = weight * self.information - gram(half, half)
-        information[:t, :t] += self.known
-        information[behind, behind] += prior
-        pulls = weight * self.pulls
-        gradient = weight * self.gradient - gram(taken, pulls)
-        gradient[:t] += self.known_gradient
-        precisions = np.diag(information)
-        # Unknowns without information get the ridge of `_factor` only.
-        scale = 1.0 / np.sqrt(np.where(precisions > _RIDGE**2, precisions, 1.0))
-        factor = _factor(information * np.outer(scale, scale))
-        covariance = cho_solve(factor, np.diag(scale), check_finite=False) * scale[:, None]
-        solution = -covariance @ gradient
-        pulled = (inverse @ pulls[:, :, None])[:, :, 0]
-        single = -pulled - taken @ solution
-        squared = weight * self.cost + gradient @ solution - float(np.sum(pulls * pulled))
-        determinants = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
-        determinants += 2.0 * float(np.log(root[:, diagonal, diagonal]).sum() + self.counts @ logs)
-        value = 0.5 * float(self.rows * 2.0 * logs[_NOISE] + determinants + squared)
-        by_level, hessian = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
-        ratios = ratio_prior(range(self.flanges), _FLANGES)
-        if not is_sloped:
-            return ratios.beside(LikelihoodValue(value, by_level, hessian), logs)
-        # Squares and variances of each level's values, in units of the level's variance.
-        levels = np.flatnonzero(self.counts)
-        singles, modes = self._members
-        of_single, of_modes = single[:, :, None] * singles, solution[:, None] * modes
-        squares = np.sum(of_single**2, axis=(0, 1)) + np.sum(of_modes**2, axis=0)
-        # A single product of a tall matrix: view by view it takes several times as long.
-        spread_out = (taken.reshape(-1, len(solution)) @ covariance).reshape(taken.shape)
-        in_common = spread_out @ np.swapaxes(taken, 1, 2)
-        variances_of_errors = np.diagonal(inverse + in_common, axis1=1, axis2=2)
-        uncertain = np.tensordot(variances_of_errors, singles, axes=2) + np.diag(covariance) @ modes
-        squares, uncertain = squares / variances[levels], uncertain / variances[levels]
-        by_level = self.counts.copy()
-        by_level[levels] -= squares + uncertain
-        # The rest of the squared error and of the degrees of freedom belongs to the corners.
-        prior_cost = solution[:t] @ (self.known @ solution[:t] + 2.0 * self.known_gradient)
-        corner_cost = squared - squares.sum() - prior_cost
-        freedom = len(solution) + is_random.sum() - np.sum(self.known * covariance[:t, :t])
-        by_level[_NOISE] = self.rows - corner_cost - freedom + uncertain.sum()
-        # Working variates of each level (average information); those of the corners are residuals.
-        by_single = (weight * self.local) @ of_single + cross @ of_modes
-        by_modes = weight * (self.information @ of_modes) + gram(cross, of_single)
-        products = np.tensordot(of_single, by_single, axes=([0, 1], [0, 1])) + of_modes.T @ by_modes
-        rest = pulls + ((weight * self.local) @ single[:, :, None])[:, :, 0] + cross @ solution
-        rest_modes = weight * (self.gradient + self.information @ solution) + gram(cross, single)
-        by_single = np.concatenate([rest[:, :, None], -by_single], axis=2)
-        by_modes = np.column_stack([rest_modes, -by_modes])
-        crossed = np.tensordot(rest, of_single, axes=([0, 1], [0, 1])) + rest_modes @ of_modes
-        working = np.block([[np.atleast_2d(corner_cost), -crossed], [-crossed[:, None], products]])
-        followed = inverse @ by_single
-        by_modes -= gram(cross, followed)
-        working -= gram(by_single, followed) + by_modes.T @ covariance @ by_modes
-        expected = self._expected(
-            covariance,
-            taken,
-            inverse,
-            in_common,
-            uncertain,
-            self.rows - freedom + uncertain.sum(),
-            logs,
-        )
-        places = np.append(_NOISE, levels)
-        second = 4.0 * working - expected + 2.0 * np.diag(by_level[places])
-        if np.linalg.eigvalsh(second)[0] <= 0.0:
-            second = 2.0 * working
-        hessian[np.ix_(places, places)] = second
-        return ratios.beside(LikelihoodValue(value, by_level, hessian), logs)
-
-    def _expected(
-        self,
-        covariance: FloatArray,
-        taken: FloatArray,
-        inverse: FloatArray,
-        in_common: FloatArray,
-        spread: FloatArray,
-        of_corners: float,
-        logs: FloatArray,
-    ) -> FloatArray:
-        """Expected Hessian (Fisher information): half the traces of P V_k P V_l.
-
-        Those with the corner noise follow from P V P = P.
-
-        Args:
-            covariance: (q, q) of the unknowns.
-            taken: (v, l, q) response of the errors of single views to the unknowns.
-            inverse: (v, l, l) covariance of these errors, given the unknowns.
-            in_common: (v, l, l) the unknowns' contribution to it.
-            spread: (k,) traces of the levels' posterior covariances over their variances.
-            of_corners: Degrees of freedom of the corners.
-            logs: The logarithms of the levels.
-
-        Returns:
-            (1 + k, 1 + k) for the corner noise and the levels with any values.
-        """
-        t, levels, variances = len(self.known), np.flatnonzero(self.counts), np.exp(2.0 * logs)
-        singles, modes = self._members
-        among_rows = [taken[self.kinds == level] for level in levels.tolist()]
-        turned = np.array([covariance @ (row.T @ row) for row in among_rows])
-        of_one_view = (inverse * (inverse + 2.0 * in_common)) @ singles
-        traces = np.tensordot(singles, of_one_view, axes=([0, 1], [0, 1]))
-        traces += np.tensordot(turned, turned, axes=([1, 2], [2, 1]))
-        of_rows = np.sum(turned * covariance, axis=2) @ modes
-        traces += of_rows + of_rows.T + modes.T @ covariance**2 @ modes
-        among = np.diag(self.counts[levels] - 2.0 * spread)
-        among += traces / np.outer(variances[levels], variances[levels])
-        held = self.known @ covariance[:t]
-        by_prior = np.tensordot(turned[:, :t], held, axes=2)
-        by_prior = (by_prior + np.sum(held * covariance[:t], axis=0) @ modes) / variances[levels]
-        of_noise = 2.0 * (self.counts[levels] - spread - among.sum(axis=0) - by_prior)
-        inner = held[:, :t]
-        of_prior = np.trace(inner) - np.sum(inner * inner.T) - by_prior.sum()
-        alone = 2.0 * of_corners - of_noise.sum() - of_prior
-        return np.block([[np.atleast_2d(alone), of_noise], [of_noise[:, None], 2.0 * among]])
 
     def minimised(
         self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
-    ) -> tuple[float, FloatArray]:
-        """Minimum and the levels' logarithms there; `closed` ones stay at their lower bounds."""
+    ) -> MixedEstimate:
+        """The most likely levels; `closed` ones stay at their lower bounds."""
         low, high = self.limits(closed)
         hardly = HARDLY * np.maximum(self.counts, 1.0)
-        start = np.clip(logs, low, high)
-        logs, likelihood = most_likely(self, start, low, high, enough=enough, hardly=hardly)
+        found = self.model.maximised(logs, low, high, enough=enough, hardly=hardly)
         # Insignificant levels decrease by ever smaller gains: tries their lower bounds directly.
         for level in (_FIELD, _BREATHING, _JITTER):
-            if likelihood.gradient[level] <= 0.0 or logs[level] <= low[level]:
+            if found.gradient[level] <= 0.0 or found.logs[level] <= low[level]:
                 continue
-            without = logs.copy()
+            without = found.logs.copy()
             without[level] = low[level]
-            candidate = self(without)
-            if candidate.value <= likelihood.value:
-                logs, likelihood = without, candidate
-        return likelihood.value, logs
+            candidate = self.model.at(without)
+            if candidate.value <= found.value:
+                found = candidate
+        return found
 
-    def gain(self, logs: FloatArray, value: float, closed: tuple[int, ...], level: int) -> float:
+    def gain(self, found: MixedEstimate, closed: tuple[int, ...], level: int) -> float:
         """Likelihood-ratio statistic of one level, against its lower bound."""
-        logs_without, least = logs.copy(), self.limits((*closed, level))[0][level]
-        if logs[level] <= least:
+        without, least = found.logs.copy(), self.limits((*closed, level))[0][level]
+        if without[level] <= least:
             return 0.0
-        logs_without[level] = least
-        upper_bound = 2.0 * (self(logs_without, is_sloped=False).value - value)
+        without[level] = least
+        upper_bound = 2.0 * (self.model.at(without, is_sloped=False).value - found.value)
         # The other levels are only refitted where it matters.
         if upper_bound < SIGNIFICANT:
             return upper_bound
-        return 2.0 * (self.minimised(logs_without, (*closed, level))[0] - value)
+        return 2.0 * (self.minimised(without, (*closed, level)).value - found.value)
 
     def limits(self, closed: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the levels' logarithms."""
-        low = np.repeat([_FLANGE_RANGE[0]], _FLANGES + 2 * self.flanges)
+        low = np.repeat([_FLANGE_RANGE[0]], len(self.counts))
         high = np.repeat([_FLANGE_RANGE[1]], len(low))
         low[_NOISE], high[_NOISE] = np.multiply(_NOISE_RANGE, self.noise_px)
         low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px[0], 1.0, 1.0))
@@ -335,43 +163,21 @@ def estimate_levels(
         stated = [1.0, before.field, before.breathing, before.jitter]
         sizes = np.maximum(noise_px * np.array(stated), np.array([0.0, 0.1, 0.1, 0.1]) * sizes)
     logs = np.log(np.concatenate([sizes, np.maximum(noise.robots, 1e-6).ravel()]))
-    best = (*likelihood.minimised(logs, closed), at, likelihood)
+    found = likelihood.minimised(logs, closed)
     for step in (1, -1):
-        while 0 <= best[2] + step < len(_LENGTHS):
-            candidate = _assembled(linearised, _LENGTHS[best[2] + step], len(noise.robots))
-            value, candidate_logs = candidate.minimised(best[1], closed, best[0] - _GAIN)
-            if value > best[0] - _GAIN:
+        while 0 <= at + step < len(_LENGTHS):
+            candidate = _assembled(linearised, _LENGTHS[at + step], len(noise.robots))
+            other = candidate.minimised(found.logs, closed, found.value - _GAIN)
+            if other.value > found.value - _GAIN:
                 break
-            best = value, candidate_logs, best[2] + step, candidate
-    _, logs, at, likelihood = best
-    sizes = np.exp(logs[: _JITTER + 1])
+            found, at, likelihood = other, at + step, candidate
+    sizes = np.exp(found.logs[: _JITTER + 1])
     low = np.exp(likelihood.limits(closed)[0][: _JITTER + 1])
     field, breathing, jitter = np.where(sizes > 2.0 * low, sizes, 0.0)[1:] / sizes[_NOISE]
-    gains = [
-        likelihood.gain(logs, best[0], closed, index) for index in (_FIELD, _BREATHING, _JITTER)
-    ]
+    gains = [likelihood.gain(found, closed, index) for index in (_FIELD, _BREATHING, _JITTER)]
     return LensLevels(
         float(field), _LENGTHS[at], float(breathing), float(jitter), (gains[0], gains[1], gains[2])
     )
-
-
-def _factor(scaled: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor of a matrix with unit diagonal, by a ridge made positive definite."""
-    ridge = _RIDGE
-    while True:
-        raised = scaled + ridge * np.eye(len(scaled))
-        try:
-            factor, is_lower = cho_factor(raised, lower=True, check_finite=False)
-        except np.linalg.LinAlgError as error:
-            if ridge > 1.0:
-                raise ConvergenceError(
-                    "lens: no sizes of its errors are likely: the fit that they are sought in runs "
-                    "away.",
-                    next_step="Look whether poses, images and board go together.",
-                ) from error
-            ridge *= 1e3
-        else:
-            return factor, is_lower
 
 
 def _rows(
@@ -444,63 +250,84 @@ def _without(
 
 
 def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
-    """Assembles the likelihood at one correlation length of the field."""
-    stack, without = rows.stack, rows.without
+    """Assembles the likelihood at one correlation length of the field.
+
+    A view is a unit of seven rows: its observation, of the pose that is the best one for given
+    lens, board, field and focus, and its own estimate of its focus. What its corners tell beside
+    these depends on the common unknowns alone: those of the observations, breathing, and the
+    field's modes.
+    """
+    stack, without, chained = rows.stack, rows.without, rows.chained
     modes = field_modes(stack.px, rows.camera.resolution, length)
     answer, products = without.with_modes(modes)
     # Columns: lens, board, breathing, a change of focus, residuals, and the modes.
     focus = without.left.shape[2] - 2
     residual, shared = focus + 1, np.r_[:focus, focus + 2 : len(products)]
     by_focus = without.by_view(focus, modes)
-    views, chained, t, q = len(stack.views), rows.chained, len(rows.known), len(shared)
-    size = t + q - len(rows.places)
+    views, t, levels = len(stack.views), len(rows.known), _FLANGES + 2 * robots
+    size = t + len(shared) - len(rows.places)
     columns = np.concatenate([rows.places, np.arange(t, size)])
-    among, pulled = products[np.ix_(shared, shared)], products[shared, residual]
-    information, gradient = np.zeros((size, size)), np.zeros(size)
-    information[np.ix_(columns, columns)], gradient[columns] = among, pulled
-    # Observations: measured poses are the best ones for given lens, board, field and focus.
-    following = answer[chained]
-    jacobian = np.zeros((len(chained), 6, size))
-    jacobian[:, :, :t] = rows.jacobian
-    jacobian[:, :, columns] = following[:, :, shared]
-    residuals = rows.away + following[:, :, residual]
+    noise, known_noise = np.zeros((2, views, 7, 7))
+    jacobian, residuals = np.zeros((views, 7, size)), np.zeros((views, 7))
+    # Views without an observation have no pose rows; theirs are of no consequence.
+    known_noise[:, :6, :6] = np.eye(6)
+    known_noise[chained] = 0.0
+    noise[chained, :6, :6] = without.inverse[chained]
+    # Lens and board move the measured poses, as breathing and the field do.
+    following = np.zeros((len(chained), 6, size))
+    following[:, :, :t], following[:, :, columns] = rows.jacobian, answer[chained][:, :, shared]
+    jacobian[chained, :6] = following
+    residuals[chained, :6] = rows.away + answer[chained, :, residual]
+    zoomed = np.zeros((views, 7))
+    zoomed[chained, :6] = answer[chained, :, focus]
+    zoomed[:, 6] = 1.0
+    # Corners of a view without extent do not tell its focus.
+    told = np.maximum(by_focus[:, focus], _RIDGE)
+    noise[:, 6, 6] = 1.0 / told
+    jacobian[:, 6, columns] = by_focus[:, shared] / told[:, None]
+    residuals[:, 6] = by_focus[:, residual] / told
+    parts = np.zeros((2 + 2 * robots, views, 7, 7))
+    parts[0], parts[1] = noise, zoomed[:, :, None] * zoomed[:, None, :]
     # Repeats of stationary frames share an error, too, but are taken as independent here.
-    by_flanges = np.repeat(rows.robots, 6, axis=1)
-    of_flanges = np.where(by_flanges[:, None] < 0, 0.0, rows.by_errors)
-    errors = np.concatenate([of_flanges, following[:, :, focus : focus + 1]], axis=2)
-    weights = without.information[chained]
-    turned = np.swapaxes(errors, 1, 2) @ weights
-    width = errors.shape[2]
-    local, cross = np.zeros((views, width, width)), np.zeros((views, width, size))
-    pulls, kinds = np.zeros((views, width)), np.full((views, width), -1)
-    local[:, -1, -1], cross[:, -1, columns] = by_focus[:, focus], by_focus[:, shared]
-    pulls[:, -1], kinds[:, -1] = by_focus[:, residual], _JITTER
-    local[chained] += turned @ errors
-    cross[chained] += turned @ jacobian
-    pulls[chained] += (turned @ residuals[:, :, None])[:, :, 0]
-    flanges = np.repeat(_FLANGES + 2 * rows.robots, 6, axis=1) + np.tile(
-        np.repeat([0, 1], 3), rows.robots.shape[1]
-    )
-    kinds[chained, :-1] = np.where(by_flanges < 0, -1, flanges)
-    inner, cost = among + np.diag(_RIDGE + 1e-6 * np.diag(among)), products[residual, residual]
+    for slot, of_slot in enumerate(rows.robots.T):
+        seen = np.flatnonzero(of_slot >= 0)
+        for axes in (0, 1):
+            moved = rows.by_errors[seen, :, 6 * slot + 3 * axes : 6 * slot + 3 * axes + 3]
+            parts[2 + 2 * of_slot[seen] + axes, chained[seen], :6, :6] += moved @ np.swapaxes(
+                moved, 1, 2
+            )
+    by_shared = by_focus[:, shared]
+    shared_products = products[np.ix_(shared, shared)] - by_shared.T @ (by_shared / told[:, None])
+    pulled = products[shared, residual] - residuals[:, 6] @ by_shared
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    information[np.ix_(columns, columns)], gradient[columns] = shared_products, pulled
+    among, cost = products[np.ix_(shared, shared)], products[residual, residual]
+    inner = among + np.diag(_RIDGE + 1e-6 * np.diag(among))
     # Images that repeat the same view count as one.
     freedom = float(without.roots**2 @ (2 * stack.counts - 6))
 
     def left_px(free: int) -> float:
-        rest = cost - pulled[:free] @ np.linalg.solve(inner[:free, :free], pulled[:free])
+        pull = products[shared[:free], residual]
+        rest = cost - pull @ np.linalg.solve(inner[:free, :free], pull)
         return floored_sigma_px(float(np.sqrt(max(rest, 0.0) / max(freedom - free, 1.0))))
 
+    shares = np.zeros((size, levels))
+    shares[t, _BREATHING] = shares[t + 1 :, _FIELD] = 1.0
+    of_corners = CommonRows(
+        information, gradient, float(cost - by_focus[:, residual] @ residuals[:, 6]),
+        freedom - views, _NOISE,
+    )  # fmt: skip
+    known = CommonRows(rows.known, rows.gradient).beside(size - t)
+    sizes = np.r_[_NOISE, _JITTER, _FLANGES:levels]
+    units = Units(residuals, jacobian, known_noise, parts, sizes)
+    prior = ratio_prior(range(robots), levels, _FLANGES)
+    counts = shares.sum(axis=0)
+    counts[_JITTER] = views
+    counts[_FLANGES:] = [
+        3 * np.sum(rows.robots == robot) for robot in range(robots) for _ in range(2)
+    ]
     return _Likelihood(
-        freedom + 6 * len(chained),
-        information + gram(jacobian, weights @ jacobian),
-        gradient + gram(jacobian, (weights @ residuals[:, :, None])[:, :, 0]),
-        float(cost + np.einsum("oi,oij,oj->", residuals, weights, residuals)),
-        local,
-        cross,
-        pulls,
-        kinds,
-        rows.known,
-        rows.gradient,
-        (left_px(q), left_px(focus)),
-        robots,
+        MixedModel((units,), (of_corners, known), shares, prior),
+        counts,
+        (left_px(len(shared)), left_px(focus)),
     )

@@ -15,9 +15,9 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.variance import PriorInformation
 
 # Sizes of changes: from a tenth of a millimetre to a tenth of a metre, by half decades.
 SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))

@@ -21,21 +21,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import block_diag
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
 from visioncal.estimation.budget import less_noise
-from visioncal.estimation.linalg import covariance_among, covariance_root
+from visioncal.estimation.linalg import covariance_among, gram
+from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, CommonRows, MixedModel, Units
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.robot_likelihood import (
-    RATIO_PRIOR,
-    robot_likelihood,
-)
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, LikelihoodValue
+from visioncal.estimation.robot_likelihood import ratio_prior, robot_likelihood
 
 # Distance between postures equivalent to a rotation by a radian [m].
 _REACH_M = 0.5
@@ -66,7 +63,8 @@ _CLUSTERS = 5
 _FACTORED = 1e-6
 # Start of a process's size in units of the noise, and the size that counts as zero.
 _START_SIZE, _NOTHING = 0.7, 1e-2
-_ITERATIONS, _CONVERGED, _WORST_DAMPING, _LONGEST_STEP = 30, 5e-3, 1e4, 1.5
+# Least gain in log-likelihood of a step.
+_LITTLE = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,25 +299,18 @@ class _StopBlock:
     """Stops with a joint covariance."""
 
     stops: IntArray  # (u,) the stop of each unit, among those with a pose.
-    errors: FloatArray  # (n,) reduced residuals of the units.
-    jacobian: FloatArray  # (n, p) by the unknowns.
-    known: FloatArray  # (n, n) covariance without the robot's own errors.
-    # (2, n) contribution of the robot's rotation and position noise to its diagonal.
-    white: FloatArray
+    rows: Units  # All their n rows as one unit; its sizes are the robot's two noise levels.
     by_flange: FloatArray  # (u, n / u, 6) Jacobian by the robot's flange.
 
-    def common(self, process: _Process) -> FloatArray:
-        """(n, n) covariance by a process of unit size."""
-        flange_covariance = replace(process, size=1.0).between(self.stops, self.stops)
-        covariance = self.by_flange[:, None] @ flange_covariance @ np.swapaxes(self.by_flange, 1, 2)
-        return np.asarray(np.swapaxes(covariance, 1, 2).reshape(self.known.shape))
-
-
-@dataclass(frozen=True, eq=False)
-class _LikelihoodAt(LikelihoodValue):
-    """The likelihood at some logarithms of sizes; its curvature is average information."""
-
-    logs: FloatArray
+    def with_processes(self, processes: Sequence[_Process]) -> Units:
+        """The rows with the covariance of each process as one more part."""
+        parts = [*self.rows.parts]
+        for process in processes:
+            flange_covariance = replace(process, size=1.0).between(self.stops, self.stops)
+            covariance = self.by_flange[:, None] @ flange_covariance
+            covariance = covariance @ np.swapaxes(self.by_flange, 1, 2)
+            parts.append(np.swapaxes(covariance, 1, 2).reshape(self.rows.known.shape))
+        return replace(self.rows, parts=np.array(parts), sizes=np.arange(len(parts)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,8 +318,7 @@ class _Likelihood:
     """The restricted likelihood of one robot's errors."""
 
     blocks: tuple[_StopBlock, ...]  # Its stops; different blocks count as independent.
-    information: FloatArray  # (p, p) on the unknowns by everything else.
-    gradient: FloatArray  # (p,) of that.
+    rest: CommonRows  # Everything else that is known of the unknowns.
 
     @classmethod
     def of(
@@ -336,110 +326,66 @@ class _Likelihood:
     ) -> "_Likelihood":
         """Linearises the observations; arguments are those of `find_pose_errors`."""
         index, count = problem.robots.index(robot), len(problem.poses[robot])
-        moves = np.zeros((count, 6, 6))
-        moves[posed] = np.eye(6)
-        likelihood = robot_likelihood(problem, state, noise).beside(index, moves)
-        jacobian = likelihood.reduced.jacobian[:, :, likelihood.moving]
-        jacobian, by_flange = jacobian[:, :, :-6], jacobian[:, :, -6:]
-        information = likelihood.known.information[:-6, :-6].copy()
-        gradient = likelihood.known.gradient[:-6].copy()
+        likelihood = robot_likelihood(problem, state, noise)
+        (every,), (rest,) = likelihood.model.units, likelihood.model.common
+        members, stops, width = likelihood.members, likelihood.stops, every.residuals.shape[1]
+        mine = (members == index).any(axis=1)
+        by_flange = np.zeros((len(members), width, 6))
+        by_flange[mine] = likelihood.moved(index, np.broadcast_to(np.eye(6), (count, 6, 6)))
         levels = noise.robots.copy()
         levels[index] = 0.0
         others = problem.error_covariance(replace(noise, robots=levels))
         known = likelihood.reduced.covariance + others
-        errors, parts = likelihood.reduced.errors, likelihood.components.parts
-        members, stops, width = likelihood.members, likelihood.stops, errors.shape[1]
-        units = np.flatnonzero((members == index).any(axis=1))
+        units = np.flatnonzero(mine)
         units = units[np.argsort(stops[units], kind="stable")]
-        every = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
-        spread = np.linspace(0, len(every) - 1, min(len(every), _MOST_BLOCKS)).round().astype(int)
-        chosen = [every[at] for at in spread]
-        rest = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
-        total = likelihood.reduced.covariance[rest] + problem.error_covariance(noise)[rest]
-        weighted = np.linalg.solve(total, jacobian[rest])
-        information += np.einsum("uip,uiq->pq", weighted, jacobian[rest])
-        gradient += np.einsum("uip,ui->p", weighted, errors[rest])
-        blocks = []
-        for rows in chosen:
-            covariance = np.zeros((len(rows), width, len(rows), width))
-            covariance[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
-            blocks.append(
-                _StopBlock(
-                    np.searchsorted(posed, stops[rows]),
-                    errors[rows].ravel(),
-                    jacobian[rows].reshape(-1, jacobian.shape[2]),
-                    covariance.reshape((len(rows) * width,) * 2),
-                    parts[2 * index : 2 * index + 2, rows].reshape(2, -1),
-                    by_flange[rows],
-                )
+        split = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
+        spread = np.linspace(0, len(split) - 1, min(len(split), _MOST_BLOCKS)).round().astype(int)
+        chosen = [split[at] for at in spread]
+        others_rows = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
+        total = likelihood.reduced.covariance + problem.error_covariance(noise)
+        jacobian = every.jacobian[others_rows]
+        weighted = np.linalg.solve(total[others_rows], jacobian)
+        rest = CommonRows(
+            rest.information + gram(weighted, jacobian),
+            rest.gradient + gram(weighted, every.residuals[others_rows]),
+        )
+
+        def joined(covariance: FloatArray) -> FloatArray:
+            return np.asarray(block_diag(*covariance))[None]
+
+        blocks = [
+            _StopBlock(
+                np.searchsorted(posed, stops[rows]),
+                Units(
+                    every.residuals[rows].reshape(1, -1),
+                    every.jacobian[rows].reshape(1, -1, every.jacobian.shape[2]),
+                    joined(known[rows]),
+                    np.array([joined(every.parts[2 * index + axes, rows]) for axes in (0, 1)]),
+                    np.arange(2),
+                ),
+                by_flange[rows],
             )
-        return cls(tuple(blocks), information, gradient)
+            for rows in chosen
+        ]
+        return cls(tuple(blocks), rest)
 
     def maximised(self, model: _Model) -> _Model:
-        """The model with maximum-likelihood sizes, by Newton steps from its present ones."""
-        common = [
-            np.array([block.common(process) for process in model.processes])
-            for block in self.blocks
-        ]
+        """The model with maximum-likelihood sizes, searched from its present ones."""
         sizes = np.array([process.size for process in model.processes])
         least = np.append([LEAST_SIGMA] * 2, np.full(len(sizes), _NOTHING))
-        damping, now = 1e-3, self._step(common, np.log(np.append(model.white, sizes)))
-        for _ in range(_ITERATIONS):
-            if now is None or damping > _WORST_DAMPING:
-                break
-            curvature = now.curvature + damping * np.diag(np.diag(now.curvature) + 1e-6)
-            step = np.clip(-np.linalg.solve(curvature, now.gradient), -_LONGEST_STEP, _LONGEST_STEP)
-            trial = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
-            if trial is None or trial.value > now.value:
-                damping *= 10.0
-                continue
-            gained, now, damping = now.value - trial.value, trial, damping / 10.0
-            if gained < _CONVERGED:
-                break
-        if now is None:
+        count, unknowns = 2 + len(sizes), len(self.rest.gradient)
+        mixed = MixedModel(
+            tuple(block.with_processes(model.processes) for block in self.blocks),
+            (self.rest,),
+            np.zeros((unknowns, count)),
+            ratio_prior([0], count),
+        )
+        start = np.log(np.append(model.white, sizes))
+        try:
+            found = mixed.maximised(start, np.log(least), np.log(MOST_SIGMA), little=_LITTLE)
+        except np.linalg.LinAlgError:
             return model
-        sigmas = np.exp(now.logs)
+        sigmas = np.exp(found.logs)
         pairs = zip(model.processes, sigmas[2:].tolist(), strict=True)
         processes = tuple(replace(process, size=size) for process, size in pairs)
-        return replace(model, processes=processes, white=sigmas[:2], value=now.value)
-
-    def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _LikelihoodAt | None:
-        """The likelihood at some sizes; None where the covariance is numerically singular."""
-        squares, count = np.exp(2.0 * logs), len(logs)
-        information, gradient = self.information.copy(), self.gradient.copy()
-        value, solved = 0.0, []
-        for block, parts in zip(self.blocks, common, strict=True):
-            total = block.known + np.diag(squares[:2] @ block.white)
-            if len(parts):
-                total = total + np.tensordot(squares[2:], parts, axes=1)
-            factor, failed = lapack.dpotrf(total, lower=1)
-            if failed:
-                return None
-            inverse = lapack.dpotri(factor, lower=1)[0]
-            inverse = np.tril(inverse) + np.tril(inverse, -1).T
-            weighted, pulled = inverse @ block.jacobian, inverse @ block.errors
-            information += block.jacobian.T @ weighted
-            gradient += block.jacobian.T @ pulled
-            value += 2.0 * float(np.log(np.diag(factor)).sum()) + float(block.errors @ pulled)
-            solved.append((inverse, weighted, pulled))
-        root = covariance_root(information)
-        estimate = root @ (root.T @ gradient)
-        value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ estimate)
-        gradients, average = np.zeros(count), np.zeros((count, count))
-        projected = np.zeros((len(root), count))
-        for block, parts, (inverse, weighted, pulled) in zip(
-            self.blocks, common, solved, strict=True
-        ):
-            left_over = pulled - weighted @ estimate
-            by_root = weighted @ root
-            left = inverse - by_root @ by_root.T
-            of_white = block.white * left_over
-            working = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
-            traces = [*(block.white @ np.diag(left)), *(np.sum(left * part) for part in parts)]
-            gradients += squares * (np.array(traces) - working @ left_over)
-            working = 2.0 * squares[:, None] * working
-            average += working @ inverse @ working.T
-            projected += by_root.T @ working.T
-        curvature = 0.5 * (average - projected.T @ projected)
-        full = RATIO_PRIOR.beside(LikelihoodValue(0.5 * value, gradients, curvature), logs)
-        return _LikelihoodAt(full.value, full.gradient, full.curvature, logs)
+        return replace(model, processes=processes, white=sigmas[:2], value=found.value)

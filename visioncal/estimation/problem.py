@@ -23,9 +23,9 @@ from scipy.sparse.csgraph import connected_components
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import PathStep, Stride, Tree, TreePaths
-from visioncal.estimation.variance import PriorInformation
 
 # Variance of a rotation that was not measured; its residual and Jacobian rows are zero.
 _NOT_MEASURED = 1.0

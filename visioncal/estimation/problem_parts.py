@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.variance import PriorInformation
+from visioncal.estimation.mixed import PriorInformation
 
 # Variances of undetermined directions of a pose are larger [rad^2].
 _UNDETERMINED_VARIANCE = 0.05

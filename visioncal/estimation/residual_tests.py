@@ -10,13 +10,13 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import (
     fisher_information,
     normal_equations,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.variance import PriorInformation
 
 # Share of sessions in which noise fails a test.
 _FALSE_ALARM = 1e-4

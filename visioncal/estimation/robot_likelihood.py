@@ -6,30 +6,33 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_root, gram, weighted_gram
+from visioncal.estimation.mixed import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    SETTLED,
+    CommonRows,
+    MixedEstimate,
+    MixedModel,
+    SizePrior,
+    Units,
+)
 from visioncal.estimation.normal_equations import Reduced, reduce
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.variance import (
-    LEAST_SIGMA,
-    SETTLED,
-    Components,
-    PriorInformation,
-    RatioPrior,
-    WeightedResiduals,
-    estimate_sigmas,
-)
 
-# Typical translation to rotation noise of arms and cameras [m/rad], within a factor of five.
-RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
+# Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
+# of its logarithm, a factor of five.
+TYPICAL_RATIO, RATIO_LOG_SIGMA = 0.6, 1.5
 
 
-def ratio_prior(robots: Iterable[int], first: int = 0) -> RatioPrior:
-    """Prior of the ratio of both noise levels of robots, whose levels begin at index `first`."""
-    places = tuple((first + 2 * robot, first + 2 * robot + 1) for robot in robots)
-    return replace(RATIO_PRIOR, places=places)
+def ratio_prior(robots: Iterable[int], count: int, first: int = 0) -> SizePrior:
+    """Prior of the ratio of both levels of robots, which begin at index `first` of k sizes."""
+    pairs = [(first + 2 * robot, first + 2 * robot + 1) for robot in robots]
+    return SizePrior.of_ratios(pairs, count, TYPICAL_RATIO, RATIO_LOG_SIGMA)
 
 
 # Lower bound of the initial noise levels of robots [rad and m]: the search starts from above.
@@ -45,14 +48,14 @@ class RobotLikelihood:
     """Restricted likelihood of the robots' noise levels."""
 
     reduced: Reduced  # The estimates of each unit's flange errors.
-    components: Components  # Variance components of these estimates.
-    # Information on the free unknowns from other sources than these estimates.
-    known: PriorInformation
+    # Their likelihood by the free unknowns. The first sizes are the robots' levels of rotation and
+    # translation, robot by robot.
+    model: MixedModel
     moving: Mask  # (p,) mask of the free unknowns.
     members: IntArray  # (u, w) the robots of each unit; see `Problem.units`.
     stops: IntArray  # (u,) the stop of each unit that has observations.
     before: FloatArray  # (r, 2) the robots' previous levels.
-    _weighed: dict[int, tuple[tuple[FloatArray, WeightedResiduals], ...]] = field(
+    _weighed: dict[int, tuple[tuple[FloatArray, MixedEstimate], ...]] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -61,10 +64,10 @@ class RobotLikelihood:
         """(r,) mask of the robots with observations."""
         return np.isin(np.arange(len(self.before)), self.members)
 
-    @cached_property
+    @property
     def jacobian(self) -> FloatArray:
         """(u, 6 w, q) Jacobian of the flange errors by the free unknowns."""
-        return np.ascontiguousarray(self.reduced.jacobian[:, :, self.moving])
+        return self.model.units[0].jacobian
 
     @property
     def rms(self) -> FloatArray:
@@ -83,25 +86,16 @@ class RobotLikelihood:
         """Finds the maximum-likelihood levels, and the negative log-likelihood there.
 
         Args:
-            start: (r, 2) initial levels; or (2 r + k,) with those of k more components.
-            free: (2 r + k,) mask of the levels to estimate, robot by robot.
-            least: Lower bound of the levels.
-            settled: See `estimate_sigmas`.
-            enough: See `variance.most_likely`.
+            start: (r, 2) initial levels; or (2 r + k,) with k more sizes.
+            free: (2 r + k,) mask of the sizes to estimate, robot by robot.
+            least: Lower bound of the sizes.
+            settled: See `mixed.most_likely`.
+            enough: See `mixed.most_likely`.
         """
-        sigmas, value = estimate_sigmas(
-            self.reduced.errors,
-            self.jacobian,
-            self.components,
-            self.known,
-            start.ravel(),
-            free,
-            ratio_prior(np.flatnonzero(self.seen).tolist()),
-            least,
-            settled,
-            enough,
-        )
-        return sigmas.reshape(start.shape), value
+        logs = np.log(np.maximum(start.ravel(), LEAST_SIGMA))
+        low, high = (np.where(free, np.log(bound), logs) for bound in (least, MOST_SIGMA))
+        found = self.model.maximised(logs, low, high, settled, enough)
+        return np.exp(found.logs).reshape(start.shape), found.value
 
     def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
         """Estimates the robots' levels (r, 2); see `robot_levels`."""
@@ -135,15 +129,14 @@ class RobotLikelihood:
                 start, least = (levels, size), weighed.value - gain
         return start
 
-    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, WeightedResiduals], ...]:
+    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, MixedEstimate], ...]:
         """Fits at the levels `white`, and at lower levels of one robot."""
         if robot not in self._weighed:
             lower = np.ones((len(_LOWER), *self.before.shape))
             lower[:, robot] = _LOWER
-            every = np.maximum(self.white[0] * lower, LEAST_SIGMA)
-            given = self.reduced.errors, self.jacobian, self.components, self.known
             self._weighed[robot] = tuple(
-                (levels, WeightedResiduals.of(*given, np.log(levels.ravel()))) for levels in every
+                (levels, self.model.at(np.log(levels.ravel()), is_sloped=False))
+                for levels in np.maximum(self.white[0] * lower, LEAST_SIGMA)
             )
         return self._weighed[robot]
 
@@ -153,35 +146,48 @@ class RobotLikelihood:
         return self.white[1] + 0.5 * self.reduced.cost
 
     def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
-        if not len(self.components.known):
+        if not len(self.members):
             return self.before, 0.0
         start = np.where(self.seen[:, None], start, self.before)
         return self.most_likely(start, np.repeat(self.seen, 2))
 
-    def beside(self, robot: int, moves: FloatArray) -> Self:
+    def beside(
+        self,
+        robot: int,
+        moves: FloatArray,
+        shares: FloatArray | None = None,
+        typical: FloatArray | None = None,
+    ) -> Self:
         """Appends k unknowns that move a robot's flange.
 
-        They affect the units' flange error estimates only: `reduced.information` has nothing on
-        them, since the errors are eliminated there.
+        They affect the units' flange error estimates only, in which the errors are eliminated.
 
         Args:
             robot: Index of the robot.
             moves: (s, 6, k) Jacobian of its flange by them at each stop.
+            shares: (k, g) variance of each by the square of each of g more sizes; flat if None.
+            typical: (g,) logarithms of typical sizes, which are their prior within a factor of e;
+                no prior if None.
         """
-        reduced, size = self.reduced, moves.shape[2]
-        jacobian = np.zeros((*reduced.errors.shape, size))
+        (units,), count = self.model.units, moves.shape[2]
+        jacobian = np.zeros((*units.residuals.shape, count))
         jacobian[(self.members == robot).any(axis=1)] = self.moved(robot, moves)
-        return replace(
-            self,
-            reduced=replace(
-                reduced,
-                information=np.pad(reduced.information, (0, size)),
-                gradient=np.pad(reduced.gradient, (0, size)),
-                jacobian=np.concatenate([reduced.jacobian, jacobian], axis=2),
-            ),
-            known=self.known.beside(size),
-            moving=np.pad(self.moving, (0, size), constant_values=True),
+        units = replace(units, jacobian=np.concatenate([units.jacobian, jacobian], axis=2))
+        own, prior = np.zeros((count, 0)) if shares is None else shares, self.model.prior
+        # A prior of infinite width is none.
+        if prior is not None:
+            prior = prior.beside(
+                np.zeros(own.shape[1]) if typical is None else typical,
+                np.inf if typical is None else 1.0,
+            )
+        model = replace(
+            self.model,
+            prior=prior,
+            units=(units,),
+            common=tuple(rows.beside(count) for rows in self.model.common),
+            shares=np.asarray(block_diag(self.model.shares, own)),
         )
+        return replace(self, model=model)
 
     def moved(self, robot: int, moves: FloatArray) -> FloatArray:
         """Jacobian (m, 6 w, k) of the estimates of a robot's m units, for `moves` (s, 6, k)."""
@@ -204,17 +210,18 @@ class RobotLikelihood:
         Returns:
             (k,) values.
         """
-        total = self.components.total(np.maximum(levels.ravel(), LEAST_SIGMA))
+        (units,), (known,) = self.model.units, self.model.common
+        total = units.total(np.log(np.maximum(levels.ravel(), LEAST_SIGMA)))
         white = np.linalg.inv(np.linalg.cholesky(total))
         own = (self.members == robot).any(axis=1)
         added = np.repeat(np.where(self.members == robot, 1.0, 0.0), 6, axis=1)
         added *= np.tile(np.repeat(levels[robot], 3), self.members.shape[1]) ** 2
         shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
         white = np.swapaxes(axes, 1, 2) @ white
-        jacobian, errors = white @ self.jacobian, (white @ self.reduced.errors[..., None])[..., 0]
+        jacobian, errors = white @ units.jacobian, (white @ units.residuals[..., None])[..., 0]
         others, other_errors = jacobian[~own], errors[~own]
-        information = self.known.information + gram(others, others)
-        gradient = self.known.gradient + gram(others, other_errors)
+        information = known.information + gram(others, others)
+        gradient = known.gradient + gram(others, other_errors)
         jacobian, errors, values = jacobian[own], errors[own], np.empty(len(scales))
         for index, scale in enumerate(scales.tolist()):
             grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
@@ -246,22 +253,23 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
     stops[unit_of[unit_of >= 0]] = problem.observations.stops[unit_of >= 0]
     reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
     count, width = len(problem.robots), members.shape[1]
-    parts = np.zeros((2 * count, len(members), 6 * width))
+    parts = np.zeros((2 * count, len(members), 6 * width, 6 * width))
     for robot in range(count):
         rows, slots = np.nonzero(members == robot)
         for axis in range(3):
             at = 6 * slots + axis
-            parts[2 * robot, rows, at] = parts[2 * robot + 1, rows, at + 3] = 1.0
+            parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
     moving, covariance = problem.moving, reduced.covariance.copy()
     if problem.repeats:
         first = len(members) - len(problem.repeats)
         covariance[first:] += problem.error_covariance(noise)[first:]
-    return RobotLikelihood(
-        reduced,
-        Components(covariance, parts),
-        PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
-        moving,
-        members,
-        stops,
-        noise.robots,
+    jacobian = np.ascontiguousarray(reduced.jacobian[:, :, moving])
+    levels = np.arange(2 * count)
+    seen = np.intersect1d(np.arange(count), members)
+    model = MixedModel(
+        (Units(reduced.errors, jacobian, covariance, parts, levels),),
+        (CommonRows(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),),
+        np.zeros((jacobian.shape[2], len(levels))),
+        ratio_prior(seen.tolist(), len(levels)),
     )
+    return RobotLikelihood(reduced, model, moving, members, stops, noise.robots)

@@ -15,6 +15,7 @@ from visioncal.core.transforms import exp, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.linalg import covariance_from, scaled_values
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
     FALSE_MOVE,
@@ -37,7 +38,6 @@ from visioncal.estimation.solve import (
     fit_problem,
     fitted_covariance,
 )
-from visioncal.estimation.variance import PriorInformation
 
 # Least information of a step beside the other unknowns, as a share of that without them.
 _LEAST_INFORMATION = 1e-6

@@ -29,9 +29,9 @@ from visioncal.estimation.effects.delays import (
     target_twists,
 )
 from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
-from visioncal.estimation.variance import PriorInformation
 from visioncal.results.sections import ClockResult
 from visioncal.session import View, too_far_apart
 

@@ -32,6 +32,7 @@ from visioncal.estimation.joint import (
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.lens_levels import are_beyond, estimate_levels
 from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import likely_sigma
 from visioncal.estimation.normal_equations import equations_and_cost
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem_parts import State
@@ -40,7 +41,6 @@ from visioncal.estimation.solve import (
     covariance_of,
     left_out_residuals,
 )
-from visioncal.estimation.variance import likely_sigma
 
 # Relative error of a board's size beyond the linear range.
 _NONLINEAR = 2e-3

@@ -17,6 +17,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_among, damped_step
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import (
     equations_and_cost,
     fisher_information,
@@ -28,7 +29,6 @@ from visioncal.estimation.solve import (
     fit_problem,
     robot_levels,
 )
-from visioncal.estimation.variance import PriorInformation
 from visioncal.robot import Robot
 from visioncal.robot.thermal.heating import Heating, Inputs, Kind
 from visioncal.robot.thermal.model import ThermalModel

@@ -3,8 +3,8 @@
 import numpy as np
 
 from visioncal.core.types import FloatArray
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import ROBOT, Effect
-from visioncal.estimation.variance import PriorInformation
 
 
 def clock_effect(

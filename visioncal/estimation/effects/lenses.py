@@ -15,9 +15,9 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import CornerProblem
-from visioncal.estimation.variance import PriorInformation
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.

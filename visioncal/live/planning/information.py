@@ -28,10 +28,10 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.purposes import Purpose

@@ -1,0 +1,467 @@
+"""One linear mixed model, whose sizes are estimated by restricted maximum likelihood (REML).
+
+    r = J a + E v + n        n ~ N(0, known)        v_j ~ N(0, s_k^2)        a: flat or N(0, s_k^2)
+
+`r` are residuals at a linearisation point, in units that share errors `v`; `a` are the unknowns
+that all units have in common. The standard deviations `s_k` of unit errors, of common unknowns and
+of noise are the sizes; each may be estimated (Patterson and Thompson 1971; in the form of Harville
+1977, section 3), with average information as curvature (Gilmour, Thompson and Cullis 1995). Errors
+of units are eliminated unit by unit, so that an evaluation is linear in the number of units.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.linalg import covariance_root, gram
+
+# Bounds of the standard deviations, in units of the residuals [rad and m].
+LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
+_ITERATIONS = 60
+# A step changes a sigma by a factor of e at most; a change of 1e-4 is far below its uncertainty.
+_LONGEST_STEP, SETTLED = 1.0, 1e-4
+_WORST_DAMPING = 1e6
+# A smaller gain of log-likelihood corresponds to a thousandth of the levels' uncertainty.
+_LITTLE = 1e-6
+# Levels near zero have a gradient below this per value that they describe, and at most this ratio
+# of curvature to gradient (that of a variance is 2): they decrease by longer steps.
+HARDLY, _VARIANCES, _LONGEST_FALL = 0.1, 3.0, 2.0
+# The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
+# this length: at three times the initial level it is three times the prediction.
+_SURELY, _SHORT_STEP = 3.0, 0.5
+# Square root of the likelihood-ratio limit of a 95 % interval of one unknown (chi-square); first
+# and largest half width and tolerance of its search, in logarithms of the sigma.
+_SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
+
+# Spacing of the grid over the logarithm of a random effect's size.
+_SIZE_STEP = 0.2
+# Eigenvalues of the remaining information below this share of the original trace are rounding.
+_ROUNDING = 1e-9
+
+# Bounds of the logarithm of the ratio of a value's variance to its measurement variance; shrinkage
+# factor below which the value counts as zero.
+_LIKELY_RANGE, _FOLLOWED = (-7.0, 12.0), 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class PriorInformation:
+    """Gaussian prior of p parameters, linearised."""
+
+    information: FloatArray  # (p, p), zero for parameters without a prior.
+    gradient: FloatArray  # (p,) half the gradient of the prior cost at the current state.
+
+    def beside(self, count: int) -> "PriorInformation":
+        """The same with `count` parameters without a prior appended."""
+        return PriorInformation(
+            np.pad(self.information, (0, count)), np.pad(self.gradient, (0, count))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodValue:
+    """Negative log-likelihood with gradient and curvature by the logarithms of the sigmas."""
+
+    value: float
+    gradient: FloatArray
+    curvature: FloatArray
+
+
+Found = TypeVar("Found", bound=LikelihoodValue)
+
+
+@dataclass(frozen=True, eq=False)
+class SizePrior:
+    """Log-normal priors: m linear functions of the sizes' logarithms, of variance one."""
+
+    jacobian: FloatArray  # (m, k).
+    mean: FloatArray  # (m,).
+
+    @classmethod
+    def of_ratios(
+        cls, pairs: Sequence[tuple[int, int]], count: int, ratio: float, log_sigma: float
+    ) -> "SizePrior":
+        """Prior of the second size over the first, of some pairs among k sizes."""
+        jacobian = np.zeros((len(pairs), count))
+        for row, (first, second) in zip(jacobian, pairs, strict=True):
+            row[first], row[second] = -1.0 / log_sigma, 1.0 / log_sigma
+        return cls(jacobian, np.full(len(pairs), np.log(ratio) / log_sigma))
+
+    def beside(self, typical: FloatArray, log_sigma: float) -> "SizePrior":
+        """The same with g more sizes, of (g,) typical logarithms within `log_sigma`."""
+        return SizePrior(
+            np.asarray(block_diag(self.jacobian, np.eye(len(typical)) / log_sigma)),
+            np.append(self.mean, typical / log_sigma),
+        )
+
+    def at(self, logs: FloatArray) -> LikelihoodValue:
+        """Its negative logarithm."""
+        offset = self.jacobian @ logs - self.mean
+        return LikelihoodValue(
+            0.5 * float(offset @ offset), offset @ self.jacobian, self.jacobian.T @ self.jacobian
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """u units of d rows each, whose errors are independent of those of other units."""
+
+    residuals: FloatArray  # (u, d).
+    jacobian: FloatArray  # (u, d, q) by the common unknowns.
+    known: FloatArray  # (u, d, d) covariance whose size is known.
+    parts: FloatArray  # (j, u, d, d) covariance by each of j sizes, at a size of one.
+    sizes: IntArray  # (j,) indices of these sizes.
+
+    def total(self, logs: FloatArray) -> FloatArray:
+        """Covariances (u, d, d) of the residuals at (k,) logarithms of the sizes."""
+        squares = np.exp(2.0 * logs[self.sizes])
+        return np.asarray(self.known + np.tensordot(squares, self.parts, axes=1))
+
+
+@dataclass(frozen=True, eq=False)
+class CommonRows:
+    """Rows that depend on the common unknowns alone, by their products; a prior is one, too."""
+
+    information: FloatArray  # (q, q) at a noise size of one.
+    gradient: FloatArray  # (q,) product of their Jacobian and their residuals.
+    cost: float = 0.0  # Squared residuals.
+    rows: float = 0.0  # Number of rows.
+    noise: int = -1  # Index of the size of their noise; -1 where their covariance is absolute.
+
+    def beside(self, count: int) -> "CommonRows":
+        """The same with `count` more unknowns, on which they do not depend."""
+        return replace(
+            self,
+            information=np.pad(self.information, (0, count)),
+            gradient=np.pad(self.gradient, (0, count)),
+        )
+
+    def left(self, values: FloatArray) -> tuple[FloatArray, float]:
+        """(q,) gradient and squared residuals at (q,) values."""
+        gradient = self.gradient - self.information @ values
+        return gradient, self.cost - float(values @ (self.gradient + gradient))
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedUnits:
+    """Units at some sizes."""
+
+    weights: FloatArray  # (u, d, d) inverse covariance of the residuals.
+    weighted: FloatArray  # (u, d, q) weights times the Jacobian.
+    pulled: FloatArray  # (u, d) weighted residuals at the most likely common unknowns.
+
+
+@dataclass(frozen=True, eq=False)
+class MixedEstimate(LikelihoodValue):
+    """The restricted likelihood at some sizes, and the most likely common unknowns there."""
+
+    logs: FloatArray  # (k,) logarithms of the sizes.
+    values: FloatArray  # (q,) best linear unbiased prediction of the common unknowns.
+    root: FloatArray  # (q, q) root of their covariance `root @ root^T`.
+    units: tuple[WeightedUnits, ...]
+
+    def likely_size(self, moved: FloatArray, among: Mask) -> tuple[float, float]:
+        """Maximum-likelihood size of additional random unknowns of equal variance.
+
+        With the other sizes held, the likelihood of a size is a sum over the eigenvalues of the
+        unknowns' information.
+
+        Args:
+            moved: (n, d, j) Jacobian of residuals of the first units by the unknowns.
+            among: (u,) mask of these n units.
+
+        Returns:
+            The size within a tenth, and the gain of log-likelihood; zeros if no size gains any.
+        """
+        own = self.units[0]
+        absorbed = self.root.T @ gram(own.weighted[among], moved)
+        information = gram(moved, own.weights[among] @ moved) - absorbed.T @ absorbed
+        values, vectors = np.linalg.eigh(information)
+        # Directions that the parameters absorb entirely hold rounding only.
+        kept = values > _ROUNDING * np.trace(information + absorbed.T @ absorbed)
+        values, vectors = values[kept], vectors[:, kept]
+        squares = (gram(moved, own.pulled[among]) @ vectors) ** 2
+        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
+        added = 1.0 + sizes**2 * values
+        change = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
+        best = int(np.argmin(change))
+        return (float(sizes[best, 0]), -float(change[best])) if change[best] < 0.0 else (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class MixedModel:
+    """Units and common rows, with q common unknowns and k sizes."""
+
+    units: tuple[Units, ...]
+    common: tuple[CommonRows, ...]
+    # (q, k) variance of each common unknown by the square of each size; zeros where it is flat.
+    shares: FloatArray
+    # Prior of the sizes: it decides where the residuals cannot, because the common unknowns can
+    # absorb one kind of them entirely.
+    prior: SizePrior | None = None
+
+    def at(self, logs: FloatArray, *, is_sloped: bool = True) -> MixedEstimate:
+        """The likelihood at (k,) logarithms of the sizes; without slopes, these are zero."""
+        sizes = np.exp(logs)
+        is_random = self.shares.any(axis=1)
+        variances = (self.shares @ sizes**2)[is_random]
+        gradient = np.zeros(len(self.shares))
+        information = np.diag(gradient)
+        information[is_random, is_random] = 1.0 / variances
+        value, weighed = float(np.log(variances).sum()), []
+        for unit in self.units:
+            total = unit.total(logs)
+            weights = np.asarray(np.linalg.inv(total), dtype=float)
+            weighted = weights @ unit.jacobian
+            information += gram(unit.jacobian, weighted)
+            gradient += gram(weighted, unit.residuals)
+            value += float(np.linalg.slogdet(total)[1].sum())
+            weighed.append((weights, weighted))
+        for rows in self.common:
+            weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
+            information += weight * rows.information
+            gradient += weight * rows.gradient
+            if rows.noise >= 0:
+                value += 2.0 * rows.rows * float(logs[rows.noise])
+        root = covariance_root(information)
+        values = root @ (root.T @ gradient)
+        value += float(np.sum(values[is_random] ** 2 / variances))
+        value -= 2.0 * float(np.linalg.slogdet(root)[1])
+        units = []
+        for unit, (weights, weighted) in zip(self.units, weighed, strict=True):
+            left = unit.residuals - unit.jacobian @ values
+            pulled = (weights @ left[:, :, None])[:, :, 0]
+            value += float(np.einsum("ui,ui->", left, pulled))
+            units.append(WeightedUnits(weights, weighted, pulled))
+        for rows in self.common:
+            weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
+            value += weight * rows.left(values)[1]
+        flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
+        here = MixedEstimate(0.5 * value, *flat, logs, values, root, tuple(units))
+        gradient, curvature = self._slopes(here) if is_sloped else flat
+        if self.prior is not None:
+            prior = self.prior.at(logs)
+            gradient, curvature = gradient + prior.gradient, curvature + prior.curvature
+            value += 2.0 * prior.value
+        return replace(here, value=0.5 * value, gradient=gradient, curvature=curvature)
+
+    def _slopes(self, here: MixedEstimate) -> tuple[FloatArray, FloatArray]:
+        """Gradient (k,) and average information (k, k) by the logarithms of the sizes."""
+        variances, values, root = np.exp(2.0 * here.logs), here.values, here.root
+        by_size = np.zeros(len(variances))
+        is_random = self.shares.any(axis=1)
+        own = self.shares[is_random] @ variances
+        # Variance of each random unknown by each size.
+        parts = self.shares[is_random] * variances
+        posterior = np.sum(root[is_random] ** 2, axis=1) + values[is_random] ** 2
+        by_size += (1.0 / own - posterior / own**2) @ parts
+        # Working variates: derivatives of the covariance by the logarithm of each size, times the
+        # weighted residuals. Their products, less what the unknowns absorb, are the information.
+        along = np.zeros((len(values), len(variances)))
+        along[is_random] = 2.0 * parts * (values[is_random] / own)[:, None]
+        average, absorbed = np.zeros((len(variances),) * 2), np.zeros_like(along)
+        for unit, at in zip(self.units, here.units, strict=True):
+            by_root = (at.weighted.reshape(-1, len(root)) @ root).reshape(at.weighted.shape)
+            remaining = at.weights - by_root @ np.swapaxes(by_root, 1, 2)
+            pulls = (unit.parts @ at.pulled[:, :, None])[..., 0]
+            traces = np.tensordot(unit.parts, remaining, axes=([1, 2, 3], [0, 1, 2]))
+            squares = variances[unit.sizes]
+            by_size[unit.sizes] += squares * (traces - np.einsum("jui,ui->j", pulls, at.pulled))
+            working = unit.jacobian @ along
+            working[:, :, unit.sizes] += np.moveaxis(2.0 * squares[:, None, None] * pulls, 0, 2)
+            average += gram(working, at.weights @ working)
+            absorbed += gram(at.weighted, working)
+        for rows in self.common:
+            weight = 1.0 if rows.noise < 0 else 1.0 / variances[rows.noise]
+            rest, cost = rows.left(values)
+            products = rows.information @ along
+            average += weight * along.T @ products
+            absorbed += weight * products
+            if rows.noise < 0:
+                continue
+            trace = float(np.sum(root * (rows.information @ root)))
+            by_size[rows.noise] += rows.rows - weight * (cost + trace)
+            crossed = 2.0 * weight * rest @ along
+            average[rows.noise] += crossed
+            average[:, rows.noise] += crossed
+            average[rows.noise, rows.noise] += 4.0 * weight * cost
+            absorbed[:, rows.noise] += 2.0 * weight * rest
+        projected = root.T @ absorbed
+        return by_size, 0.5 * (average - projected.T @ projected)
+
+    def maximised(
+        self,
+        logs: FloatArray,
+        low: FloatArray | float,
+        high: FloatArray | float,
+        settled: float = SETTLED,
+        enough: float = np.inf,
+        little: float = _LITTLE,
+        hardly: FloatArray | float = HARDLY,
+    ) -> MixedEstimate:
+        """The most likely sizes within (k,) bounds of their logarithms; see `most_likely`."""
+        low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
+        start = np.clip(logs, low, high)
+        return most_likely(self.at, start, low, high, settled, enough, little, hardly)
+
+
+def most_likely(
+    at: Callable[[FloatArray], Found],
+    logs: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    settled: float = SETTLED,
+    enough: float = np.inf,
+    little: float = _LITTLE,
+    hardly: FloatArray | float = HARDLY,
+) -> Found:
+    """Finds the maximum-likelihood logarithms of levels by damped Newton steps.
+
+    Args:
+        at: Evaluates the likelihood at (k,) logarithms.
+        logs: (k,) initial logarithms, within the bounds.
+        low: (k,) lower bounds; equal to `high` for fixed levels.
+        high: (k,) upper bounds.
+        settled: Step below which the search has converged.
+        enough: The search ends once it is unlikely to reach a value below this.
+        little: Predicted gain of log-likelihood below which the search has converged, too.
+        hardly: Gradient below which a level may be near zero, scalar or (k,).
+
+    Returns:
+        The likelihood there; where the last step gains next to nothing, before that step.
+    """
+    now, damping = at(logs), 1e-3
+    for _ in range(_ITERATIONS):
+        # Levels at a bound that they would cross are held there.
+        free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
+        curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
+        near_zero = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
+        vanishing = free & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
+        least = np.maximum(low - logs, np.where(vanishing, -_LONGEST_FALL, -_LONGEST_STEP))
+        # A vanishing variance affects the other levels like half a step of its logarithm.
+        fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
+        newton = _bounded_step(
+            now.gradient + curvature @ fall, curvature, np.where(free & ~vanishing, least, 0.0),
+            np.where(free & ~vanishing, np.minimum(high - logs, _LONGEST_STEP), 0.0),
+        )  # fmt: skip
+        step = np.where(vanishing, least, newton)
+        candidate, length = logs + step, np.abs(step).max(initial=0.0)
+        predicted = -float(newton @ (now.gradient + now.curvature @ (fall + 0.5 * newton)))
+        predicted += 0.5 * float(now.gradient[vanishing].sum())
+        if damping < 1.0:
+            if length < settled or predicted < little:
+                break
+            is_short = np.abs(newton).max(initial=0.0) < _SHORT_STEP
+            if is_short and now.value - _SURELY * predicted > enough:
+                break
+        trial = None
+        # Levels of very different size can make matrices numerically singular.
+        with suppress(np.linalg.LinAlgError):
+            trial = at(candidate)
+        if trial is not None and trial.value <= now.value:
+            logs, now, damping = candidate, trial, max(damping / 10, 1e-6)
+        else:  # The next step is at most half as long.
+            damping = max(10.0 * damping, 1.0)
+        # If no step lowers the value any more, only rounding is left.
+        if length < settled or damping > _WORST_DAMPING:
+            break
+    return now
+
+
+def _bounded_step(
+    gradient: FloatArray, curvature: FloatArray, least: FloatArray, most: FloatArray
+) -> FloatArray:
+    """Newton step (k,) within bounds: clipped components are fixed and the others solved anew."""
+    step, bound = np.zeros(len(gradient)), least == most
+    for _ in range(len(gradient)):
+        rest = ~bound
+        target = -(gradient + curvature @ np.where(bound, step, 0.0))[rest]
+        step[rest] = np.linalg.solve(curvature[np.ix_(rest, rest)], target)
+        violated = rest & ((step < least) | (step > most))
+        if not violated.any():
+            break
+        step, bound = np.clip(step, least, most), bound | violated
+    return step
+
+
+def level_weight(gain: float) -> float:
+    """Akaike weight of a non-zero level (Akaike 1974: each parameter costs 1 in log-likelihood).
+
+    Args:
+        gain: Decrease of twice the log-likelihood without the level.
+    """
+    return float(1.0 / (1.0 + np.exp(1.0 - 0.5 * gain)))
+
+
+def likely_sigma(found: FloatArray, covariance: FloatArray) -> float:
+    """Model-averaged standard deviation of k values that may be zero.
+
+    Args:
+        found: (k,) measured values.
+        covariance: (k, k) of the measurement.
+
+    Returns:
+        The prior standard deviation that gives the average of the shrinkage at the most likely
+        size and at zero, weighted by their Akaike weights.
+    """
+    from scipy.optimize import minimize_scalar
+
+    variances, axes = np.linalg.eigh(covariance)
+    squares, typical = (axes.T @ found) ** 2, float(variances.mean())
+
+    def deviance(log_ratio: float) -> float:
+        total = variances + typical * np.exp(log_ratio)
+        return float(np.sum(np.log(total) + squares / total))
+
+    best = minimize_scalar(deviance, bounds=_LIKELY_RANGE, method="bounded")
+    weight = level_weight(deviance(-np.inf) - best.fun)
+    ratio = float(np.exp(best.x))
+    shrinkage = weight * ratio / (1.0 + ratio)
+    return float(np.sqrt(typical * shrinkage / (1.0 - shrinkage))) if shrinkage > _FOLLOWED else 0.0
+
+
+def profile_interval(
+    profile: Callable[[float], float], sigma: float, lowest: float
+) -> tuple[float, float]:
+    """95 % interval of a standard deviation by its profile likelihood.
+
+    Args:
+        profile: Negative log-likelihood as a function of the logarithm of the sigma.
+        sigma: The maximum-likelihood estimate.
+        lowest: Negative log-likelihood there.
+
+    Returns:
+        Low and high: low is zero if the residuals do not exclude zero noise, and high is about
+        fifty times the sigma if they do not exclude that.
+    """
+    middle = float(np.log(max(sigma, LEAST_SIGMA)))
+    # A fit at a local maximum has its interval about that maximum.
+    local = profile(middle)
+    if 2.0 * (local - lowest) > _SURPRISE_95**2:
+        lowest = local
+
+    def crossing(side: float, limit: float) -> float:
+        inner, outer, width = (0.0, 0.0), None, _FIRST_WIDTH
+        while True:
+            # The root is about linear in the width.
+            root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
+            if root < _SURPRISE_95:
+                inner = width, root
+            else:
+                outer = width, root
+            if outer is not None:
+                fraction = (_SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
+                next_width = inner[0] + fraction * (outer[0] - inner[0])
+            elif width == _WIDEST:
+                return limit
+            else:
+                next_width = min(width * min(1.1 * _SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
+            if not abs(next_width - width) >= _EXACT:
+                return float(np.exp(middle + side * next_width))
+            width = next_width
+
+    return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))
