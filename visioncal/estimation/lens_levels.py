@@ -116,14 +116,14 @@ class _Likelihood:
         return np.log(low), np.log(high)
 
 
-def are_beyond(levels: LensLevels, sigma_px: float) -> bool:
+def are_beyond(levels: LensLevels, sigma_px: float, share: float = 1.2) -> bool:
     """Whether levels exceed those of any real lens, given the corner noise of a fit with them.
 
     They are in units of that noise: both grow where the poses diverge.
     """
     sizes = sigma_px * np.array([levels.field, levels.breathing, levels.jitter])
     # The noise was estimated again, and differs by some percent.
-    return bool(np.any(sizes > 1.2 * np.array(_MOST)))
+    return bool(np.any(sizes > share * np.array(_MOST)))
 
 
 def estimate_levels(
@@ -281,11 +281,11 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     zoomed = np.zeros((views, 7))
     zoomed[chained, :6] = answer[chained, :, focus]
     zoomed[:, 6] = 1.0
-    # Corners of a view without extent do not tell its focus.
-    told = np.maximum(by_focus[:, focus], _RIDGE)
-    noise[:, 6, 6] = 1.0 / told
-    jacobian[:, 6, columns] = by_focus[:, shared] / told[:, None]
-    residuals[:, 6] = by_focus[:, residual] / told
+    # Corners of a view without extent do not determine its focus.
+    focus_information = np.maximum(by_focus[:, focus], _RIDGE)
+    noise[:, 6, 6] = 1.0 / focus_information
+    jacobian[:, 6, columns] = by_focus[:, shared] / focus_information[:, None]
+    residuals[:, 6] = by_focus[:, residual] / focus_information
     parts = np.zeros((2 + 2 * robots, views, 7, 7))
     parts[0], parts[1] = noise, zoomed[:, :, None] * zoomed[:, None, :]
     # Repeats of stationary frames share an error, too, but are taken as independent here.
@@ -297,7 +297,9 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
                 moved, 1, 2
             )
     by_shared = by_focus[:, shared]
-    shared_products = products[np.ix_(shared, shared)] - by_shared.T @ (by_shared / told[:, None])
+    shared_products = products[np.ix_(shared, shared)] - by_shared.T @ (
+        by_shared / focus_information[:, None]
+    )
     pulled = products[shared, residual] - residuals[:, 6] @ by_shared
     information, gradient = np.zeros((size, size)), np.zeros(size)
     information[np.ix_(columns, columns)], gradient[columns] = shared_products, pulled

@@ -32,6 +32,7 @@ from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.lens_levels import are_beyond
 from visioncal.estimation.observability import (
     check_observability,
     refuse_open_motion,
@@ -221,11 +222,15 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
     solved, levels = start, dict[str, LensLevels]()
     for _ in range(_ROUNDS):
         solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, levels, sizes)
-        levels = (
-            {}
-            if solved.linearised_corners is None
-            else dict(solved.linearised_corners.camera_parameters.levels)
-        )
+        if (corners := solved.linearised_corners) is not None:
+            # Levels at their bounds come from outliers that are still in the fit: the next one
+            # estimates them anew.
+            cameras = corners.camera_parameters.problems.items()
+            levels = {
+                name: camera.levels
+                for (name, camera), sigma_px in zip(cameras, corners.sigmas_px, strict=True)
+                if camera.levels is not None and not are_beyond(camera.levels, sigma_px, 0.9)
+            }
         if solved.cell.mount is None or observed.is_misread:
             break
         before = solved.inlier_fit.used
