@@ -17,7 +17,7 @@ from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
-from visioncal.frames.findings import sigma_findings
+from visioncal.frames.fixture_fit import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
     SessionImages,
