@@ -1,8 +1,7 @@
 """Fixture frame from images of markers whose positions a drawing states."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -18,19 +17,17 @@ from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import drawn_fixture
 from visioncal.frames.fixture_fit import FitSettings, Words
 from visioncal.frames.frame_from_images import camera_details, view_findings
-from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
+from visioncal.frames.image_outliers import CandidateViews, find_inliers
 from visioncal.frames.measured_points import MeasuredPoints
 from visioncal.frames.session_observations import SessionImages, fit_views, session_images
 from visioncal.frames.single_view import (
     Sight,
-    TargetPlace,
     all_places,
     check_labels,
     common_covariance,
     needs_robot,
 )
 from visioncal.frames.target_in_image import (
-    PoseCandidates,
     check_image_size,
     target_pose_candidates,
 )
@@ -77,16 +74,6 @@ class MarkerPoints:
         return np.asarray(block_diag(*self.independent) + self.common)
 
 
-@dataclass(frozen=True, eq=False)
-class _Marker:
-    """One marker in the i images that show it: their indices, its places and its poses in each."""
-
-    name: str
-    images: tuple[int, ...]
-    views: tuple[tuple[TargetPlace, ...], ...]
-    looks: tuple[PoseCandidates, ...]
-
-
 def measure_markers(
     calibration: Calibration,
     sights: Sequence[Sight],
@@ -113,58 +100,67 @@ def measure_markers(
     """
     check_labels(sights)
     eye = CalibratedCamera.of(calibration)
-    targets = [_target(number, dictionary, size_m, size_sigma_m) for number in ids]
-    if not targets:
+    if not ids:
         raise DataError("no markers to look for: give their ids.")
-    markers = [_detect(eye, sights, target, sigma_px) for target in targets]
-    unseen = [marker.name for marker in markers if not marker.images]
+    document = {"kind": "marker", "size_m": size_m, "dictionary": dictionary}
+    if size_sigma_m is not None:
+        document["square_sigma_m"] = size_sigma_m
+    targets = [target_from_document({**document, "id": at}, f"marker {at}") for at in ids]
+    found = [
+        [
+            (at, corners)
+            for at, sight in enumerate(sights)
+            if (corners := _corners(eye, sight, target))
+        ]
+        for target in targets
+    ]
+    unseen = [str(number) for number, shown in zip(ids, found, strict=True) if not shown]
     if unseen:
         raise DataError(
             f"marker {some_of(unseen)} of {dictionary} is in none of the {len(sights)} images.",
             culprits=[f"marker {name}" for name in unseen],
             next_step="Take an image that shows it whole, with its white margin; or leave it out.",
         )
-    common = common_covariance(eye, markers[0].looks[0].scale_sigma)
-    fits = [
-        find_inliers(CandidateViews(marker.views, eye.flange_noise, common, eye.noise_dof))
-        for marker in markers
-    ]
-    warnings = [
-        warning
-        for marker, fit in zip(markers, fits, strict=True)
-        for warning in _warnings(eye, marker, fit, sights)
-    ]
+    common = common_covariance(eye, targets[0].square_sigma_m / targets[0].square_m)
+    fits, independent, warnings = [], [], list(eye.warnings)
+    # Jacobians of all centres by the common errors, and by the flange's at each image.
+    by_common = np.zeros((len(ids), 3, len(common)))
+    by_stop = np.zeros((len(sights), len(ids), 3, 6))
+    for marker, (target, shown) in enumerate(zip(targets, found, strict=True)):
+        own_sights = [sights[at] for at, _ in shown]
+        looks = [
+            target_pose_candidates(eye, corners, target, sights[at].label, sigma_px)
+            for at, corners in shown
+        ]
+        views = all_places(eye, own_sights, looks, "base")
+        fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
+        by_centre = np.concatenate([np.zeros((3, 3)), fit.mean.matrix[:3, :3]], axis=1)
+        own = np.zeros((3, 3))
+        for (at, _), view, pick, gain in zip(shown, views, fit.picks, fit.mean.gains, strict=True):
+            place, jacobian = view[pick], by_centre @ gain
+            own += jacobian @ place.pixels @ jacobian.T
+            by_common[marker] += jacobian @ place.by_common
+            by_stop[at, marker] = np.sqrt(fit.variance) * jacobian @ place.flange_jacobian
+        fits.append(fit)
+        independent.append(fit.variance * own)
+        warnings += [words for look in looks for words in look.warnings]
+        # A single image needs no warning, since the other markers check it.
+        if len(shown) > 1:
+            keys = {sight.stop_key for sight in own_sights}
+            stops = len(keys) if needs_robot(eye, "base") else None
+            labels = [sight.label for sight in own_sights]
+            warnings += inlier_warnings(fit, labels, looks, stops, f"marker {target.marker_id}")
+    flat = by_common.reshape(3 * len(ids), -1)
+    stops_flat = by_stop.reshape(len(sights), 3 * len(ids), 6)
+    by_robot = np.einsum("sij,jk,slk->il", stops_flat, eye.flange_noise, stops_flat)
     return MarkerPoints(
-        tuple(marker.name for marker in markers),
+        tuple(map(str, ids)),
         np.array([fit.mean.matrix[:3, 3] for fit in fits]),
-        np.array([_own_covariance(*pair) for pair in zip(markers, fits, strict=True)]),
-        _common_covariance(eye, markers, fits, common, len(sights)),
+        np.array(independent),
+        flat @ common @ flat.T + by_robot,
         tuple(int(fit.inliers.sum()) for fit in fits),
-        (*eye.warnings, *warnings),
+        tuple(warnings),
     )
-
-
-def _target(marker: int, dictionary: str, size_m: float, sigma_m: float | None) -> Target:
-    document = {"kind": "marker", "id": marker, "size_m": size_m, "dictionary": dictionary}
-    if sigma_m is not None:
-        document["square_sigma_m"] = sigma_m
-    return target_from_document(document, f"marker {marker}")
-
-
-def _detect(
-    eye: CalibratedCamera, sights: Sequence[Sight], target: Target, sigma_px: float | None
-) -> _Marker:
-    """Detects one marker in all images; images without it are skipped."""
-    seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
-    shown = [(at, corners) for at, corners in seen if corners is not None]
-    own_sights = [sights[at] for at, _ in shown]
-    looks = [
-        target_pose_candidates(eye, corners, target, sight.label, sigma_px)
-        for (_, corners), sight in zip(shown, own_sights, strict=True)
-    ]
-    views = all_places(eye, own_sights, looks, "base")
-    images = tuple(at for at, _ in shown)
-    return _Marker(str(target.marker_id), images, tuple(views), tuple(looks))
 
 
 def _corners(eye: CalibratedCamera, sight: Sight, target: Target) -> Corners | None:
@@ -180,65 +176,6 @@ def _corners(eye: CalibratedCamera, sight: Sight, target: Target) -> Corners | N
     if isinstance(detected, NotFound):
         return None
     return Corners(0, detected.ids, detected.px, blur_at_corners(image, detected.px))
-
-
-def _warnings(
-    eye: CalibratedCamera, marker: _Marker, fit: ImageInliers, sights: Sequence[Sight]
-) -> Iterator[str]:
-    """Warnings on a marker; a single image needs none, since the other markers check it."""
-    for look in marker.looks:
-        yield from look.warnings
-    if len(marker.images) > 1:
-        shown = [sights[at] for at in marker.images]
-        stops = len({sight.stop_key for sight in shown}) if needs_robot(eye, "base") else None
-        labels = [sight.label for sight in shown]
-        yield from inlier_warnings(fit, labels, marker.looks, stops, f"marker {marker.name}")
-
-
-def _place_jacobians(
-    fit: ImageInliers, views: Sequence[Sequence[TargetPlace]]
-) -> list[tuple[TargetPlace, FloatArray]]:
-    """Each image's place, and the (3, 6) Jacobian of the mean's centre by its perturbation."""
-    mean = np.concatenate([np.zeros((3, 3)), fit.mean.matrix[:3, :3]], axis=1)
-    return [
-        (view[pick], mean @ gain)
-        for view, pick, gain in zip(views, fit.picks, fit.mean.gains, strict=True)
-    ]
-
-
-def _own_covariance(marker: _Marker, fit: ImageInliers) -> FloatArray:
-    """(3, 3) covariance of a centre by the pixel noise of its images."""
-    covariance = np.sum(
-        [
-            jacobian @ place.pixels @ jacobian.T
-            for place, jacobian in _place_jacobians(fit, marker.views)
-        ],
-        axis=0,
-    )
-    return np.asarray(fit.variance * covariance)
-
-
-def _common_covariance(
-    eye: CalibratedCamera,
-    markers: Sequence[_Marker],
-    fits: Sequence[ImageInliers],
-    common: FloatArray,
-    images: int,
-) -> FloatArray:
-    """(3 n, 3 n) covariance of all centres by their common errors."""
-    by_common = np.zeros((len(markers), 3, len(common)))
-    by_stop = np.zeros((images, len(markers), 3, 6))
-    for at, (marker, fit) in enumerate(zip(markers, fits, strict=True)):
-        for image, (place, jacobian) in zip(
-            marker.images, _place_jacobians(fit, marker.views), strict=True
-        ):
-            by_common[at] += jacobian @ place.by_common
-            by_stop[image, at] = np.sqrt(fit.variance) * jacobian @ place.flange_jacobian
-    flat = by_common.reshape(3 * len(markers), -1)
-    stops = by_stop.reshape(images, 3 * len(markers), 6)
-    return np.asarray(
-        flat @ common @ flat.T + np.einsum("sij,jk,slk->il", stops, eye.flange_noise, stops)
-    )
 
 
 def fixture_from_marker_images(
@@ -267,7 +204,14 @@ def fixture_from_marker_images(
         DataError: Fewer than three drawn markers are seen, or they do not fit the drawing.
         DegenerateError: They do not determine the fixture in every direction.
     """
-    ids = {_id(name, drawing): name for name in drawing.names}
+    for name in drawing.names:
+        if not (name.isascii() and name.isdigit()):
+            raise DataError(
+                f"{drawing.source}: point {name!r} is no marker's id: a whole number is needed.",
+                culprits=[name],
+                next_step="Name each point by the id of the marker whose centre it is.",
+            )
+    ids = {int(name): name for name in drawing.names}
     shown = session_images(session, calibration, among=fit_views(session))
     if shown.target.kind != "marker":
         raise DataError(
@@ -285,6 +229,10 @@ def fixture_from_marker_images(
         shown.target.square_m,
         size_sigma_m=shown.target.square_sigma_m,
     )
+    eye = CalibratedCamera.of(calibration)
+    # Directions to the camera's mean position.
+    positions = [eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in shown.sights]
+    outward = np.mean(positions, axis=0) - points.points
     measured = MeasuredPoints(
         session.name,
         points.names,
@@ -293,33 +241,30 @@ def fixture_from_marker_images(
         points.points,
         points.independent,
         points.common,
-        _outward(calibration, shown.sights, points),
+        outward / np.linalg.norm(outward, axis=1)[:, None],
     )
-    fatal = CalibratedCamera.of(calibration).warnings
     findings = (
-        *(replace(remark, is_fatal=remark.words in fatal) for remark in remarks(points.warnings)),
+        *(
+            replace(remark, is_fatal=remark.words in eye.warnings)
+            for remark in remarks(points.warnings)
+        ),
         *view_findings(session, shown.lost),
         *remarks(shown.warnings),
     )
     setting = FitSettings(
         doubts=findings,
-        details=_details(shown.target, points, calibration),
+        details={
+            "dictionary": shown.target.dictionary,
+            "marker_mm": 1e3 * shown.target.square_m,
+            "seen_in": dict(zip(points.names, points.seen_in, strict=True)),
+            **camera_details(calibration),
+        },
         options=options or FixtureLimits(),
         words=_WORDS,
         # Each point's own covariance already holds its noise.
         assumed_noise_m=0.0,
     )
     return drawn_fixture(measured, drawing, setting)
-
-
-def _id(name: str, drawing: NominalPoints) -> int:
-    if not (name.isascii() and name.isdigit()):
-        raise DataError(
-            f"{drawing.source}: point {name!r} is no marker's id: a whole number is needed.",
-            culprits=[name],
-            next_step="Name each point by the id of the marker whose centre it is.",
-        )
-    return int(name)
 
 
 def _shown_markers(shown: SessionImages, ids: Sequence[int]) -> tuple[int, ...]:
@@ -343,20 +288,3 @@ def _shown_markers(shown: SessionImages, ids: Sequence[int]) -> tuple[int, ...]:
 
 def _listed(ids: Sequence[int]) -> str:
     return f" ({some_of([str(number) for number in ids])})" if ids else ""
-
-
-def _outward(calibration: Calibration, sights: Sequence[Sight], points: MarkerPoints) -> FloatArray:
-    """(n, 3) unit directions in the base from the markers to the camera's mean position."""
-    eye = CalibratedCamera.of(calibration)
-    positions = np.array([eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights])
-    directions = positions.mean(axis=0) - points.points
-    return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])
-
-
-def _details(target: Target, points: MarkerPoints, calibration: Calibration) -> dict[str, Any]:
-    return {
-        "dictionary": target.dictionary,
-        "marker_mm": 1e3 * target.square_m,
-        "seen_in": dict(zip(points.names, points.seen_in, strict=True)),
-        **camera_details(calibration),
-    }
