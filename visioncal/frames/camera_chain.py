@@ -112,15 +112,22 @@ class CalibratedCamera:
         verdict = calibration.verdict
         bad = f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
         covariance = result.covariance_with(edge.covariance)
+        noise, errors = calibration.noise, calibration.arm_errors
+        # Robot and camera combined where they were not separable.
+        source = "robot" if "robot_translation_mm" in noise else "combined"
+        rotation = np.deg2rad(noise.get(f"{source}_rotation_deg", 0.0))
+        translation = 1e-3 * noise.get(f"{source}_translation_mm", 0.0)
+        # Without known joints, the estimated noise of the flange already contains the arm's errors.
+        arm_sigma = float(np.deg2rad(errors.sigma_deg)) if errors and errors.of is None else 0.0
         return cls(
             calibration.mount,
             result,
             edge.matrix,
             covariance,
-            _flange_sigmas(calibration),
-            _arm_sigma(calibration),
+            np.repeat([rotation, translation], 3),
+            arm_sigma,
             ArmErrors.of(calibration, covariance),
-            calibration.noise.get("pixel_px"),
+            noise.get("pixel_px"),
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
             None if calibration.budget is None else calibration.budget.distances_m,
@@ -291,12 +298,9 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
         DataError: It is not three finite numbers, or is farther off than any arm reaches.
     """
     point = np.asarray(point_m, dtype=float)
-    if point.shape != (3,):
-        raise DataError(
-            f"{name} has the shape {point.shape}; three metres are needed.", culprits=[name]
-        )
-    if not np.isfinite(point).all():
-        raise DataError(f"{name} is {point.tolist()}; three metres are needed.", culprits=[name])
+    if point.shape != (3,) or not np.isfinite(point).all():
+        seen = f"is {point.tolist()}" if point.shape == (3,) else f"has the shape {point.shape}"
+        raise DataError(f"{name} {seen}; three metres are needed.", culprits=[name])
     if np.abs(point).max() > FAR_M:
         raise DataError(
             f"{name} is {point.tolist()}, and no arm reaches farther than {FAR_M:g} m.",
@@ -304,21 +308,6 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
             next_step="It looks like millimetres: multiply it by 0.001.",
         )
     return point
-
-
-def _flange_sigmas(calibration: Calibration) -> FloatArray:
-    """(6,) flange noise [rad, m]; robot and camera combined where they were not separable."""
-    noise = calibration.noise
-    source = "robot" if "robot_translation_mm" in noise else "combined"
-    rotation = np.deg2rad(noise.get(f"{source}_rotation_deg", 0.0))
-    translation = 1e-3 * noise.get(f"{source}_translation_mm", 0.0)
-    return np.repeat([rotation, translation], 3)
-
-
-def _arm_sigma(calibration: Calibration) -> float:
-    errors = calibration.arm_errors
-    # Without known joints, the estimated noise of the flange already contains the arm's errors.
-    return float(np.deg2rad(errors.sigma_deg)) if errors and errors.of is None else 0.0
 
 
 @dataclass(frozen=True, eq=False)

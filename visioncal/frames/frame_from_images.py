@@ -1,7 +1,7 @@
 """Tool or fixture frame from a session's images, with its verdict."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,7 +14,6 @@ from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
-from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
 from visioncal.frames.fixture_fit import sigma_findings
@@ -46,19 +45,13 @@ _COUNTED_TWICE = (
 _WILD, _STILL = 10.0, 0.1
 # Largest share of unused views without a finding, and the number of reasons listed.
 _LOST_SHARE, _LISTED = 0.25, 3
+_BOARDS = {
+    "charuco": "ChArUco board",
+    "aprilgrid": "AprilGrid",
+    "circles": "grid of circles",
+    "points": "rig",
+}
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
-
-
-@dataclass(frozen=True, eq=False)
-class _PlacedTarget:
-    """Estimated pose of a target on a tool or fixture, with its input."""
-
-    kind: FrameKind  # What the target is on.
-    shown: SessionImages  # The images.
-    seen: TargetPose  # The estimated frame.
-    worst: tuple[Direction, Direction]  # Directions of its largest sigmas: offset, rotation.
-    views: tuple[View, ...]  # (m,) the views that it was estimated from.
-    lost: Mapping[int, str]  # Why other views were not used, by number.
 
 
 @typed
@@ -106,84 +99,95 @@ def seen_frame(
     shown = detect_session_target(
         session, calibration, parent, among=fit_views(session), progress=progress
     )
-    views, looks, lost = _measure(eye, shown)
-    lost |= held_out_views(session)
-    sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
-    seen = place_target(eye, sights, looks, parent).at(point)
-    worst = worst_of(seen.matrix, seen.covariance, kind, parent)
-    placed = _PlacedTarget(kind, shown, seen, worst, views, lost)
-    _check_parent(eye, placed, sights, looks)
-    findings = [
-        *(
-            replace(remark, is_fatal=remark.words in eye.warnings)
-            for remark in remarks(seen.warnings)
-        ),
-        *sigma_findings(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
-        *view_findings(session, lost),
-        *remarks(shown.warnings),
-    ]
-    return Frame(
-        seen.edge,
-        True,
-        _method(placed, point),
-        session.name,
-        datetime.now(UTC).isoformat(timespec="seconds"),
-        seen.rms_mm,
-        _noise_mm(seen),
-        tuple(_observations(session, placed)),
-        Verdict.by(findings, Finding(AGREEMENT, _praise(placed))),
-        _details(placed, point, calibration),
-    )
-
-
-def _measure(
-    eye: CalibratedCamera, shown: SessionImages
-) -> tuple[tuple[View, ...], list[PoseCandidates], dict[int, str]]:
-    """The usable views, their target poses, and why the other views were rejected."""
-    views, looks, lost = [], [], dict(shown.lost)
+    views, sights, looks, lost = [], [], [], dict(shown.lost)
     for sight, view in zip(shown.sights, shown.views, strict=True):
         try:
             looks.append(target_pose_candidates(eye, sight.seen, shown.target, sight.label))
             views.append(view)
+            sights.append(sight)
         except DataError as error:
             lost[view.number] = without_label(error, sight)
     if not views:
         raise no_usable_image(shown, lost)
-    return tuple(views), looks, lost
+    lost |= held_out_views(session)
+    seen = place_target(eye, sights, looks, parent).at(point)
+    worst = worst_of(seen.matrix, seen.covariance, kind, parent)
+    _check_parent(eye, kind, shown, seen, sights, looks)
+    own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
+    advice = (
+        "Take more images, from nearer and from other sides."
+        if own > common
+        else "Most of it is the same in all images (the camera's calibration, the target's size, "
+        "the arm's errors): a better calibration helps, more images do not."
+    )
+    warnings = remarks(seen.warnings)
+    findings = [
+        *(replace(remark, is_fatal=remark.words in eye.warnings) for remark in warnings),
+        *sigma_findings(worst, options.sigma_mm, options.sigma_deg, advice),
+        *view_findings(session, lost),
+        *remarks(shown.warnings),
+    ]
+    count, board = int(seen.inliers.sum()), shown.target
+    images = "one image" if count == 1 else f"{count} images"
+    method = f"{_BOARDS.get(board.kind, board.kind)} {board.name} seen in {images}"
+    details: dict[str, Any] = {"target": board.name}
+    if point.any():
+        point_mm = 1e3 * point
+        method += f"; its point ({', '.join(f'{value:.6g}' for value in point_mm)}) mm"
+        details["point_target_mm"] = point_mm.tolist()
+    # Noise of one image per axis: from the scatter, or predicted for a single image.
+    noise_mm = 1e3 * np.sqrt(own / 3)
+    if count > 1:
+        noise_mm = np.sqrt(np.sum(seen.away_mm[seen.inliers] ** 2) / (3 * (count - 1)))
+    praise = (
+        f"{count} images agree to {mm_and_deg(seen.rms_mm, seen.rms_deg)} (rms), and "
+        f"{worst[0].words}, the worst direction, is known to {figure(1e3 * worst[0].sigma)} mm."
+    )
+    return Frame(
+        seen.edge,
+        True,
+        method,
+        session.name,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        seen.rms_mm,
+        float(noise_mm),
+        tuple(_observations(session, views, seen, lost)),
+        Verdict.by(findings, Finding(AGREEMENT, praise)),
+        details
+        | {
+            "rms_deg": seen.rms_deg,
+            "scatter_over_expected": seen.scatter,
+            "sigma_by_images_mm": float(1e3 * np.sqrt(own)),
+            "sigma_in_common_mm": float(1e3 * np.sqrt(common)),
+        }
+        | camera_details(calibration),
+    )
 
 
 def _check_parent(
     eye: CalibratedCamera,
-    placed: _PlacedTarget,
+    kind: FrameKind,
+    shown: SessionImages,
+    seen: TargetPose,
     sights: Sequence[Sight],
     looks: Sequence[PoseCandidates],
 ) -> None:
     """Raises an error where the target is fixed to the other parent."""
-    other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
-    parent, seen = PARENTS[other], placed.seen
+    other: FrameKind = "fixture" if kind == "tool" else "tool"
+    parent = PARENTS[other]
     has_poses = all(sight.base_from_flange is not None for sight in sights)
     if seen.scatter < _WILD or (needs_robot(eye, parent) and not has_poses):
         return
     alternative = place_target(eye, sights, looks, parent)
     if alternative.rms_mm < _STILL * seen.rms_mm:
         raise DataError(
-            f"session {placed.shown.source!r}: target {placed.shown.target.name} moves by "
-            f"{figure(seen.rms_mm)} mm against the {PARENTS[placed.kind]}, and stands still to "
+            f"session {shown.source!r}: target {shown.target.name} moves by "
+            f"{figure(seen.rms_mm)} mm against the {PARENTS[kind]}, and stands still to "
             f"{figure(alternative.rms_mm)} mm against the {parent}: it is on a {other}, not on a "
-            f"{placed.kind}.",
-            culprits=[placed.shown.source],
+            f"{kind}.",
+            culprits=[shown.source],
             next_step=f"Say visioncal {_COMMANDS[other]} for it.",
         )
-
-
-def _advice(seen: TargetPose) -> str:
-    own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
-    if own > common:
-        return "Take more images, from nearer and from other sides."
-    return (
-        "Most of it is the same in all images (the camera's calibration, the target's size, the "
-        "arm's errors): a better calibration helps, more images do not."
-    )
 
 
 def view_findings(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
@@ -203,67 +207,19 @@ def camera_details(calibration: Calibration) -> dict[str, Any]:
     return {SEEN_BY: calibration.created, "note": _COUNTED_TWICE}
 
 
-def _method(placed: _PlacedTarget, point: FloatArray) -> str:
-    count, target = int(placed.seen.inliers.sum()), placed.shown.target
-    words = {
-        "charuco": "ChArUco board",
-        "aprilgrid": "AprilGrid",
-        "circles": "grid of circles",
-        "points": "rig",
-    }
-    images = "one image" if count == 1 else f"{count} images"
-    note = f"{words.get(target.kind, target.kind)} {target.name} seen in {images}"
-    if not point.any():
-        return note
-    return f"{note}; its point ({', '.join(f'{value:.6g}' for value in 1e3 * point)}) mm"
-
-
-def _noise_mm(seen: TargetPose) -> float:
-    """Noise of one image per axis [mm]: from the scatter, or predicted for a single image."""
-    count = int(seen.inliers.sum())
-    if count > 1:
-        return float(np.sqrt(np.sum(seen.away_mm[seen.inliers] ** 2) / (3 * (count - 1))))
-    return float(1e3 * np.sqrt(np.trace(seen.independent[3:, 3:]) / 3))
-
-
-def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observation]:
-    index_of = {view.number: at for at, view in enumerate(placed.views)}
+def _observations(
+    session: Session, views: Sequence[View], seen: TargetPose, lost: Mapping[int, str]
+) -> Iterator[Observation]:
+    index_of = {view.number: at for at, view in enumerate(views)}
     for number in (view.number for view in session.views):
         if number not in index_of:
-            yield Observation(str(number), used=False, reason=placed.lost[number])
+            yield Observation(str(number), used=False, reason=lost[number])
             continue
         at = index_of[number]
-        away_mm, agrees = float(placed.seen.away_mm[at]), bool(placed.seen.inliers[at])
-        words = mm_and_deg(away_mm, float(placed.seen.away_deg[at]))
+        away_mm, agrees = float(seen.away_mm[at]), bool(seen.inliers[at])
+        words = mm_and_deg(away_mm, float(seen.away_deg[at]))
         reason = "" if agrees else f"it puts the target {words} from where the others do"
         yield Observation(str(number), agrees, reason, residual_mm=away_mm)
-
-
-def _praise(placed: _PlacedTarget) -> str:
-    seen, worst = placed.seen, placed.worst[0]
-    return (
-        f"{int(seen.inliers.sum())} images agree to {mm_and_deg(seen.rms_mm, seen.rms_deg)} (rms), "
-        f"and {worst.words}, the worst direction, is known to "
-        f"{figure(1e3 * worst.sigma)} mm."
-    )
-
-
-def _details(placed: _PlacedTarget, point: FloatArray, calibration: Calibration) -> dict[str, Any]:
-    seen = placed.seen
-    own = {"point_target_mm": (1e3 * point).tolist()} if point.any() else {}
-    return {
-        "target": placed.shown.target.name,
-        **own,
-        "rms_deg": seen.rms_deg,
-        "scatter_over_expected": seen.scatter,
-        "sigma_by_images_mm": _sigma_mm(seen.independent),
-        "sigma_in_common_mm": _sigma_mm(seen.common),
-        **camera_details(calibration),
-    }
-
-
-def _sigma_mm(covariance: FloatArray) -> float:
-    return float(1e3 * np.sqrt(np.trace(covariance[3:, 3:])))
 
 
 def depends_on_camera(frame: Frame) -> bool:

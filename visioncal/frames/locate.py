@@ -1,6 +1,6 @@
 """Picks: position in the base of a feature in an image, with its uncertainty."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from visioncal.frames.camera_chain import (
     point_jacobian,
 )
 from visioncal.frames.located import Located
-from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
+from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
 from visioncal.vision.camera import normalise
@@ -186,7 +186,13 @@ def _located(
     """Builds the result without the sources of zero variance, and warns of a large sigma."""
     nonzero = {name: part for name, part in parts.items() if np.trace(part) > 0.0}
     nonzero = nonzero or {"pixels": np.zeros((3, 3))}
-    located = Located(p_base, nonzero, _freedom(eye, nonzero), (*eye.warnings, *warnings))
+    # Effective degrees of freedom of the summed covariance (Satterthwaite 1946). Only parts by the
+    # robot's noise estimate have finite ones: the pixel noise comes from thousands of corners, and
+    # plane and target are declared.
+    traces = {name: float(np.trace(part)) for name, part in nonzero.items()}
+    estimated = sum(traces[name] for name in _ESTIMATED & traces.keys())
+    freedom = eye.noise_dof * (sum(traces.values()) / estimated) ** 2 if estimated > 0.0 else np.inf
+    located = Located(p_base, nonzero, freedom, (*eye.warnings, *warnings))
     worst_m = float(np.sqrt(max(np.linalg.eigvalsh(located.covariance)[-1], 0.0)))
     if worst_m <= SIGMA_LIMIT_M:
         return located
@@ -210,17 +216,6 @@ def _distance_warning(eye: CalibratedCamera, point_cam: FloatArray) -> tuple[str
         f"{least_m:.2f} to {most_m:.2f} m: its sigma goes by the lens's model there, which nothing "
         "has checked. Calibrate with views at this distance.",
     )
-
-
-def _freedom(eye: CalibratedCamera, parts: Mapping[str, FloatArray]) -> float:
-    """Effective degrees of freedom of the summed covariance (Satterthwaite 1946).
-
-    Only the parts that depend on the robot's noise estimate have finite ones: the pixel noise comes
-    from thousands of corners, and plane and target are declared.
-    """
-    total = sum(float(np.trace(part)) for part in parts.values())
-    estimated = sum(float(np.trace(parts[name])) for name in _ESTIMATED & parts.keys())
-    return eye.noise_dof * (total / estimated) ** 2 if estimated > 0.0 else np.inf
 
 
 # Parts that scale with the robot's estimated noise.
@@ -290,23 +285,17 @@ def locate_target(
     }
     warnings = (*view.warnings, *_distance_warning(eye, point_cam))
     located = _located(eye, cam_pose.point(point_cam), parts, warnings)
-    warning = _ambiguity_warning(view, candidates_cam, located)
-    if not warning:
-        return located
-    return Located(located.p_base, located.parts, located.freedom, (*located.warnings, warning))
-
-
-def _ambiguity_warning(view: PoseCandidates, points_cam: FloatArray, located: Located) -> str:
-    """Warning where another pose fits the image as well and moves the point significantly."""
-    away_mm = 1e3 * float(np.linalg.norm(points_cam - points_cam[0], axis=1).max())
+    # Another pose may fit the image as well and move the point.
+    away_mm = 1e3 * float(np.linalg.norm(candidates_cam - point_cam, axis=1).max())
     if away_mm <= located.radius95_mm:
-        return ""
+        return located
     why = (
         "The board looks the same when it is turned"
         if len(set(view.symmetries)) > 1
         else "Seen so flat, the target may as well be tilted the other way"
     )
-    return (
+    warning = (
         f"{why}: the point would lie {figure(away_mm)} mm away then. Look from another side, from "
         "nearer, or at a board without symmetry."
     )
+    return Located(located.p_base, located.parts, located.freedom, (*located.warnings, warning))

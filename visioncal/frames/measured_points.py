@@ -114,7 +114,18 @@ def touched_points(
         DataError: A row has no pose, or the same one as another.
     """
     if tool is None:
-        poses, tip = _tip_poses(rows), np.zeros(3)
+        # Positions suffice for the tip itself.
+        poses, tip = rows.base_from_flange, np.zeros(3)
+        known = np.isfinite(poses[:, :3, 3]).all(axis=1)
+        missing = [rows.places[index] for index in np.flatnonzero(~known)]
+        if missing:
+            raise DataError(
+                f"{some_of(missing)}: no position of the tip. With --tool none that is what the "
+                "rows have to hold; joint angles lead to the flange alone.",
+                culprits=missing,
+                next_step="Fill in x_m, y_m, z_m, or name the tool with --tool.",
+            )
+        check_lengths(rows)
         covariance, axis = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0])
     else:
         poses, tip = flange_poses(rows, robot, calibration), tool.edge.matrix[:3, 3]
@@ -138,20 +149,3 @@ def touched_points(
         flat @ covariance @ flat.T,
         -(turns @ axis),
     )
-
-
-def _tip_poses(rows: TouchRows) -> FloatArray:
-    """(n, 4, 4) poses of the tip itself; positions suffice."""
-    missing = [
-        rows.places[index]
-        for index in np.flatnonzero(~np.isfinite(rows.base_from_flange[:, :3, 3]).all(axis=1))
-    ]
-    if missing:
-        raise DataError(
-            f"{some_of(missing)}: no position of the tip. With --tool none that is what the rows "
-            "have to hold; joint angles lead to the flange alone.",
-            culprits=missing,
-            next_step="Fill in x_m, y_m, z_m, or name the tool with --tool.",
-        )
-    check_lengths(rows)
-    return rows.base_from_flange

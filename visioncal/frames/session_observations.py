@@ -63,15 +63,10 @@ def detect_session_target(
     target = _checked_target(session, calibration)
     wanted = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, parent, wanted)
-    views = _usable(session, wanted, target, lost)
-    detected = detect(session, progress=progress, among=views)
+    detected = detect(session, progress=progress, among=_usable(session, wanted, target, lost))
     lost |= {rejection.view: rejection.reason for rejection in detected.rejections}
-    views = _usable(session, wanted, target, lost)
     check_resolution(session, calibration, detected.resolution)
-    sights = [_sight(view, detected.corners[view.number], poses, calibration) for view in views]
-    return SessionImages(
-        session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
-    )
+    return _images(session, calibration, target, wanted, poses, lost, detected.corners)
 
 
 def session_images(
@@ -84,19 +79,51 @@ def session_images(
     target = _checked_target(session, calibration)
     wanted = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, "base", wanted)
-    sights = []
     lost |= {view.number: _NO_IMAGE for view in wanted if not view.image}
+    images: dict[int, Image] = {}
     for view in _usable(session, wanted, target, lost):
         image = image_of(session, view)
         if isinstance(image, Rejection):
             lost[view.number] = image.reason
             continue
         check_resolution(session, calibration, (image.shape[1], image.shape[0]))
-        sights.append(_sight(view, image, poses, calibration))
-    views = _usable(session, wanted, target, lost)
-    return SessionImages(
-        session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
-    )
+        images[view.number] = image
+    return _images(session, calibration, target, wanted, poses, lost, images)
+
+
+def _images(
+    session: Session,
+    calibration: Calibration,
+    target: Target,
+    wanted: Sequence[View],
+    poses: Mapping[int, FloatArray],
+    lost: Mapping[int, str],
+    seen: Mapping[int, Corners] | Mapping[int, Image],
+) -> SessionImages:
+    """Collects the views that are not rejected, with warnings on the session."""
+    views, sights = _usable(session, wanted, target, lost), []
+    for view in views:
+        pose = poses.get(view.number)
+        joints_rad = None if pose is None else calibrated_joints(view, calibration)
+        label = f"view {view.number}"
+        sights.append(Sight(label, seen[view.number], pose, view.stop, joints_rad))
+    lens, stated = calibration.camera, session.camera
+    warnings = [*session.warnings]
+    if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):
+        warnings.append(
+            "The calibration is of a calibrated arm, but views come without joint angles: their "
+            "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too."
+        )
+    if lens is not None and stated is not None:
+        difference = np.abs(stated.matrix - lens.camera.matrix).max()
+        if difference > _OTHER_LENS * lens.camera.matrix[0]:
+            fx, _, cx, _ = stated.matrix
+            warnings.append(
+                f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
+                f"calibrated to {lens.camera.matrix[0]:.0f} and {lens.camera.matrix[2]:.0f}: is it "
+                "the same camera? The calibrated lens was used."
+            )
+    return SessionImages(session.name, target, tuple(sights), views, lost, tuple(warnings))
 
 
 def fit_views(session: Session) -> tuple[View, ...]:
@@ -117,14 +144,6 @@ def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None
     return joints if len(joints) == arm.joint_count else None
 
 
-def _sight(
-    view: View, seen: Corners | Image, poses: Mapping[int, FloatArray], calibration: Calibration
-) -> Sight:
-    pose = poses.get(view.number)
-    joints_rad = None if pose is None else calibrated_joints(view, calibration)
-    return Sight(f"view {view.number}", seen, pose, view.stop, joints_rad)
-
-
 def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArray | None:
     """(4, 4) flange pose at a view, from its joints if need be; None where there is neither.
 
@@ -132,30 +151,6 @@ def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArra
         DataError: The joints are not those of the model.
     """
     return _flange(session, calibration, (view,)).base_from_flange.get(view.number)
-
-
-def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
-    """Warnings on the session itself, and on differences from the calibration."""
-    lens, stated = calibration.camera, session.camera
-    words = session.warnings
-    if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):
-        words = (
-            *words,
-            "The calibration is of a calibrated arm, but views come without joint angles: their "
-            "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
-        )
-    if lens is None or stated is None:
-        return words
-    difference = stated.matrix - lens.camera.matrix
-    if np.abs(difference).max() <= _OTHER_LENS * lens.camera.matrix[0]:
-        return words
-    fx, cx, of_fx, of_cx = (camera.matrix[at] for camera in (stated, lens.camera) for at in (0, 2))
-    return (
-        *words,
-        f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
-        f"calibrated to {of_fx:.0f} and {of_cx:.0f}: is it the same camera? The calibrated lens "
-        "was used.",
-    )
 
 
 def without_label(error: DataError, sight: Sight) -> str:

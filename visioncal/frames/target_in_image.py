@@ -72,7 +72,9 @@ def target_pose_candidates(
     with one_blas_thread():
         in_model = replace(corners, px=eye.lens.in_model(corners.px))
         poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
-        distance_m = _distance_m(poses, kept, target)
+        stack = CornerStack.of({kept.view: kept}, corner_positions(target))
+        # Mean depth of the corners.
+        distance_m = float(depths_m(stack, poses.cam_from_target[:1])[0])
         if eye.breathes:
             in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
             poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
@@ -80,7 +82,19 @@ def target_pose_candidates(
             _with_jacobians(eye, poses, at, kept, target, noise_px, distance_m)
             for at in range(len(poses.turns))
         ]
-    noise_px, warnings = _noise(noise_px, squared_sum, 2 * len(kept.ids) - 6, label)
+    freedom = 2 * len(kept.ids) - 6
+    warnings: tuple[str, ...] = ()
+    scatter_px = float(np.sqrt(squared_sum / freedom))
+    is_larger = squared_sum > noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
+    # Rounding of exact corners is no scatter.
+    if is_larger and scatter_px >= 1e-6:
+        if scatter_px >= _MENTIONED * noise_px:
+            warnings = (
+                f"{label}: the corners scatter by {figure(scatter_px)} px around the target's "
+                f"pose, and {figure(noise_px)} px was to be expected: look whether the image is "
+                "sharp, and the target flat and of the size that is stated.",
+            )
+        noise_px = scatter_px
     # Corners without noise get a millionth of a pixel, so that the covariance is not zero.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return PoseCandidates(
@@ -89,7 +103,13 @@ def target_pose_candidates(
         np.array(
             [np.hstack([compressed.by_shared[0, :, :lens], beyond]) for compressed, beyond in fits]
         ),
-        np.array([_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in fits]),
+        # A rig's size is exact.
+        np.array(
+            [
+                (target.kind != "points") * compressed.by_shared[0, :, lens + SCALE]
+                for compressed, _ in fits
+            ]
+        ),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,
@@ -143,12 +163,6 @@ def _check_corners(corners: Corners, target: Target, label: str) -> None:
             "takes four, of which two lie off every line.",
             culprits=[label],
         )
-
-
-def _distance_m(poses: ViewPoses, corners: Corners, target: Target) -> float:
-    """Mean depth of the corners in the camera's frame [m]."""
-    stack = CornerStack.of({corners.view: corners}, corner_positions(target))
-    return float(depths_m(stack, poses.cam_from_target[:1])[0])
 
 
 def _fit_poses(
@@ -212,26 +226,3 @@ def _compressed(
 ) -> Compressed:
     basis = shape_basis(target)
     return compress(stack, basis, Appearance(camera, np.zeros(basis.shape[2])), starts)
-
-
-def _by_scale(by_shape: FloatArray, target: Target) -> FloatArray:
-    """(6,) Jacobian of a pose by the target's size; a rig's size is exact."""
-    return np.zeros(6) if target.kind == "points" else by_shape[:, SCALE]
-
-
-def _noise(
-    noise_px: float, squares: float, freedom: int, label: str
-) -> tuple[float, tuple[str, ...]]:
-    """Noise to use: the known one, or the corners' scatter where significantly larger; warnings."""
-    limit = noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
-    scatter = float(np.sqrt(squares / freedom))
-    # Rounding of exact corners is no scatter.
-    if squares <= limit or scatter < 1e-6:
-        return noise_px, ()
-    if scatter < _MENTIONED * noise_px:
-        return scatter, ()
-    return scatter, (
-        f"{label}: the corners scatter by {figure(scatter)} px around the target's pose, and "
-        f"{figure(noise_px)} px was to be expected: look whether the image is sharp, and the "
-        "target flat and of the size that is stated.",
-    )

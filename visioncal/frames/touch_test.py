@@ -104,7 +104,7 @@ def touch_targets(
             culprits=["--tool"],
             next_step="Find the tip first (visioncal tcp TOUCHES -c OUT --name gripper), or keep "
             "the flange away by more than all that it carries: --tool none --clearance-mm "
-            f"{_millimetres_from(extent_m):.0f} or more; so far are the parts that are known.",
+            f"{np.ceil(1e3 * extent_m):.0f} or more; so far are the parts that are known.",
         )
     pin = compose(np.eye(3), np.array([0.0, 0.0, clearance_m or 0.0]))
     tip = Edge(pin, np.zeros((6, 6))) if tool is None else tool.edge
@@ -116,7 +116,7 @@ def touch_targets(
             f"(the camera and tools) reaches to {1e3 * extent_m:.0f} mm: it would be in the board.",
             culprits=[named],
             next_step="Touch with a longer tool, or with a gauge: --tool none --clearance-mm "
-            f"{_millimetres_from(extent_m):.0f} or more.",
+            f"{np.ceil(1e3 * extent_m):.0f} or more.",
         )
     board = next(iter(session.boards.values()), None)
     if board is None:
@@ -144,11 +144,6 @@ def touch_targets(
     return TouchTargets(tuple(points), frame, tip, carried_m)
 
 
-def _millimetres_from(length_m: float) -> float:
-    """A length rounded up to whole millimetres."""
-    return float(np.ceil(1e3 * length_m))
-
-
 def evaluate_gaps(
     points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: Tool | None = None
 ) -> TouchTest:
@@ -171,10 +166,13 @@ def evaluate_gaps(
         for point, gap in zip(points, gaps_mm, strict=True)
     )
     beyond = sum(point.gap_mm > point.radius95_mm for point in touched)
-    passed = beyond <= _BY_CHANCE and not _far_beyond(touched)
-    created = datetime.now(UTC).isoformat(timespec="seconds")
+    # Errors along one direction have the longest tail for their 95 % radius.
+    limits = chi2_limit(np.array([_FALSE_ALARM / len(points), 0.05]), 1)
+    by_chance = np.sqrt(limits[0] / limits[1])
+    far = any(point.gap_mm > by_chance * point.radius95_mm for point in touched)
+    passed = beyond <= _BY_CHANCE and not far
     return TouchTest(
-        created=created,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
         tool="flange" if tool is None else tool.name.removeprefix("flange_from_"),
         passed=passed,
         points=touched,
@@ -205,14 +203,6 @@ def touch_test_finding(test: TouchTest) -> Finding:
             "Measure the tool's tip anew, then look whether the camera or the robot was moved."
         )
     return Finding("touch_test", words, step, is_fatal=True)
-
-
-def _far_beyond(points: Sequence[TouchedPoint]) -> list[TouchedPoint]:
-    """The points whose gaps are not explained by chance."""
-    # Errors along one direction have the longest tail for their 95 % radius.
-    limits = chi2_limit(np.array([_FALSE_ALARM / len(points), 0.05]), 1)
-    ratio = np.sqrt(limits[0] / limits[1])
-    return [point for point in points if point.gap_mm > ratio * point.radius95_mm]
 
 
 def _five_corners(board: Target) -> dict[str, FloatArray]:

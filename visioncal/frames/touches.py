@@ -209,7 +209,15 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
     if rows.joints_rad is None:
         return has_joints, poses
     has_joints = np.asarray(np.isfinite(rows.joints_rad).all(axis=1))
-    _check_angles(rows, has_joints)
+    largest = np.abs(np.where(has_joints[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
+    wide = np.flatnonzero(largest > _WIDE_RAD)
+    if len(wide):
+        raise DataError(
+            f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "
+            "turns: these look like degrees.",
+            culprits=[rows.places[index] for index in wide],
+            next_step="Say --joint-unit deg, or write radians.",
+        )
     if robot is None:
         if needed and has_joints.any():
             raise DataError(
@@ -225,33 +233,12 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
             culprits=[rows.source],
         )
     poses[has_joints] = robot.base_from_flange(rows.joints_rad[has_joints])
-    _check_same_arm(rows, poses, has_joints, robot)
-    return has_joints, poses
-
-
-def _check_angles(rows: TouchRows, has_joints: Mask) -> None:
-    if rows.joints_rad is None:
-        return
-    largest = np.abs(np.where(has_joints[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
-    wide = np.flatnonzero(largest > _WIDE_RAD)
-    if len(wide):
-        raise DataError(
-            f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "
-            "turns: these look like degrees.",
-            culprits=[rows.places[index] for index in wide],
-            next_step="Say --joint-unit deg, or write radians.",
-        )
-
-
-def _check_same_arm(rows: TouchRows, poses: FloatArray, has_joints: Mask, robot: Robot) -> None:
     both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
-    if not len(both):
-        return
     delta = invert(poses[both]) @ rows.base_from_flange[both]
-    off_m, off_rad = (np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta))
-    odd = (off_m > _SAME_ARM_M) | (off_rad > _SAME_ARM_RAD)
-    if odd.any():
-        at = int(np.argmax(odd))
+    off_m, off_rad = np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta)
+    odd = np.flatnonzero((off_m > _SAME_ARM_M) | (off_rad > _SAME_ARM_RAD))
+    if len(odd):
+        at = odd[0]
         raise DataError(
             f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
             f"{1e3 * off_m[at]:.0f} mm and {np.rad2deg(off_rad[at]):.1f} deg away from "
@@ -260,6 +247,7 @@ def _check_same_arm(rows: TouchRows, poses: FloatArray, has_joints: Mask, robot:
             next_step="Check the robot's model and its base, and whether the controller reports "
             "the flange without a tool.",
         )
+    return has_joints, poses
 
 
 def numbered(names: Collection[str]) -> dict[str, int]:
