@@ -58,7 +58,10 @@ class LiveView:
         poses = self.cam_from_target(joints)
         smear_px = float(self._moved_px(poses[:-1], poses[1:]).sum())
         if smear_px < _STILL_PX:
-            light = self._still(poses[len(poses) // 2], joints[len(joints) // 2])
+            pose = poses[len(poses) // 2]
+            if self._rest is None or self._moved_px(self._rest[0][None], pose[None]) > _STILL_PX:
+                self._rest = (pose, self._light(pose, joints[len(joints) // 2]))
+            light = self._rest[1]
         else:
             light = self._smeared(joints, smear_px)
         self._count += 1
@@ -68,11 +71,6 @@ class LiveView:
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
         """True board poses: (k, n) joints [rad] to (k, 4, 4)."""
         return self._before(forward(self._cell.robot.true_arm, joints))
-
-    def _still(self, pose: FloatArray, posture: FloatArray) -> Float32Array:
-        if self._rest is None or self._moved_px(self._rest[0][None], pose[None])[0] > _STILL_PX:
-            self._rest = (pose, self._light(pose, posture))
-        return self._rest[1]
 
     def _light(self, pose: FloatArray, posture: FloatArray, **more: int) -> Float32Array:
         shows_board = _faces(self._cell, pose)

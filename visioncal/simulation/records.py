@@ -3,7 +3,7 @@
 A single robot with one camera has no names; its session has singular tables.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -12,14 +12,14 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.columns import POSE, pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
 from visioncal.simulation.draws import RandomStream
-from visioncal.simulation.layout import BoardAt, CameraAt, CellOptions
+from visioncal.simulation.layout import CellOptions
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import BOARDS
 from visioncal.simulation.render import RenderScene, encode, prepare_scene, render
@@ -90,42 +90,11 @@ def cell_session(
             next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
         )
     sights = [sight for sight in cell.sights if not sight.is_of_lens or seen != "poses"]
-    rows = _rows(cell, sights, seen)
-    numbers = dict.fromkeys(key for row in rows for key in row.numbers)
-    texts = dict.fromkeys(key for row in rows for key in row.text)
-    last = [text for text in texts if text == "approach"]
-    stops = ("stop",) if cell.is_named else ()
-    images = ("image",) if any(row.image for row in rows) else ()
-    columns = (
-        "view",
-        *stops,
-        *(text for text in texts if text not in last),
-        *images,
-        *numbers,
-        *last,
-    )
-    boards = [board for board in cell.layout.boards if board.name or seen != "poses"]
-    documents = {board.name: target_document(board.target) for board in boards}
-    single = next(iter(documents.values()), None)
-    return Session.assemble(
-        _document(cell, name, seen),
-        columns,
-        [[row.cell(column) for column in columns] for row in rows],
-        MemoryImages(_rendered(cell, progress) if seen == "images" else {}),
-        target_document=documents if len(documents) > 1 else single,
-        corners=_corners(sights) if seen == "corners" else None,
-    ).with_streams(cell.streams)
-
-
-def _rows(cell: SimulatedCell, sights: Sequence[SimulatedSight], seen: Seen) -> list[View]:
-    """Rows of camera observations, of instrument readings, and of poses only."""
     poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
     views = {
         sight.view: _row(cell, sight, seen, pose) for sight, pose in zip(sights, poses, strict=True)
     }
-    with_rotation = {
-        instrument.name for instrument in cell.layout.instruments if instrument.sigma_rad
-    }
+    with_rotation = {item.name for item in cell.layout.instruments if item.sigma_rad}
     for reading in cell.readings:
         robot = cell.robot_of(frame_name("point", reading.point))
         keys = POSE if reading.instrument in with_rotation else POSE[:3]
@@ -135,7 +104,35 @@ def _rows(cell: SimulatedCell, sights: Sequence[SimulatedSight], seen: Seen) -> 
         views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
     for number, stop, robot in cell.pose_rows:
         views[number] = _view(cell, number, stop, robot, {}, {})
-    return [views[number] for number in sorted(views)]
+    rows = [views[number] for number in sorted(views)]
+    texts = dict.fromkeys(key for row in rows for key in row.text)
+    columns = [
+        *(["view", "stop"] if cell.is_named else ["view"]),
+        *(text for text in texts if text != "approach"),
+        *(["image"] if any(row.image for row in rows) else []),
+        *dict.fromkeys(key for row in rows for key in row.numbers),
+        *(["approach"] if "approach" in texts else []),
+    ]
+    corners = None
+    if seen == "corners":
+        counts = [len(sight.corners.ids) for sight in sights]
+        corners = CornerTable(
+            np.repeat([sight.view for sight in sights], counts),
+            np.concatenate([sight.corners.ids for sight in sights]),
+            np.concatenate([sight.corners.px for sight in sights]),
+            ("",) * sum(counts),
+        )
+    boards = [board for board in cell.layout.boards if board.name or seen != "poses"]
+    documents = {board.name: target_document(board.target) for board in boards}
+    single = next(iter(documents.values()), None)
+    return Session.assemble(
+        _document(cell, name, seen),
+        columns,
+        [[row.cell(column) for column in columns] for row in rows],
+        MemoryImages(_rendered(cell, progress) if seen == "images" else {}),
+        target_document=documents if len(documents) > 1 else single,
+        corners=corners,
+    ).with_streams(cell.streams)
 
 
 def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
@@ -146,10 +143,24 @@ def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
         in_hand = cell.parents["cam"] == "flange"
         document["mount"] = "eye-in-hand" if in_hand else "eye-to-hand"
     robots = {robot.name: {"model": robot.robot, "tip": "flange"} for robot in layout.robots}
-    cameras = {
-        camera.name: _camera_table(camera, cell.stated[camera.name]) for camera in layout.cameras
+    cameras: dict[str, dict[str, Any]] = {}
+    for camera in layout.cameras:
+        lens = cell.stated[camera.name]
+        table: dict[str, Any] = {} if camera.name else {"name": "simulated"}
+        table |= {"resolution": list(lens.resolution), "model": lens.model}
+        if camera.state_intrinsics:
+            table |= {"matrix": lens.matrix.tolist(), "distortion": lens.distortion.tolist()}
+        cameras[camera.name] = table
+    # A board that comes with visioncal, or the file that is written.
+    shipped = (BOARDS["charuco"], BOARDS["checkerboard"])
+    boards = {
+        board.name: {
+            "target": board.target.name
+            if board.target in shipped
+            else f"{frame_name('target', board.name)}.toml"
+        }
+        for board in layout.boards
     }
-    boards = {board.name: {"target": _target_reference(board)} for board in layout.boards}
     if seen == "poses":
         # Measured poses need neither a single camera's table nor a single board's.
         cameras.pop("", None)
@@ -176,33 +187,20 @@ def _tables(kind: str, tables: Mapping[str, Any]) -> dict[str, Any]:
     return {kind: tables[""]} if "" in tables else {f"{kind}s": dict(tables)}
 
 
-def _camera_table(camera: CameraAt, stated: Camera) -> dict[str, Any]:
-    table: dict[str, Any] = {} if camera.name else {"name": "simulated"}
-    table |= {"resolution": list(stated.resolution), "model": stated.model}
-    if camera.state_intrinsics:
-        table |= {"matrix": stated.matrix.tolist(), "distortion": stated.distortion.tolist()}
-    return table
-
-
-def _target_reference(board: BoardAt) -> str:
-    """Name of a board that comes with visioncal, or of the file that is written."""
-    shipped = board.target in (BOARDS["charuco"], BOARDS["checkerboard"])
-    return board.target.name if shipped else f"{frame_name('target', board.name)}.toml"
-
-
 def _row(
     cell: SimulatedCell, sight: SimulatedSight, seen: Seen, measured: FloatArray | None
 ) -> View:
     """Row of a camera observation, with the measured board pose if given."""
-    text = {"camera": sight.camera, "target": sight.board}
+    names = {"camera": sight.camera, "target": sight.board}
+    text = {column: name for column, name in names.items() if name}
     numbers = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
     if measured is not None:
         numbers |= {f"cft_{key}": value for key, value in pose_row(measured).items()}
     image = _image_name(cell, sight) if seen in ("images", "names") else ""
     if sight.stamp_s is not None:
-        return View(sight.view, image, numbers=numbers, text=_named(text))
+        return View(sight.view, image, numbers=numbers, text=text)
     if sight.is_of_lens:
-        return View(sight.view, image, text=_named(text | {"role": "intrinsics"}))
+        return View(sight.view, image, text=text | {"role": "intrinsics"})
     frames = frame_name("camera", sight.camera), frame_name("target", sight.board)
     robots = [arm for frame in frames if (arm := cell.robot_of(frame)) is not None]
     robot = robots[0] if len(set(robots)) == len(robots) > 0 else None
@@ -228,26 +226,10 @@ def _view(
         state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
         if robot_state.loads:
             state |= robot_state.loads[stop].row()
-        words = {"robot": robot, **words}
+        words = ({"robot": robot} if robot else {}) | words
         if robot_state.approach is not None:
             words["approach"] = "+" if robot_state.approach[stop] > 0 else "-"
-    return View(number, image, stop=stop, numbers={**state, **numbers}, text=_named(words))
-
-
-def _named(text: Mapping[str, str]) -> dict[str, str]:
-    """A row's texts, without empty names."""
-    return {column: name for column, name in text.items() if name}
-
-
-def _corners(sights: Sequence[SimulatedSight]) -> CornerTable:
-    """Table of the detected corners."""
-    counts = [len(sight.corners.ids) for sight in sights]
-    return CornerTable(
-        np.repeat([sight.view for sight in sights], counts),
-        np.concatenate([sight.corners.ids for sight in sights]),
-        np.concatenate([sight.corners.px for sight in sights]),
-        ("",) * sum(counts),
-    )
+    return View(number, image, stop=stop, numbers={**state, **numbers}, text=words)
 
 
 def measured_poses(cell: SimulatedCell) -> FloatArray:
@@ -271,30 +253,25 @@ def measured_poses(cell: SimulatedCell) -> FloatArray:
         draws = [
             options.stream(RandomStream.MEASURED, number).standard_normal(6) for number in numbers
         ]
-    return np.array([_measured_pose(cell, *pair) for pair in zip(sights, draws, strict=True)])
-
-
-def _measured_pose(cell: SimulatedCell, sight: SimulatedSight, white: FloatArray) -> FloatArray:
-    """(4, 4) measured `cam_from_target`, with (6,) white noise."""
-    ids, board = sight.exact.ids, cell.board(sight.board)
-    if ids.size < 4:
-        raise DataError(f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4.")
-    camera = cell.camera(sight.camera).camera
-    jacobian = _pose_jacobian(camera, sight.cam_from_target, corners_m(board)[ids])
-    # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
-    factor = np.linalg.qr(jacobian, mode="r")
-    error = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, white))
-    measured = sight.cam_from_target @ error
-    measured[:3, 3] /= board.scale
-    return np.asarray(measured)
-
-
-def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
-    """(2n, 6) Jacobian of the pixels by the pose's right perturbation, by finite differences."""
-    poses = cam_from_target @ _STEPS
-    turns, places = np.swapaxes(poses[..., :3, :3], -1, -2), poses[..., None, :3, 3]
-    forward, backward = project(camera, points @ turns + places).reshape(2, 6, -1)
-    return np.asarray((forward - backward).T / (2.0 * _STEP))
+    measured = []
+    for sight, white in zip(sights, draws, strict=True):
+        ids, board = sight.exact.ids, cell.board(sight.board)
+        if ids.size < 4:
+            raise DataError(
+                f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4."
+            )
+        # Jacobian of the pixels by the pose's right perturbation, by finite differences.
+        poses = sight.cam_from_target @ _STEPS
+        turns, places = np.swapaxes(poses[..., :3, :3], -1, -2), poses[..., None, :3, 3]
+        points = corners_m(board)[ids] @ turns + places
+        forward, backward = project(cell.camera(sight.camera).camera, points).reshape(2, 6, -1)
+        # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
+        factor = np.linalg.qr((forward - backward).T / (2.0 * _STEP), mode="r")
+        error = exp(options.pixel_sigma_px * np.linalg.solve(factor, white))
+        pose = sight.cam_from_target @ error
+        pose[:3, 3] /= board.scale
+        measured.append(pose)
+    return np.array(measured)
 
 
 def _image_name(cell: SimulatedCell, sight: SimulatedSight) -> str:

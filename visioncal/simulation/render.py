@@ -92,12 +92,18 @@ def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = Non
     if holder is not None and cell.robot_of(seer) is None:
         arm, joints = cell.robots[holder].arm, cell.robots[holder].joints
         cam_from_base = cell.between(seer, frame_name("base", holder))
+    # The texture is as fine as the board's closest image needs.
+    target = sheet.target
+    nearest = min(float(np.linalg.norm(sight.cam_from_target[:3, 3])) for sight in sights)
+    samples = _SAMPLES * float(optics.camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
+    texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
+    # Limits a texture to about 30 million texels.
+    while target.columns * target.rows * texels**2 > 3e7:
+        texels //= 2
     return RenderScene(
         camera=optics,
         board=sheet,
-        sheet=_textured(
-            optics.camera, sheet, np.array([sight.cam_from_target for sight in sights])
-        ),
+        sheet=draw_sheet(target, texels),
         backdrop=Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, moves=True)
         if arm is None
         else Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, moves=False),
@@ -107,18 +113,6 @@ def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = Non
         cam_from_base=cam_from_base,
         noise=partial(options.stream, RandomStream.IMAGES),
     )
-
-
-def _textured(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> SheetTexture:
-    """Texture of a board, as fine as its closest image needs."""
-    target = sheet.target
-    nearest = float(np.linalg.norm(cam_from_target[:, :3, 3], axis=1).min())
-    samples = _SAMPLES * float(camera.matrix[0]) * unit_m(target) / max(nearest, 0.05)
-    texels = 2 ** int(np.clip(np.round(np.log2(samples)), 4, 10))
-    # Limits a texture to about 30 million texels.
-    while target.columns * target.rows * texels**2 > 3e7:
-        texels //= 2
-    return draw_sheet(target, texels)
 
 
 def render(scene: RenderScene, index: int) -> Image:
@@ -204,7 +198,11 @@ def _background(
     """Background: its light, knots over the image, and brightness at the knots."""
     camera = scene.camera.camera
     raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
-    plane_from_cam = _plane_from_cam(scene.backdrop, cam_from_target)
+    # The backdrop's plane is z = 0.
+    plane_from_cam = compose(np.eye(3), np.array([0.4, 0.3, -scene.backdrop.depth_m]))
+    if scene.backdrop.moves:
+        lower = compose(np.eye(3), np.array([0.0, 0.0, -scene.backdrop.depth_m]))
+        plane_from_cam = lower @ invert(cam_from_target)
     hits = _plane_hits(plane_from_cam, raster.directions, 0.0)
     background = np.asarray(
         cv2.remap(
@@ -232,23 +230,6 @@ def _background(
     return light, raster, lamp * (1.0 - scene.camera.vignetting * edge)
 
 
-def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArray:
-    """(4, 4) pose of the camera relative to the backdrop, whose plane is z = 0."""
-    if not backdrop.moves:
-        return compose(np.eye(3), np.array([0.4, 0.3, -backdrop.depth_m]))
-    lower = compose(np.eye(3), np.array([0.0, 0.0, -backdrop.depth_m]))
-    return lower @ invert(cam_from_target)
-
-
-def _board_brightness(scene: RenderScene, cam_from_target: FloatArray) -> float:
-    """Brightness of the board by its orientation to the light, if a robot holds it."""
-    if scene.backdrop.moves:
-        return 1.0
-    # Light from behind the camera, above and slightly left; the board's z points away from it.
-    light_cam = np.array([0.3, 0.6, 0.74])
-    return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
-
-
 def _draw_board(
     light: Float32Array, scene: RenderScene, cam_from_target: FloatArray, samples: int
 ) -> None:
@@ -257,11 +238,29 @@ def _draw_board(
     patch = _board_patch(camera, scene.board, cam_from_target)
     if min(patch.size) < 1:
         return
-    brightness = _board_brightness(scene, cam_from_target)
-    raster = trace(camera, patch, samples)
-    flat = _sheet_hits(scene.board, raster.directions, cam_from_target)
+    brightness = 1.0
+    if not scene.backdrop.moves:
+        # Light on a held board from behind the camera, above and slightly left; the board's z
+        # points away from it.
+        light_cam = np.array([0.3, 0.6, 0.74])
+        brightness = 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
+    raster, board, target_from_cam = (
+        trace(camera, patch, samples),
+        scene.board,
+        invert(cam_from_target),
+    )
+    flat = _plane_hits(target_from_cam, raster.directions, 0.0)
+    for _ in range(6 if board.bow_m != 0.0 else 0):
+        # The bow is shallow: this converges by the ratio of the sheet's slope to the ray's.
+        depth = np.clip(bow_depth_m(board, flat), -0.05, 0.05)
+        flat = _plane_hits(target_from_cam, raster.directions, depth)
+    flat = flat / board.scale
+    # Typical spacing of neighbouring pixels on the sheet, as the root of an area [m].
+    right, down = np.diff(flat, axis=1)[:-1], np.diff(flat, axis=0)[:, :-1]
+    area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
+    knot_px2 = float(np.prod(raster.px[1, 1] - raster.px[0, 0]))
     # Texture level that fits the sub-pixels best, over the whole board.
-    spacing = _spacing_m(flat, raster.px) / samples
+    spacing = float(np.sqrt(np.median(area) / knot_px2)) / samples
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
@@ -300,19 +299,6 @@ def _board_patch(camera: Camera, board: Sheet, cam_from_target: FloatArray) -> P
     return Patch(int(left), int(top), int(right), int(bottom))
 
 
-def _sheet_hits(board: Sheet, directions: FloatArray, cam_from_target: FloatArray) -> FloatArray:
-    """Hit points of rays on the bowed sheet, (..., 2) in the flat, unscaled target frame [m]."""
-    target_from_cam = invert(cam_from_target)
-    flat = _plane_hits(target_from_cam, directions, 0.0)
-    if board.bow_m != 0.0:
-        for _ in range(6):
-            # The bow is shallow: the iteration converges by the ratio of the sheet's slope to the
-            # ray's.
-            depth = np.clip(bow_depth_m(board, flat), -0.05, 0.05)
-            flat = _plane_hits(target_from_cam, directions, depth)
-    return flat / board.scale
-
-
 def _plane_hits(
     plane_from_cam: FloatArray, directions: FloatArray, depth_m: FloatArray | float
 ) -> FloatArray:
@@ -324,59 +310,36 @@ def _plane_hits(
     return np.asarray(start[:2] + direction[..., :2] * ((depth_m - start[2]) / descent)[..., None])
 
 
-def _spacing_m(flat: FloatArray, px: FloatArray) -> float:
-    """Typical spacing of neighbouring pixels on the sheet, as the root of an area [m]."""
-    right = np.diff(flat, axis=1)[:-1]
-    down = np.diff(flat, axis=0)[:, :-1]
-    area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
-    knot_px2 = float(np.prod(px[1, 1] - px[0, 0]))
-    return float(np.sqrt(np.median(area) / knot_px2))
-
-
-@dataclass(frozen=True, eq=False)
-class _Tube:
-    """A round part between two points of the base frame, (3,) each [m]."""
-
-    start: FloatArray
-    end: FloatArray
-    radius_m: float
-    grey: float
-
-
 def _draw_arm(
     image: Image, camera: Camera, arm: DhArm, joints: FloatArray, cam_from_base: FloatArray
 ) -> None:
-    """Draws an arm into an image, far parts first."""
-    tubes = _tubes(arm, link_frames(arm, joints[None])[0])
-    visible = []
-    for tube in tubes:
-        ends = np.stack([tube.start, tube.end]) @ cam_from_base[:3, :3].T + cam_from_base[:3, 3]
-        if ends[:, 2].min() > _NEAREST_M:
-            visible.append((float(ends[:, 2].mean()), ends, tube))
-    for _, ends, tube in sorted(visible, key=lambda each: -each[0]):
-        radii = camera.matrix[0] * tube.radius_m / ends[:, 2]
-        _draw_tube(image, project(camera, ends), radii, tube.grey)
-
-
-def _tubes(arm: DhArm, frames: FloatArray) -> list[_Tube]:
-    """Housings and links of an arm of Universal Robots' shape, scaled by its reach."""
-    size = reach_m(arm)
+    """Draws an arm of Universal Robots' shape, scaled by its reach, far parts first."""
+    frames, size = link_frames(arm, joints[None])[0], reach_m(arm)
     origin, axis = frames[:, :3, 3], frames[:, :3, 2]
     wide, slim = 0.062 * size, 0.045 * size
     # Upper arm and forearm are offset from the plane of their joints' origins.
     upper, fore = 0.14 * size * axis[1], 0.03 * size * axis[1]
     light, dark = 178.0, 96.0
-    return [
-        _Tube(origin[0], origin[1], wide * 1.15, light),
-        _Tube(origin[1] - 0.05 * size * axis[1], origin[1] + upper, wide, dark),
-        _Tube(origin[1] + upper, origin[2] + upper, wide * 0.8, light),
-        _Tube(origin[2] + upper, origin[2] + fore, wide * 0.95, dark),
-        _Tube(origin[2] + fore, origin[3] + fore, slim, light),
-        _Tube(origin[3] + fore, origin[4], slim, dark),
-        _Tube(origin[4], origin[5], slim, light),
-        _Tube(origin[5], origin[6], slim * 0.9, dark),
-        _Tube(origin[6], origin[6] + 0.05 * axis[6], slim * 0.6, 130.0),
-    ]
+    # Housings and links: ends in the base [m], radius [m] and grey level.
+    tubes = (
+        (origin[0], origin[1], wide * 1.15, light),
+        (origin[1] - 0.05 * size * axis[1], origin[1] + upper, wide, dark),
+        (origin[1] + upper, origin[2] + upper, wide * 0.8, light),
+        (origin[2] + upper, origin[2] + fore, wide * 0.95, dark),
+        (origin[2] + fore, origin[3] + fore, slim, light),
+        (origin[3] + fore, origin[4], slim, dark),
+        (origin[4], origin[5], slim, light),
+        (origin[5], origin[6], slim * 0.9, dark),
+        (origin[6], origin[6] + 0.05 * axis[6], slim * 0.6, 130.0),
+    )
+    visible = []
+    for start, end, radius_m, grey in tubes:
+        ends = np.stack([start, end]) @ cam_from_base[:3, :3].T + cam_from_base[:3, 3]
+        if ends[:, 2].min() > _NEAREST_M:
+            visible.append((float(ends[:, 2].mean()), ends, radius_m, grey))
+    for _, ends, radius_m, grey in sorted(visible, key=lambda each: -each[0]):
+        radii = camera.matrix[0] * radius_m / ends[:, 2]
+        _draw_tube(image, project(camera, ends), radii, grey)
 
 
 def _draw_tube(image: Image, px: FloatArray, radii: FloatArray, grey: float) -> None:
@@ -390,17 +353,11 @@ def _draw_tube(image: Image, px: FloatArray, radii: FloatArray, grey: float) -> 
     for shade in range(_SHADES):
         share = 1.0 - shade / _SHADES
         centre_line = px + 0.35 * (1.0 - share) * radii[:, None] * normal
-        tone = grey * (0.45 + 0.65 * np.sqrt(1.0 - share**2))
-        _fill(image, centre_line, share * radii, normal, float(min(tone, 235.0)))
-
-
-def _fill(
-    image: Image, centre_line: FloatArray, radii: FloatArray, normal: FloatArray, tone: float
-) -> None:
-    side = radii[:, None] * normal
-    outline = np.concatenate([centre_line + side, (centre_line - side)[::-1]])
-    # Fixed-point coordinates with four fractional bits keep edges smooth.
-    cv2.fillPoly(image, [np.rint(outline * 16).astype(np.int32)], tone, cv2.LINE_AA, 4)
-    for centre, radius in zip(centre_line, radii, strict=True):
-        x, y = np.rint(centre * 16).astype(int)
-        cv2.circle(image, (int(x), int(y)), round(radius * 16), tone, -1, cv2.LINE_AA, 4)
+        tone = float(min(grey * (0.45 + 0.65 * np.sqrt(1.0 - share**2)), 235.0))
+        side = (share * radii)[:, None] * normal
+        outline = np.concatenate([centre_line + side, (centre_line - side)[::-1]])
+        # Fixed-point coordinates with four fractional bits keep edges smooth.
+        cv2.fillPoly(image, [np.rint(outline * 16).astype(np.int32)], tone, cv2.LINE_AA, 4)
+        for centre, radius in zip(centre_line, share * radii, strict=True):
+            x, y = np.rint(centre * 16).astype(int)
+            cv2.circle(image, (int(x), int(y)), round(radius * 16), tone, -1, cv2.LINE_AA, 4)

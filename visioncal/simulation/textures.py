@@ -53,9 +53,22 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     paper = margin - round(_PAPER_MARGIN * texels)
     grey[paper:-paper, paper:-paper] = _PAPER
     grey[margin:-margin, margin:-margin] = _print(target, (height, width), texels)
-    _draw_label(grey[-margin:-paper, margin:-margin], target, texels)
+    # A small grey description of the print in the strip below it.
+    square_mm, scale = f"{1000.0 * unit_m(target):g} mm", texels / 160.0
+    words = f"{target.kind} {target.columns}x{target.rows}, {square_mm} {target.dictionary}"
+    at, thickness = (int(0.1 * texels), int(0.42 * texels)), max(round(1.2 * scale), 1)
+    font, strip = cv2.FONT_HERSHEY_SIMPLEX, grey[-margin:-paper, margin:-margin]
+    cv2.putText(strip, words, at, font, 0.8 * scale, 110.0, thickness, cv2.LINE_AA)
     plate = margin - round(_PLATE_MARGIN * texels)
-    coverage = _shadow(grey.shape, plate, texels)
+    # Coverage: 255 on the plate, fading in the shadow around it, which is computed at low
+    # resolution, as it is smooth.
+    factor = max(texels // 16, 1)
+    small = np.zeros((-(-grey.shape[0] // factor), -(-grey.shape[1] // factor)), np.float32)
+    inner = plate // factor
+    small[inner:-inner, inner:-inner] = 255.0 * _SHADOW_STRENGTH
+    soft = cv2.GaussianBlur(small, (0, 0), 0.16 * texels / factor)
+    coverage = np.asarray(cv2.resize(soft, (grey.shape[1], grey.shape[0])), np.uint8)
+    coverage[plate:-plate, plate:-plate] = 255
     grey[coverage < 255] = 0
     levels = [np.stack([grey, coverage], axis=-1)]
     while levels[-1].shape[0] > 128:
@@ -89,7 +102,12 @@ def draw_table(rng: np.random.Generator, size: int) -> Image:
     mottling = _smooth_noise(rng, size, 40.0, 40.0)
     canvas = np.asarray(134.0 + 4.0 * grain + 6.0 * mottling, np.float32)
     for _ in range(14):
-        _draw_scratch(canvas, rng)
+        start = rng.uniform(0.1, 0.9, 2) * size
+        end = np.clip(start + rng.normal(0.0, 0.12, 2) * size, 0.03 * size, 0.97 * size)
+        layer = np.zeros_like(canvas)
+        cv2.line(layer, _point(start), _point(end), float(rng.uniform(-9.0, 12.0)), 1)
+        part = _around(layer, 8)
+        canvas[part] += cv2.GaussianBlur(layer[part], (0, 0), 0.8)
     for _ in range(9):
         _draw_part(canvas, rng)
     return np.asarray(np.clip(canvas, 0.0, 255.0), np.uint8)
@@ -104,17 +122,6 @@ def draw_wall(rng: np.random.Generator, size: int) -> Image:
         corner = (int(min(x + wide, 0.96 * size)), int(min(y + high, 0.96 * size)))
         cv2.rectangle(canvas, (int(x), int(y)), corner, float(rng.uniform(70.0, 165.0)), -1)
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.008 * size), np.uint8)
-
-
-def _draw_label(strip: Image, target: Target, texels: int) -> None:
-    """Writes a small grey description of the print into the strip below it."""
-    square_mm = f"{1000.0 * unit_m(target):g} mm"
-    words = f"{target.kind} {target.columns}x{target.rows}, {square_mm} {target.dictionary}"
-    scale = texels / 160.0
-    at = (int(0.1 * texels), int(0.42 * texels))
-    thickness = max(round(1.2 * scale), 1)
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(strip, words, at, font, 0.8 * scale, 110.0, thickness, cv2.LINE_AA)
 
 
 def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
@@ -226,19 +233,6 @@ def _marker(target: Target, number: int, side: int) -> Image:
     return np.where(bits > 0, _PAPER, _INK).astype(np.uint8)
 
 
-def _shadow(shape: tuple[int, ...], plate: int, texels: int) -> Image:
-    """Coverage: 255 on the plate, fading in the shadow around it."""
-    # Computed at low resolution, as it is smooth.
-    factor = max(texels // 16, 1)
-    small = np.zeros((-(-shape[0] // factor), -(-shape[1] // factor)), np.float32)
-    inner = plate // factor
-    small[inner:-inner, inner:-inner] = 255.0 * _SHADOW_STRENGTH
-    soft = cv2.GaussianBlur(small, (0, 0), 0.16 * texels / factor)
-    coverage = np.asarray(cv2.resize(soft, (shape[1], shape[0])), np.uint8)
-    coverage[plate:-plate, plate:-plate] = 255
-    return coverage
-
-
 def _smooth_noise(
     rng: np.random.Generator, size: int, sigma_x: float, sigma_y: float
 ) -> FloatArray:
@@ -251,16 +245,6 @@ def _smooth_noise(
     damping[0, 0] = 0.0
     noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * damping, (size, size))
     return np.asarray(noise / noise.std())
-
-
-def _draw_scratch(canvas: _Canvas, rng: np.random.Generator) -> None:
-    size = canvas.shape[0]
-    start = rng.uniform(0.1, 0.9, 2) * size
-    end = np.clip(start + rng.normal(0.0, 0.12, 2) * size, 0.03 * size, 0.97 * size)
-    layer = np.zeros_like(canvas)
-    cv2.line(layer, _point(start), _point(end), float(rng.uniform(-9.0, 12.0)), 1)
-    part = _around(layer, 8)
-    canvas[part] += cv2.GaussianBlur(layer[part], (0, 0), 0.8)
 
 
 def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:

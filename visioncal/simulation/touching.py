@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,8 +72,8 @@ class Touching:
         """Rows of the drawing: `point`, `x_mm`, `y_mm`, `z_mm`."""
         rows = (1e3 * _DRAWN_M).round(6).tolist()
         return [
-            {"point": _point_name(at), "x_mm": x, "y_mm": y, "z_mm": z}
-            for at, (x, y, z) in enumerate(rows)
+            {"point": f"P{at}", "x_mm": x, "y_mm": y, "z_mm": z}
+            for at, (x, y, z) in enumerate(rows, start=1)
         ]
 
 
@@ -121,7 +121,7 @@ def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
         contacts = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
         return _touched(robot, flange_from_tool, contacts, np.zeros_like(contacts), columns, rng)
 
-    names = tuple(_point_name(at) for at in range(len(_DRAWN_M)))
+    names = tuple(f"P{at}" for at in range(1, len(_DRAWN_M) + 1))
     return Touching(
         flange_from_tool,
         base_from_fixture,
@@ -129,10 +129,6 @@ def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
         on_fixture(featured, {"kind": features}),
         on_fixture(_DRAWN_M, {"point": names}),
     )
-
-
-def _point_name(at: int) -> str:
-    return f"P{at + 1}"
 
 
 def _touched(
@@ -201,20 +197,19 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
         DataError: The folder cannot be written.
     """
     for name, part in {"touches": "tip", "features": "features", "points": "points"}.items():
-        rows = [
-            ({"robot": robot} if robot else {}) | row
-            for robot, touching in touched.items()
-            for row in _rows(getattr(touching, part))
-        ]
-        numbered: list[dict[str, object]] = [{"view": at} | row for at, row in enumerate(rows)]
-        write_atomically(folder / f"{name}.csv", _csv(numbered))
+        rows: list[dict[str, object]] = []
+        for robot, touching in touched.items():
+            table: Touched = getattr(touching, part)
+            for at, q in enumerate(table.joints.tolist()):
+                rows.append(
+                    {"view": len(rows)}
+                    | ({"robot": robot} if robot else {})
+                    | {column: values[at] for column, values in table.columns.items()}
+                    | pose_row(table.base_from_flange[at])
+                    | {f"q{joint}_rad": value for joint, value in enumerate(q, start=1)}
+                )
+        write_atomically(folder / f"{name}.csv", _csv(rows))
     write_atomically(folder / "cad.csv", _csv(next(iter(touched.values())).drawing))
-
-
-def _rows(table: Touched) -> Iterator[dict[str, object]]:
-    for at, (pose, q) in enumerate(zip(table.base_from_flange, table.joints, strict=True)):
-        joints = {f"q{joint}_rad": value for joint, value in enumerate(q.tolist(), start=1)}
-        yield {name: column[at] for name, column in table.columns.items()} | pose_row(pose) | joints
 
 
 def _csv(rows: Sequence[Mapping[str, object]]) -> str:

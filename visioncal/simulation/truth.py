@@ -74,34 +74,24 @@ def read_truth(path: Path | str) -> Truth:
 
 
 def truth_of(cell: SimulatedCell) -> dict[str, Any]:
-    """Content of a cell's ground truth file."""
-    of_cell = _of_one if isinstance(cell.options, CellOptions) else _of_several
-    return {"schema": 1} | of_cell(cell) | dict(cell.facts)
-
-
-def _of_one(cell: SimulatedCell) -> dict[str, Any]:
-    """For a cell of one robot and one camera, view by view."""
-    options, arm = asdict(cell.options), asdict(cell.robot.true_arm)
-    camera = options.pop("camera")
-    del arm["name"]
-    return {
-        "transforms": cell.transforms,
-        "camera": camera,
-        "wrong_views": cell.wrong_views,
-        "options": options,
-        "arm": arm,
-        "base_from_flange": cell.robot.true_base_from_flange[[sight.stop for sight in cell.sights]],
-        "cam_from_target": cell.cam_from_target,
-    }
-
-
-def _of_several(cell: SimulatedCell) -> dict[str, Any]:
-    """For a cell with named components, stop by stop."""
+    """Content of a cell's ground truth file: view by view of one robot, else stop by stop."""
+    content: dict[str, Any] = {"schema": 1, "wrong_views": cell.wrong_views}
+    if isinstance(cell.options, CellOptions):
+        options, arm = asdict(cell.options), asdict(cell.robot.true_arm)
+        stops = [sight.stop for sight in cell.sights]
+        content |= {
+            "transforms": cell.transforms,
+            "camera": options.pop("camera"),
+            "options": options,
+            "arm": {key: value for key, value in arm.items() if key != "name"},
+            "base_from_flange": cell.robot.true_base_from_flange[stops],
+            "cam_from_target": cell.cam_from_target,
+        }
+        return content | dict(cell.facts)
     layout, robots = cell.layout, cell.robots
-    return {
+    content |= {
         "parents": cell.parents,
         "transforms": dict(cell.mountings),
-        "wrong_views": cell.wrong_views,
         "wrong_stops": {name: robot.wrong_stops for name, robot in robots.items()},
         "moved": [
             {"frame": move.frame, "from_stop": layout.first_pushed(move)} for move in layout.moved
@@ -110,6 +100,7 @@ def _of_several(cell: SimulatedCell) -> dict[str, Any]:
         "arms": {name: asdict(robot.true_arm) for name, robot in robots.items()},
         "base_from_flange": {name: robot.true_base_from_flange for name, robot in robots.items()},
     }
+    return content | dict(cell.facts)
 
 
 def write_truth(folder: Path, content: Mapping[str, Any]) -> None:
