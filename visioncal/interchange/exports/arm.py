@@ -9,7 +9,6 @@ import numpy as np
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports.content import Format, Selection
 from visioncal.interchange.exports.sources import Source
@@ -33,40 +32,6 @@ _POSTURES, _FITTED = 4000, 800
 _WORKSPACE_WEIGHT = 0.1
 
 
-@dataclass(frozen=True)
-class FitError:
-    """Flange error of fitted constant links against the calibrated arm: rms and maximum [mm]."""
-
-    rms_mm: float
-    most_mm: float
-
-    @classmethod
-    def of(cls, differences: FloatArray) -> "FitError":
-        """Statistics of (m, 3) flange differences [m]."""
-        distances_mm = 1e3 * np.linalg.norm(differences, axis=1)
-        return cls(float(np.sqrt(np.mean(distances_mm**2))), float(distances_mm.max()))
-
-    def __str__(self) -> str:
-        return f"{figure(self.rms_mm)} mm rms, {figure(self.most_mm)} mm at the most"
-
-
-@dataclass(frozen=True, eq=False)
-class FittedLinks:
-    """Constant links and offsets fitted to an arm that a format cannot fully hold."""
-
-    robot: Robot  # The arm with these links, and with the functions that the format holds.
-    # Remaining error over the joint ranges of the stops; None where these are not known.
-    measured: FitError | None
-    workspace: FitError  # Remaining error over the workspace.
-
-    @property
-    def words(self) -> str:
-        """The remaining error in words."""
-        if self.measured is None:
-            return f"{self.workspace} over the workspace"
-        return f"{self.measured} where the arm was measured, {self.workspace} over the workspace"
-
-
 @dataclass(frozen=True, eq=False)
 class ArmContent:
     """Content for a format of arms."""
@@ -88,43 +53,36 @@ class ArmContent:
     cold_c: tuple[float, float] | None = None
     # Largest drift of its flange with temperature, in one posture of the session [mm].
     drift_mm: float = 0.0
-    # Fitted links, where the format cannot hold the whole arm; else None.
-    links: FittedLinks | None = None
+    # The arm with fitted constant links, where the format cannot hold it as a whole, and the
+    # remaining error in words.
+    links: tuple[Robot, str] | None = None
     with_corrections: bool = False  # Whether the table of joint corrections is used with the links.
 
     @property
     def written(self) -> Robot:
         """The arm whose links and offsets are written."""
-        return self.robot if self.links is None else self.links.robot
+        return self.robot if self.links is None else self.links[0]
 
     @property
     def omitted(self) -> tuple[str, ...]:
-        """Effects that no file holds, with their size."""
-        return tuple(name for name in (self.sagging, self.drifting) if name)
-
-    @property
-    def sagging(self) -> str:
-        """The bending that no file holds, with its size; empty for a rigid arm."""
-        if not self.sag_mm or self.links is not None:
-            return ""
-        return (
-            "its joints bend under load, which has no place in it: this is the arm without weight. "
-            f"Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal correct counts "
-            "that)"
-        )
-
-    @property
-    def drifting(self) -> str:
-        """The thermal drift that no file holds, with its size; empty where there is none."""
-        if self.cold_c is None:
-            return ""
-        low, high = (f"{value:.0f}" for value in self.cold_c)
-        links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
-        return (
-            "it drifts with its temperature, which has no place in it: this is the arm with "
-            f"{links}. In one posture of the session its flange moved by up to {self.drift_mm:.2g} "
-            "mm as it warmed up (visioncal correct --temperatures counts that)"
-        )
+        """Bending and thermal drift that no file holds, with their size."""
+        omitted = []
+        if self.sag_mm and self.links is None:
+            omitted.append(
+                "its joints bend under load, which has no place in it: this is the arm without "
+                f"weight. Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal "
+                "correct counts that)"
+            )
+        if self.cold_c is not None:
+            low, high = (f"{value:.0f}" for value in self.cold_c)
+            links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
+            omitted.append(
+                "it drifts with its temperature, which has no place in it: this is the arm with "
+                f"{links}. In one posture of the session its flange moved by up to "
+                f"{self.drift_mm:.2g} mm as it warmed up (visioncal correct --temperatures counts "
+                "that)"
+            )
+        return tuple(omitted)
 
     @property
     def notes(self) -> list[str]:
@@ -140,6 +98,16 @@ class ArmContent:
             "base; the calibration's transforms go with this arm, not with the nominal one",
             *self.omitted,
         ]
+
+    @property
+    def all_notes(self) -> list[str]:
+        """Comment lines, with what links and offsets leave out."""
+        return [*self.notes, *([self.left_out] if self.left_out else [])]
+
+    @property
+    def left_out_warnings(self) -> tuple[str, ...]:
+        """What links and offsets leave out, as a warning."""
+        return (f"{self.left_out}.",) if self.left_out else ()
 
     @property
     def nominal_table(self) -> DHTable:
@@ -166,7 +134,7 @@ class ArmContent:
         text = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
         if not self.with_corrections:
             text += "Its links and offsets are those that leave the least of that"
-            return text if self.links is None else f"{text}: {self.links.words}"
+            return text if self.links is None else f"{text}: {self.links[1]}"
         return (
             f"{text}The table of joint-corrections goes with it: a reader without that is off by "
             f"up to {joint_function_error_mm(self.written):.2g} mm{self.bending_error_words}"
@@ -179,7 +147,7 @@ class ArmContent:
             return ""
         return (
             ". Its links hold what they can of how it bends under its own weight; with both that "
-            f"leaves {self.links.words}"
+            f"leaves {self.links[1]}"
         )
 
 
@@ -198,104 +166,6 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         DataError: The source has no calibrated arm, or an option does not apply to the format.
     """
     form.check(selection)
-    nominal = source.robot if isinstance(source, Calibration) else None
-    arm = source.arm if isinstance(source, Calibration) else None
-    if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
-        raise _no_arm_error(source, form)
-    if form.holds == "functions" and not unexportable_functions(arm.robot):
-        raise DataError(
-            f"--to {form.name}: nothing was found of this arm's joints that is a function of "
-            "their angles: there is nothing to correct.",
-            culprits=[source.session_name],
-            next_step="--to robot-urdf and --to robot-dh hold all of its links and offsets.",
-        )
-    sag_mm = _sag_mm(source)
-    with_functions = form.holds == "functions" or selection.with_corrections
-    robot = arm.robot if with_functions else without_functions(arm.robot)
-    loses = sag_mm > 0.0 or (not with_functions and bool(unexportable_functions(arm.robot)))
-    links = (
-        _fit_constant_links(source, robot, arm.measured) if form.holds != "all" and loses else None
-    )
-    return ArmContent(
-        nominal,
-        arm.robot,
-        f"calibrated by visioncal from {source.session_name!r}, {source.created}",
-        source.verdict,
-        arm.workspace_sigma_mm,
-        arm.functions,
-        None if selection.convention is None else _convention(selection.convention),
-        selection.calibration_hash,
-        sag_mm,
-        *_drift(source),
-        links,
-        with_functions,
-    )
-
-
-def _fit_constant_links(
-    calibration: Calibration, robot: Robot, measured: Sequence[JointRange]
-) -> FittedLinks:
-    """Fits constant links to the calibrated arm, over its measured ranges and the workspace."""
-    samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
-    if measured:
-        lower, upper = np.array([(joint.lower, joint.upper) for joint in measured]).T
-        rng = np.random.default_rng(0)
-        samples = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *samples]
-    # Half of the postures are fitted, the other half measures the remaining error.
-    q = np.concatenate([angles[::2] for angles, _ in samples])
-    weights = np.concatenate(
-        [np.full(len(angles[::2]), weight / len(angles)) for angles, weight in samples]
-    )
-    fitted = fit_links(robot, q, calibration.standing(q), weights)
-    errors = [
-        FitError.of(
-            (calibration.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2]))[:, :3, 3]
-        )
-        for angles, _ in samples
-    ]
-    return FittedLinks(fitted, errors[0] if measured else None, errors[-1])
-
-
-def _sag_mm(calibration: Calibration) -> float:
-    """Largest deflection of the flange under the arm's own weight, over the workspace [mm]."""
-    arm = calibration.calibrated_robot
-    if arm is None or calibration.elastic is None:
-        return 0.0
-    q = postures(arm)
-    deflections = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
-    return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
-
-
-def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]:
-    """Reference temperatures of the links [deg C], and the largest drift from there [mm]."""
-    if calibration.thermal is None:
-        return None, 0.0
-    model = calibration.drift
-    cold_c = float(model.reference_c.min()), float(model.reference_c.max())
-    return cold_c, max(point.drift_mm for point in calibration.thermal.course)
-
-
-def joint_function_error_mm(robot: Robot) -> float:
-    """Largest flange error without gear ratios, eccentricity and harmonics [mm].
-
-    Over random postures within the joints' limits, at most a turn from zero.
-    """
-    q = postures(robot, _POSTURES)
-    differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
-    return FitError.of(differences[:, :3, 3]).most_mm
-
-
-def _convention(name: str) -> Convention:
-    if name in CONVENTIONS:
-        return name
-    raise DataError(
-        f"There is no convention {name!r}; the names are {', '.join(CONVENTIONS)}.",
-        culprits=["--convention"],
-    )
-
-
-def _no_arm_error(source: Source, form: ArmFormat) -> DataError:
-    """Error of a source without a calibrated arm, with the remedy."""
     if not isinstance(source, Calibration):
         why, step = "a file of frames has none", "Name the calibration instead"
     elif source.arm is not None:
@@ -310,8 +180,99 @@ def _no_arm_error(source: Source, form: ArmFormat) -> DataError:
             "Record q1_rad ... in views.csv, name [robot] model in session.toml, and run "
             "visioncal calibrate SESSION"
         )
-    return DataError(
-        f"{form.name} writes the calibrated arm, and {why}.",
-        culprits=[form.name],
-        next_step=f"{step}.",
+    nominal = source.robot if isinstance(source, Calibration) else None
+    arm = source.arm if isinstance(source, Calibration) else None
+    if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
+        raise DataError(
+            f"{form.name} writes the calibrated arm, and {why}.",
+            culprits=[form.name],
+            next_step=f"{step}.",
+        )
+    if form.holds == "functions" and not unexportable_functions(arm.robot):
+        raise DataError(
+            f"--to {form.name}: nothing was found of this arm's joints that is a function of "
+            "their angles: there is nothing to correct.",
+            culprits=[source.session_name],
+            next_step="--to robot-urdf and --to robot-dh hold all of its links and offsets.",
+        )
+    if selection.convention is not None and selection.convention not in CONVENTIONS:
+        raise DataError(
+            f"There is no convention {selection.convention!r}; the names are "
+            f"{', '.join(CONVENTIONS)}.",
+            culprits=["--convention"],
+        )
+    sag_mm = _sag_mm(source)
+    cold_c, drift_mm = None, 0.0
+    if source.thermal is not None:
+        reference_c = source.drift.reference_c
+        cold_c = float(reference_c.min()), float(reference_c.max())
+        drift_mm = max(point.drift_mm for point in source.thermal.course)
+    with_functions = form.holds == "functions" or selection.with_corrections
+    robot = arm.robot if with_functions else without_functions(arm.robot)
+    loses = sag_mm > 0.0 or (not with_functions and bool(unexportable_functions(arm.robot)))
+    links = (
+        _fit_constant_links(source, robot, arm.measured) if form.holds != "all" and loses else None
     )
+    return ArmContent(
+        nominal,
+        arm.robot,
+        f"calibrated by visioncal from {source.session_name!r}, {source.created}",
+        source.verdict,
+        arm.workspace_sigma_mm,
+        arm.functions,
+        selection.convention,
+        selection.calibration_hash,
+        sag_mm,
+        cold_c,
+        drift_mm,
+        links,
+        with_functions,
+    )
+
+
+def _fit_constant_links(
+    calibration: Calibration, robot: Robot, measured: Sequence[JointRange]
+) -> tuple[Robot, str]:
+    """Fits constant links to the calibrated arm; also says what error remains.
+
+    They are fitted over its measured ranges, where these are known, and the workspace.
+    """
+    samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
+    if measured:
+        lower, upper = np.array([(joint.lower, joint.upper) for joint in measured]).T
+        rng = np.random.default_rng(0)
+        samples = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *samples]
+    # Half of the postures are fitted, the other half measures the remaining error.
+    q = np.concatenate([angles[::2] for angles, _ in samples])
+    weights = np.concatenate(
+        [np.full(len(angles[::2]), weight / len(angles)) for angles, weight in samples]
+    )
+    fitted = fit_links(robot, q, calibration.standing(q), weights)
+    errors = []
+    for angles, _ in samples:
+        poses = calibration.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2])
+        away_mm = 1e3 * np.linalg.norm(poses[:, :3, 3], axis=1)
+        rms_mm, most_mm = float(np.sqrt(np.mean(away_mm**2))), float(away_mm.max())
+        errors.append(f"{figure(rms_mm)} mm rms, {figure(most_mm)} mm at the most")
+    places = ["where the arm was measured", "over the workspace"][-len(errors) :]
+    return fitted, ", ".join(map(" ".join, zip(errors, places, strict=True)))
+
+
+def _sag_mm(calibration: Calibration) -> float:
+    """Largest deflection of the flange under the arm's own weight, over the workspace [mm]."""
+    arm = calibration.calibrated_robot
+    if arm is None or calibration.elastic is None:
+        return 0.0
+    q = postures(arm)
+    deflections = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
+    return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
+
+
+def joint_function_error_mm(robot: Robot) -> float:
+    """Largest flange error without gear ratios, eccentricity and harmonics [mm].
+
+    Over random postures within the joints' limits, at most a turn from zero.
+    """
+    q = postures(robot, _POSTURES)
+    differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
+    return 1e3 * float(np.linalg.norm(differences[:, :3, 3], axis=1).max())

@@ -8,13 +8,10 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import json_text
 from visioncal.core.transforms import log
-from visioncal.core.types import IntArray
 from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.interchange.exports.arm import ArmContent, ArmFormat, joint_function_error_mm
 from visioncal.interchange.exports.content import Selection
 from visioncal.robot import (
-    DHTable,
-    Robot,
     corrected_tip,
     corrected_urdf,
     small_urdf,
@@ -37,18 +34,15 @@ _WIDEST_DEG = 360.0
 _NO_HASH = "calib_visioncal"
 
 
-def _notes(content: ArmContent) -> list[str]:
-    return [*content.notes, *([content.left_out] if content.left_out else [])]
-
-
 def _write_urdf(content: ArmContent) -> str:
     if "urdf" in content.nominal.document:
-        return corrected_urdf(content.nominal, without_functions(content.written), _notes(content))
-    return small_urdf(without_functions(content.written), _notes(content))
+        robot = without_functions(content.written)
+        return corrected_urdf(content.nominal, robot, content.all_notes)
+    return small_urdf(without_functions(content.written), content.all_notes)
 
 
 def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
-    warnings = _warn_left_out(content)
+    warnings = content.left_out_warnings
     if "urdf" not in content.nominal.document:
         return warnings
     tip = corrected_tip(content.nominal, content.written)
@@ -60,11 +54,13 @@ def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
     return warnings
 
 
-def _warn_far(table: DHTable) -> tuple[str, ...]:
+def _warn_dh(content: ArmContent) -> tuple[str, ...]:
+    table = content.table
     far = int(np.argmax(np.abs(table.d_m)))
     if abs(table.d_m[far]) < _FAR_M:
-        return ()
+        return content.left_out_warnings
     return (
+        *content.left_out_warnings,
         f"d_m of {table.joint_names[far]} is {table.d_m[far]:.0f} m: its axis and a neighbour are "
         f"nearly parallel, and the {table.convention} convention goes to their common normal. "
         "--convention hayati does not.",
@@ -76,12 +72,12 @@ def _write_ur(content: ArmContent) -> str:
         without_functions(content.written),
         calibration_hash=content.calibration_hash or _NO_HASH,
         like=content.nominal_table,
-        notes=_notes(content),
+        notes=content.all_notes,
     )
 
 
 def _warn_ur(content: ArmContent) -> tuple[str, ...]:
-    warnings = _warn_left_out(content)
+    warnings = content.left_out_warnings
     difference = log(ur_flange(content.written, content.nominal_table))
     turned, moved = (
         np.rad2deg(np.linalg.norm(difference[:3])),
@@ -106,38 +102,28 @@ def _write_corrections(content: ArmContent) -> str:
     robot = content.written
     lines = [f"# {note}" for note in content.notes]
     lines.append("joint,angle_deg,correction_deg,sigma_deg")
+    limits = np.rad2deg([robot.lower_rad, robot.upper_rad]).clip(-_WIDEST_DEG, _WIDEST_DEG)
     for at, joint in enumerate(robot.joint_names):
         if robot.chain.prismatic[at]:
             continue
-        degrees = _degrees(robot, at)
+        # One turn, or the joint's range if its gear ratio is not 1.
+        degrees = np.arange(-180, 180)
+        if robot.chain.functions[at, 1] != 1.0:
+            low, high = limits[:, at]
+            degrees = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
         angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
         # The joint with its links alone: with its offset, and a ratio of 1.
         sent = robot.chain.encoded(robot.chain.functions[:, 0] + angles)
         corrections = np.rad2deg(sent - angles)[:, at]
-        sigmas = _sigmas_deg(content, at, degrees)
+        sigmas = [""] * len(degrees)
+        if content.functions is not None:
+            nodes_deg = np.rad2deg(1e-3 * np.array(content.functions.joints[at].sigma_mrad))
+            nodes = np.linspace(-180.0, 180.0, len(nodes_deg), endpoint=False)
+            interpolated = np.interp(degrees, nodes, nodes_deg, period=360.0)
+            sigmas = [f"{value:.6f}" for value in interpolated.tolist()]
         rows = zip(degrees.tolist(), corrections.tolist(), sigmas, strict=True)
         lines += [f"{joint},{angle},{correction:.6f},{sigma}" for angle, correction, sigma in rows]
     return "\n".join([*lines, ""])
-
-
-def _degrees(robot: Robot, joint: int) -> IntArray:
-    """Angles of a joint's corrections [deg]: one turn, or its range if its gear ratio is not 1."""
-    if robot.chain.functions[joint, 1] == 1.0:
-        return np.arange(-180, 180)
-    limits = np.rad2deg([robot.lower_rad[joint], robot.upper_rad[joint]])
-    low, high = np.clip(limits, -_WIDEST_DEG, _WIDEST_DEG)
-    return np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
-
-
-def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]:
-    """Standard deviations of a joint's corrections; empty cells where unknown."""
-    if content.functions is None:
-        return [""] * len(degrees)
-    sigmas_deg = np.rad2deg(1e-3 * np.array(content.functions.joints[joint].sigma_mrad))
-    nodes = np.linspace(-180.0, 180.0, len(sigmas_deg), endpoint=False)
-    return [
-        f"{value:.6f}" for value in np.interp(degrees, nodes, sigmas_deg, period=360.0).tolist()
-    ]
 
 
 def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
@@ -148,10 +134,6 @@ def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
         f"up to {joint_function_error_mm(content.written):.2g} mm{content.bending_error_words}.",
         *(f"{name}." for name in content.omitted),
     )
-
-
-def _warn_left_out(content: ArmContent) -> tuple[str, ...]:
-    return (f"{content.left_out}.",) if content.left_out else ()
 
 
 ROBOT_URDF = ArmFormat(
@@ -165,9 +147,9 @@ ROBOT_URDF = ArmFormat(
 ROBOT_DH = ArmFormat(
     "robot-dh",
     "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati [m, rad]",
-    lambda content: table_toml(content.table, "visioncal", _notes(content)),
+    lambda content: table_toml(content.table, "visioncal", content.all_notes),
     takes=frozenset({"convention", "with-corrections"}),
-    warn=lambda content: (*_warn_left_out(content), *_warn_far(content.table)),
+    warn=_warn_dh,
     holds="links",
 )
 UR_KINEMATICS = ArmFormat(
@@ -211,26 +193,21 @@ def write_dynamics(identified: Identified, to: str, selection: Selection) -> str
         DataError: The format holds no inertias, an option does not apply to it, or no inertias were
             identified.
     """
-    form = _inertia_format(to)
-    form.check(selection)
+    by_name = {form.name: form for form in (ROBOT_URDF, ROBOT_JSON)}
+    if to not in by_name:
+        raise DataError(
+            f"Identified dynamics are inertias of an arm's links, which {to} does not hold; "
+            f"{' and '.join(by_name)} do.",
+            culprits=[to],
+            next_step=f"visioncal export DYNAMICS --to {ROBOT_URDF.name}",
+        )
+    by_name[to].check(selection)
     arm = ArmDynamics.of(identified)
     session = identified.facts["session"]["name"]
     notes = [f"dynamics identified by visioncal from {session!r}, {identified.facts['created']}"]
-    if form is ROBOT_JSON:
+    if to == ROBOT_JSON.name:
         document = with_inertias(arm.robot.corrected(), arm.inertias).document
         return json_text({**document, "source": notes[0]})
     if "urdf" in arm.robot.document:
         return urdf_with_inertias(arm.robot, arm.inertias, notes)
     return small_urdf(arm.weighed(), notes)
-
-
-def _inertia_format(name: str) -> ArmFormat:
-    by_name = {arm_format.name: arm_format for arm_format in (ROBOT_URDF, ROBOT_JSON)}
-    if name in by_name:
-        return by_name[name]
-    raise DataError(
-        f"Identified dynamics are inertias of an arm's links, which {name} does not hold; "
-        f"{' and '.join(by_name)} do.",
-        culprits=[name],
-        next_step=f"visioncal export DYNAMICS --to {ROBOT_URDF.name}",
-    )

@@ -15,7 +15,6 @@ from visioncal.interchange.exports.content import (
 )
 from visioncal.vision.camera import matrix_3x3
 
-_CAMERA = {"cam": "camera"}
 # By number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
@@ -84,7 +83,17 @@ def _write_kalibr(content: Content) -> str:
     camera = camera_of(content)
     coefficients = numbers(camera.distortion)
     if camera.model == "brown":
-        coefficients = _radtan(coefficients)
+        beyond = [coefficient for coefficient in coefficients[4:] if coefficient != 0.0]
+        if beyond:
+            raise DataError(
+                "Kalibr's radtan has the coefficients k1, k2, p1 and p2, but this lens has "
+                f"{len(beyond)} more that are not zero: "
+                f"{', '.join(f'{value:.3g}' for value in beyond)}.",
+                culprits=["camera.distortion"],
+                next_step="Leaving them out would bend the image: export with --to camera-info or "
+                "opencv.",
+            )
+        coefficients = coefficients[:4]
     document = {
         "cam0": {
             "camera_model": "pinhole",
@@ -98,32 +107,10 @@ def _write_kalibr(content: Content) -> str:
     return comments("#", _notes(content)) + yaml_text(document, short_lists=True)
 
 
-def _radtan(coefficients: list[float]) -> list[float]:
-    """The coefficients k1, k2, p1, p2, where all others are zero."""
-    beyond = [coefficient for coefficient in coefficients[4:] if coefficient != 0.0]
-    if not beyond:
-        return coefficients[:4]
-    raise DataError(
-        f"Kalibr's radtan has the coefficients k1, k2, p1 and p2, but this lens has {len(beyond)} "
-        f"more that are not zero: {', '.join(f'{value:.3g}' for value in beyond)}.",
-        culprits=["camera.distortion"],
-        next_step="Leaving them out would bend the image: export with --to camera-info or opencv.",
+LENSES = tuple(
+    ExportFormat(name, words, write, holds="lens", frames={"cam": "camera"}, warn=warn_of_field)
+    for name, words, write in (
+        ("camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info),
+        ("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr),
     )
-
-
-CAMERA_INFO = ExportFormat(
-    "camera-info",
-    "the lens as ROS's camera_info YAML [px]",
-    _write_camera_info,
-    holds="lens",
-    frames=_CAMERA,
-    warn=warn_of_field,
-)
-KALIBR = ExportFormat(
-    "kalibr",
-    "the lens as Kalibr's camchain.yaml [px]",
-    _write_kalibr,
-    holds="lens",
-    frames=_CAMERA,
-    warn=warn_of_field,
 )

@@ -19,10 +19,7 @@ def _write_opencv(content: Content) -> str:
     """Writes OpenCV's FileStorage, by OpenCV itself."""
     # The lens has the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for line in (
-        *content.notes,
-        *([content.field_error_words] if content.field_error_words else []),
-    ):
+    for line in filter(None, (*content.notes, content.field_error_words)):
         storage.writeComment(one_line(line), append=False)
     storage.write("parent", content.parent)
     storage.write("child", content.child)
@@ -49,17 +46,19 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
-TEXT = ExportFormat(
-    "text",
-    "the 4x4 matrix as text, as numpy.loadtxt reads it [m]",
-    _write_text,
-    write_all=lambda contents: "".join(map(_write_text, contents)),
+MATRICES = (
+    ExportFormat(
+        "opencv",
+        "OpenCV's FileStorage: transform, R, t and any lens [m]",
+        _write_opencv,
+        warn=warn_of_field,
+        carries_lens=True,
+    ),
+    ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid),
+    ExportFormat(
+        "text",
+        "the 4x4 matrix as text, as numpy.loadtxt reads it [m]",
+        _write_text,
+        write_all=lambda contents: "".join(map(_write_text, contents)),
+    ),
 )
-OPENCV = ExportFormat(
-    "opencv",
-    "OpenCV's FileStorage: transform, R, t and any lens [m]",
-    _write_opencv,
-    warn=warn_of_field,
-    carries_lens=True,
-)
-ZIVID = ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid)

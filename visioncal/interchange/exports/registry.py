@@ -1,6 +1,7 @@
 """All export formats, and the selection of content for them."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -14,19 +15,11 @@ from visioncal.dynamics import Identified, judge
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
-from visioncal.interchange.exports.controllers import CONTROLLERS
-from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR
-from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
+from visioncal.interchange.exports.lens import LENSES
+from visioncal.interchange.exports.matrices import MATRICES
 from visioncal.interchange.exports.other_lens import with_lens
 from visioncal.interchange.exports.robots import ROBOTS
-from visioncal.interchange.exports.ros import (
-    EASY_HANDEYE,
-    EASY_HANDEYE2,
-    MOVEIT,
-    ROS,
-    ROS_LAUNCH,
-    URDF,
-)
+from visioncal.interchange.exports.ros import ROS_FORMATS
 from visioncal.interchange.exports.sources import (
     HAND_EYE,
     WORST_FIRST,
@@ -41,19 +34,10 @@ from visioncal.results import Calibration, Edge, Verdict
 from visioncal.session.choosing import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
-    ROS,
-    ROS_LAUNCH,
-    MOVEIT,
-    EASY_HANDEYE,
-    EASY_HANDEYE2,
-    URDF,
-    CAMERA_INFO,
-    KALIBR,
-    OPENCV,
-    ZIVID,
-    TEXT,
+    *ROS_FORMATS,
+    *LENSES,
+    *MATRICES,
     *ROBOTS,
-    *CONTROLLERS,
     *ARMS,
 )
 _EVERYTHING = Selection()
@@ -98,7 +82,15 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     Raises:
         DataError: As for `export`.
     """
-    form = _find(to)
+    by_name = {form.name: form for form in EXPORT_FORMATS}
+    if to not in by_name:
+        hint = did_you_mean(to, by_name)
+        raise DataError(
+            f"There is no format named {to!r}; the names are {', '.join(by_name)}.",
+            culprits=[to],
+            next_step=f"{hint} visioncal export --list says what each is.".strip(),
+        )
+    form = by_name[to]
     if isinstance(source, Identified):
         return Document(write_dynamics(source, to, selection), judge(source))
     source, selection = _robot_part(source, selection, form)
@@ -145,18 +137,6 @@ def _conditions(*contents: Content) -> tuple[str, ...]:
     return tuple(dict.fromkeys(said))
 
 
-def _find(name: str) -> ExportFormat | ArmFormat:
-    by_name = {export_format.name: export_format for export_format in EXPORT_FORMATS}
-    if name in by_name:
-        return by_name[name]
-    hint = did_you_mean(name, by_name)
-    raise DataError(
-        f"There is no format named {name!r}; the names are {', '.join(by_name)}.",
-        culprits=[name],
-        next_step=f"{hint} visioncal export --list says what each is.".strip(),
-    )
-
-
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """Selects the content to export.
 
@@ -166,8 +146,18 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """
     available = placements(source, selection.camera)
     _check_takes(form, selection)
-    _check_camera(form, selection, available)
-    name = _transform_name(form, selection, available)
+    for words, step in _unheld(form, selection, available):
+        raise DataError(f"{form.name} {words}.", culprits=[form.name], next_step=step)
+    name = selection.edge
+    if form.holds == "tool" or form.holds == "fixture":
+        name = available.only(form.holds) if name is None else name
+        available.find(name)
+        _check_kind(form, form.holds, name, inverse=selection.inverse)
+    elif name is None and form.holds == "lens" and available.cell is not None:
+        frame = next(name for name, lens in available.lenses.items() if lens is available.lens)
+        name = f"{available.cell.tree.parents[frame]}_from_{frame}"
+    elif name is None:
+        name = available.default()
     if selection.lens is not None:
         available = with_lens(source, available, name, selection.lens)
     return _content(form, selection, available, name)
@@ -198,10 +188,12 @@ def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tup
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
     placement, frames = available.find(name)
     rotation_of = None if placement.oriented else placement.rotation_of or frames[0]
-    edge = placement.edge
+    edge, lens = placement.edge, available.lens
     if selection.inverse:
-        edge, frames = _inverted(edge), (frames[1], frames[0])
-        name = f"inverse of {name}"
+        # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
+        turned = adjoint(edge.matrix)
+        edge = Edge(invert(edge.matrix), np.asarray(turned @ edge.covariance @ turned.T))
+        name, frames = f"inverse of {name}", (frames[1], frames[0])
     # The poses of tools, fixtures and targets depend on no convention of a lens.
     by_lens = any(frame.startswith("cam") for frame in frames) and not (
         form.carries_lens and available.lens is not None
@@ -211,16 +203,27 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         for condition in placement.conditions
         if form.holds != "lens" and (by_lens or condition.kind != "own-lens")
     )
+    given = (selection.parent, selection.child)
     parent, child = (
-        _checked_frame(form.frames.get(frame, frame) if given is None else given)
-        for frame, given in zip(frames, (selection.parent, selection.child), strict=True)
+        form.frames.get(frame, frame) if stated is None else stated
+        for frame, stated in zip(frames, given, strict=True)
     )
+    for frame in (parent, child):
+        if not _FRAME.fullmatch(frame):
+            raise DataError(
+                f"{frame!r} cannot be a frame's name: letters, digits and _ / - . are needed, the "
+                "first a letter, a digit or _.",
+                culprits=[frame],
+                next_step="Choose other names with --parent and --child.",
+            )
     if parent == child:
         raise DataError(
             f"parent and child are both named {parent!r}, but a transform joins two frames.",
             culprits=[parent],
             next_step="Give them different names with --parent and --child.",
         )
+    if available.cell is not None:
+        lens = available.lenses.get(frames[1], lens)
     return Content(
         name,
         edge,
@@ -228,9 +231,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         child,
         frames,
         available.mount,
-        available.lenses.get(frames[1], available.lens)
-        if available.cell is not None
-        else available.lens,
+        lens,
         placement.origin,
         placement.verdict,
         conditions,
@@ -238,20 +239,6 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         selection.number,
         selection.load,
     )
-
-
-def _transform_name(form: ExportFormat, selection: Selection, available: Placements) -> str:
-    if form.holds == "tool" or form.holds == "fixture":
-        name = available.only(form.holds) if selection.edge is None else selection.edge
-        available.find(name)
-        _check_kind(form, form.holds, name, inverse=selection.inverse)
-        return name
-    if selection.edge is not None:
-        return selection.edge
-    if form.holds == "lens" and available.cell is not None:
-        frame = next(name for name, lens in available.lenses.items() if lens is available.lens)
-        return f"{available.cell.tree.parents[frame]}_from_{frame}"
-    return available.default()
 
 
 def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> None:
@@ -287,62 +274,30 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
         )
 
 
-def _check_camera(form: ExportFormat, selection: Selection, available: Placements) -> None:
-    """Refuses selections that formats of the camera do not hold."""
-    if form.holds not in ("lens", "hand-eye"):
+def _unheld(
+    form: ExportFormat, selection: Selection, available: Placements
+) -> Iterator[tuple[str, str]]:
+    """Why a format of the camera cannot hold a selection, and what to do."""
+    of_lens = form.holds == "lens"
+    if not of_lens and form.holds != "hand-eye":
         return
-    if form.holds == "lens" and available.cell is not None:
-        _check_lens_alone(form, selection)
-        if available.lens is None:
-            names = ", ".join(available.lenses) or "none"
-            raise DataError(
-                f"{form.name} holds one camera; this cell has {names}.",
-                culprits=[form.name],
-                next_step="Name one with --camera." if available.lenses else "",
-            )
-        return
-    if available.mount is None or available.mount == "instrument":
-        raise DataError(
-            f"{form.name} holds the camera, and {available.words} has none.",
-            culprits=[form.name],
-            next_step="Name the calibration instead, or choose a format of poses: --to ros.",
-        )
-    if form.holds == "lens":
-        _check_lens_alone(form, selection)
-    hand_eye = selection.edge in (None, *HAND_EYE.values())
-    if form.holds == "hand-eye" and (selection.inverse or not hand_eye):
-        raise DataError(
-            f"{form.name} holds the camera's pose on the flange or in the base, and nothing else.",
-            culprits=[form.name],
-            next_step="Leave --edge and --inverse out, or choose --to ros.",
-        )
-
-
-def _check_lens_alone(form: ExportFormat, selection: Selection) -> None:
+    in_cell = of_lens and available.cell is not None
+    if not in_cell and (available.mount is None or available.mount == "instrument"):
+        step = "Name the calibration instead, or choose a format of poses: --to ros."
+        yield f"holds the camera, and {available.words} has none", step
     of_transform = (selection.edge, selection.parent, selection.lens)
-    if selection.inverse or any(option is not None for option in of_transform):
-        raise DataError(
-            f"{form.name} holds the lens and no transform: --edge, --inverse, --parent and --lens "
-            "do not go with it.",
-            culprits=[form.name],
-            next_step="Leave them out; --child names the camera.",
+    if of_lens and (selection.inverse or any(option is not None for option in of_transform)):
+        yield (
+            "holds the lens and no transform: --edge, --inverse, --parent and --lens do not go "
+            "with it",
+            "Leave them out; --child names the camera.",
         )
-
-
-def _inverted(edge: Edge) -> Edge:
-    # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
-    adjoint_matrix = adjoint(edge.matrix)
-    return Edge(
-        invert(edge.matrix), np.asarray(adjoint_matrix @ edge.covariance @ adjoint_matrix.T)
-    )
-
-
-def _checked_frame(name: str) -> str:
-    if _FRAME.fullmatch(name):
-        return name
-    raise DataError(
-        f"{name!r} cannot be a frame's name: letters, digits and _ / - . are needed, the first a "
-        "letter, a digit or _.",
-        culprits=[name],
-        next_step="Choose other names with --parent and --child.",
-    )
+    if in_cell and available.lens is None:
+        names = ", ".join(available.lenses) or "none"
+        step = "Name one with --camera." if available.lenses else ""
+        yield f"holds one camera; this cell has {names}", step
+    if not of_lens and (selection.inverse or selection.edge not in (None, *HAND_EYE.values())):
+        yield (
+            "holds the camera's pose on the flange or in the base, and nothing else",
+            "Leave --edge and --inverse out, or choose --to ros.",
+        )

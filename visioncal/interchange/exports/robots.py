@@ -1,81 +1,199 @@
-"""A transform as a pose in the language of a robot's controller.
+"""Poses, tools and fixtures in the languages of robots' controllers.
 
-Numbers have fixed decimals: no controller keeps more, and not every language reads an exponent.
+A tool is given in the flange's frame and a fixture in the robot's base: the frames of poses that
+are reported with no active tool or base. Numbers have fixed decimals: no controller keeps more, and
+not every language reads an exponent.
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
-from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
+from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import fixed
-from visioncal.core.types import FloatArray
 from visioncal.interchange.exports.content import Content, ExportFormat, comments
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
 _ROTATION_DECIMALS = {"rotation-vector": 10, "quaternion-wxyz": 10}
 _DEGREE_DECIMALS = 8
+# By form of poses: what starts a comment, empty where nothing does, and the pose's numbers.
+_LANGUAGES: Mapping[str, tuple[str, str]] = {
+    # Universal Robots, script manual.
+    "ur": ("#", "p[{}, {}, {}, {}, {}, {}]"),
+    # KRL's FRAME (KUKA, system variables).
+    "kuka": (";", "{{X {},Y {},Z {},A {},B {},C {}}}"),
+    # As an ASCII program (.LS) has them.
+    "fanuc": ("", "X = {} mm, Y = {} mm, Z = {} mm,\nW = {} deg, P = {} deg, R = {} deg"),
+    # RAPID's `pose`: trans of type pos, rot of type orient (RAPID reference manual).
+    "abb": ("!", "[[{},{},{}],[{},{},{},{}]]"),
+    "staubli": ("//", "{{{}, {}, {}, {}, {}, {}}}"),
+    "yaskawa": ("", "{},{},{},{},{},{}"),
+    "doosan": ("#", "posx({}, {}, {}, {}, {}, {})"),
+}
 
 
-def ur_pose(group: list[str]) -> str:
-    """Writes URScript's pose (Universal Robots, script manual)."""
-    return f"p[{', '.join(group)}]"
+@dataclass(frozen=True)
+class _Identifiers:
+    """Rules of a language for variable names."""
+
+    language: str
+    shape: re.Pattern[str]  # Pattern of a valid name.
+    needed: str  # The same in words.
+    taken: frozenset[str]  # Reserved words; lower case where the language ignores case.
+    cased: bool  # Whether it distinguishes upper and lower case.
+
+    def check(self, name: str) -> str:
+        """Returns a name after checking that it is valid for a variable."""
+        if not self.shape.fullmatch(name):
+            wrong = f"{self.needed}, are needed"
+        elif (name if self.cased else name.lower()) in self.taken:
+            wrong = "it is the language's own"
+        else:
+            return name
+        raise DataError(
+            f"{name!r} cannot be a name in {self.language}: {wrong}.",
+            culprits=[name],
+            next_step="Choose another with --child.",
+        )
 
 
-def kuka_frame(group: list[str]) -> str:
-    """Writes KRL's FRAME (KUKA, system variables)."""
-    return "{" + ",".join(f"{a} {b}" for a, b in zip("XYZABC", group, strict=True)) + "}"
+_RAPID_WORDS = """
+    tool0 wobj0 load0
+    alias and backward case connect const default div do else elseif endfor endfunc endif endmodule
+    endproc endrecord endtest endtrap endwhile error exit false for from func goto if inout local
+    mod module nostepin not noview or pers proc raise readonly record retry return step sysmodule
+    task test then to trap true trynext undo var viewonly while with xor
+"""
+_URSCRIPT_WORDS = """
+    and break continue def elif else end enter_critical exit_critical False global halt if in join
+    kill local not or pause return run sec struct thread True while xor
+"""
+_IDENTIFIERS: Mapping[str, _Identifiers] = {
+    # ABB, "RAPID kernel", lexical elements: identifiers of up to 32 characters, case ignored, and
+    # the reserved words. tool0, wobj0 and load0 are the system's own and cannot be changed.
+    "abb": _Identifiers(
+        "RAPID",
+        re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}", re.ASCII),
+        "a letter first, then letters, digits and _, 32 in all",
+        frozenset(_RAPID_WORDS.split()),
+        cased=False,
+    ),
+    # Universal Robots, script manual, "Numbers, Variables, and Types", "Flow of Control", "Threads"
+    # and "Secondary Programs": the keywords.
+    "ur": _Identifiers(
+        "URScript",
+        re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII),
+        "a letter or _ first, then letters, digits and _",
+        frozenset(_URSCRIPT_WORDS.split()),
+        cased=True,
+    ),
+}
 
 
-def abb_pose(group: list[str]) -> str:
-    """Writes RAPID's `pose`: trans of type pos, rot of type orient (RAPID reference manual)."""
-    return f"[[{','.join(group[:3])}],[{','.join(group[3:])}]]"
-
-
-def _fanuc(group: list[str]) -> str:
-    """Writes a position's numbers as an ASCII program (.LS) has them."""
-    x, y, z, w, p, r = group
-    return f"X = {x} mm, Y = {y} mm, Z = {z} mm,\nW = {w} deg, P = {p} deg, R = {r} deg"
-
-
-def pose_texts(matrix: FloatArray, form: PoseForm) -> list[str]:
-    """Writes the numbers of a (4, 4) pose [m] as a controller reads them."""
+def _write(language: str, statement: str, content: Content) -> str:
+    """Writes a statement: {pose}, {child}, {load}, {active} and {index} are filled in."""
+    form, (mark, shape) = POSE_FORMS[language], _LANGUAGES[language]
+    pose = write_pose(content.matrix, form)
     decimals = _ROTATION_DECIMALS.get(form.rotation, _DEGREE_DECIMALS)
-    pose = write_pose(matrix, form)
-    texts = [fixed(value, _DECIMALS[form.unit]) for value in pose[:3]]
-    return texts + [fixed(value, decimals) for value in pose[3:]]
+    numbers = [fixed(value, _DECIMALS[form.unit]) for value in pose[:3]]
+    numbers += [fixed(value, decimals) for value in pose[3:]]
+    # A FlexPendant writes this mass into a new tool whose load is still to be given.
+    mass, centre = "-1", "0,0,0"
+    if content.load is not None:
+        mass = fixed(content.load.mass_kg, 6)
+        centre = ",".join(fixed(value, 6) for value in content.load.centre_mm)
+    text = statement.format(
+        pose=shape.format(*numbers),
+        child=_IDENTIFIERS[language].check(content.child) if "{child}" in statement else "",
+        # `loaddata`: the centre of mass is in the flange's frame [mm]; its axes and moments of
+        # inertia are those of a point mass.
+        load=f"[{mass},[{centre}],[1,0,0,0],0,0,0]",
+        active="$" if content.number is None else "",
+        index="" if content.number is None else f"_DATA[{content.number}]",
+    )
+    return f"{comments(mark, content.notes) if mark else ''}{text}\n"
 
 
-def _write(form: PoseForm, mark: str, shape: Callable[[list[str]], str], content: Content) -> str:
-    notes = comments(mark, content.notes) if mark else ""
-    return notes + shape(pose_texts(content.matrix, form)) + "\n"
+def _warn_of_load(content: Content) -> Iterable[str]:
+    if content.load is None:
+        yield (
+            "touches determine no load: the tool's mass is written as -1, ABB's mark of a load "
+            "that is still to be given. Give it with --mass-kg and --cog-mm, or run LoadIdentify "
+            "before the robot moves with this tool."
+        )
 
 
-def _robot(name: str, words: str, mark: str, shape: Callable[[list[str]], str]) -> ExportFormat:
-    """Builds a format; `mark` starts a comment in the controller's language."""
-    return ExportFormat(name, words, partial(_write, POSE_FORMS[name], mark, shape))
-
-
-UR = _robot(
-    "ur", "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]", "#", ur_pose
+_POSES = {
+    "ur": "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]",
+    "kuka": "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]",
+    "fanuc": "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]",
+    "abb": "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]",
+    "staubli": "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",
+    "yaskawa": "Yaskawa: X,Y,Z,Rx,Ry,Rz as in a job [mm, deg]",
+    "doosan": "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
+}
+ROBOTS = (
+    *(ExportFormat(name, words, partial(_write, name, "{pose}")) for name, words in _POSES.items()),
+    ExportFormat(
+        "ur-tcp",
+        "a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]",
+        # Script manual, module internals, `set_tcp`; without the name argument of newer
+        # controllers, so that older ones read it, too.
+        partial(_write, "ur", "set_tcp({pose})"),
+        holds="tool",
+        counterpart="ur-feature",
+    ),
+    ExportFormat(
+        "ur-feature",
+        "a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]",
+        # PolyScope's features are entered by hand; programs can use a variable of type pose like a
+        # feature, as in pose_trans (script manual, "Numbers, Variables, and Types" and "Scoping
+        # rules").
+        partial(_write, "ur", "global {child} = {pose}"),
+        holds="fixture",
+        counterpart="ur-tcp",
+    ),
+    ExportFormat(
+        "abb-tooldata",
+        "a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]",
+        # robhold, tframe, tload (RAPID reference, data types, `tooldata`).
+        partial(_write, "abb", "PERS tooldata {child}:=[TRUE,{pose},{load}];"),
+        holds="tool",
+        takes=frozenset({"load"}),
+        warn=_warn_of_load,
+        counterpart="abb-wobjdata",
+    ),
+    ExportFormat(
+        "abb-wobjdata",
+        "a fixture for ABB: PERS wobjdata [mm, quaternion w first]",
+        # robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed
+        # user frame, with the object frame at its origin.
+        partial(
+            _write,
+            "abb",
+            'PERS wobjdata {child}:=[FALSE,TRUE,"",{pose},[[0,0,0],[1,0,0,0]]];',
+        ),
+        holds="fixture",
+        counterpart="abb-tooldata",
+    ),
+    # An entry of $CONFIG.DAT, or the active frame (KUKA, system variables).
+    ExportFormat(
+        "kuka-tool",
+        "a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]",
+        partial(_write, "kuka", "{active}TOOL{index}={pose}"),
+        holds="tool",
+        takes=frozenset({"number"}),
+        counterpart="kuka-base",
+    ),
+    ExportFormat(
+        "kuka-base",
+        "a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]",
+        partial(_write, "kuka", "{active}BASE{index}={pose}"),
+        holds="fixture",
+        takes=frozenset({"number"}),
+        counterpart="kuka-tool",
+    ),
 )
-KUKA = _robot("kuka", "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]", ";", kuka_frame)
-FANUC = _robot("fanuc", "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]", "", _fanuc)
-ABB = _robot(
-    "abb", "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]", "!", abb_pose
-)
-STAUBLI = _robot(
-    "staubli",
-    "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",
-    "//",
-    lambda group: f"{{{', '.join(group)}}}",
-)
-YASKAWA = _robot("yaskawa", "Yaskawa: X,Y,Z,Rx,Ry,Rz as in a job [mm, deg]", "", ",".join)
-DOOSAN = _robot(
-    "doosan",
-    "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
-    "#",
-    lambda group: f"posx({', '.join(group)})",
-)
-
-ROBOTS = (UR, KUKA, FANUC, ABB, STAUBLI, YASKAWA, DOOSAN)

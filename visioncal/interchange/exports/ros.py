@@ -9,6 +9,8 @@ optical frame.
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.files import one_line
@@ -65,19 +67,29 @@ def _urdf_joint(content: Content) -> str:
     )
 
 
-URDF = ExportFormat(
-    "urdf",
-    "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
-    lambda content: _write_urdf_all([content]),
-    frames=ROS_FRAMES,
-    write_all=_write_urdf_all,
-)
-
-
-def _program(contents: Sequence[Content]) -> str:
-    """Writes the program of a launch file (tf2_ros, static_transform_publisher's named options)."""
-    nodes = "".join(map(_node, contents))
+def _launch(first: str, notes: Sequence[str], contents: Sequence[Content]) -> str:
+    """Writes a launch file (tf2_ros, static_transform_publisher's named options)."""
+    nodes = ""
+    for content in contents:
+        pose = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
+        options = {"--frame-id": content.parent, "--child-frame-id": content.child} | {
+            option: repr(number) for option, number in zip(_NUMBERS, pose, strict=True)
+        }
+        # Frame names are letters, digits and _ / - . only, so that quotes are safe.
+        arguments = "".join(
+            f'                "{option}",\n                "{value}",\n'
+            for option, value in options.items()
+        )
+        nodes += (
+            "        Node(\n"
+            '            package="tf2_ros",\n'
+            '            executable="static_transform_publisher",\n'
+            '            output="log",\n'
+            f"            arguments=[\n{arguments}            ],\n"
+            "        ),\n"
+        )
     return (
+        f"{first}{comments('#', notes)}"
         "from launch import LaunchDescription\n"
         "from launch_ros.actions import Node\n"
         "\n\n"
@@ -87,35 +99,15 @@ def _program(contents: Sequence[Content]) -> str:
     )
 
 
-def _node(content: Content) -> str:
-    pose = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
-    options = {"--frame-id": content.parent, "--child-frame-id": content.child} | {
-        option: repr(number) for option, number in zip(_NUMBERS, pose, strict=True)
-    }
-    # Frame names are letters, digits and _ / - . only, so that quotes are safe.
-    arguments = "".join(
-        f'                "{option}",\n                "{value}",\n'
-        for option, value in options.items()
-    )
-    return (
-        "        Node(\n"
-        '            package="tf2_ros",\n'
-        '            executable="static_transform_publisher",\n'
-        '            output="log",\n'
-        f"            arguments=[\n{arguments}            ],\n"
-        "        ),\n"
-    )
-
-
 def _write_launch(content: Content) -> str:
     first = f'"""Publishes where {content.child} is in {content.parent}."""\n\n'
-    return first + comments("#", _ros_notes(content)) + _program([content])
+    return _launch(first, _ros_notes(content), [content])
 
 
 def _write_launches(contents: Sequence[Content]) -> str:
-    first = '"""Publishes where all frames of a cell are."""\n\n'
     notes = [note for content in contents for note in content.notes[1:]]
-    return first + comments("#", [contents[0].origin, *notes]) + _program(contents)
+    first = '"""Publishes where all frames of a cell are."""\n\n'
+    return _launch(first, [contents[0].origin, *notes], contents)
 
 
 def _write_moveit(content: Content) -> str:
@@ -125,22 +117,7 @@ def _write_moveit(content: Content) -> str:
     # --pitch and --yaw.
     mount = "" if content.mount is None else f"{content.mount.upper()}: "
     first = f'""" {mount}{content.parent} -> {content.child} """\n'
-    return first + comments("#", _ros_notes(content)) + _program([content])
-
-
-ROS_LAUNCH = ExportFormat(
-    "ros-launch",
-    "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
-    _write_launch,
-    frames=ROS_FRAMES,
-    write_all=_write_launches,
-)
-MOVEIT = ExportFormat(
-    "moveit",
-    "the same laid out as MoveIt 2's hand-eye calibration writes it [m, quaternion]",
-    _write_moveit,
-    frames=ROS_FRAMES,
-)
+    return _launch(first, _ros_notes(content), [content])
 
 
 def _message(content: Content) -> dict[str, dict[str, float]]:
@@ -162,80 +139,34 @@ def _write_transform(content: Content) -> str:
     return comments("#", _ros_notes(content)) + yaml_text(document)
 
 
-def _write_easy_handeye(content: Content) -> str:
-    """Writes what easy_handeye of ROS 1 keeps in its calibrations' folder."""
-    # The fields are those that `to_dict` of its handeye_calibration.py writes and its publisher
-    # reads: the pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed
-    # camera.
+def _write_easy_handeye(version: int, content: Content) -> str:
+    """Writes what easy_handeye of ROS 1, or easy_handeye2, keeps in its calibrations' folder."""
+    # The fields are those that `to_dict` of the former's handeye_calibration.py writes, and those
+    # of the latter's message HandeyeCalibration (easy_handeye2_msgs, msg/), as their publishers
+    # read them: the pose of `tracking_base_frame` in the effector's frame, or in the base's for a
+    # fixed camera.
     in_hand = content.mount == "eye-in-hand"
-    x, y, z, qx, qy, qz, qw = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
-    document = {
-        "parameters": {
-            "namespace": "/visioncal/",
-            "eye_on_hand": in_hand,
-            **_calibrated_frames(content),
-            "move_group_namespace": "/",
-            "move_group": "manipulator",
-        },
-        "transformation": {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
-    }
-    use = "its publisher finds it as ~/.ros/easy_handeye/visioncal.yaml"
-    return comments("#", [*_ros_notes(content), use]) + yaml_text(document)
-
-
-def _calibrated_frames(content: Content) -> dict[str, str]:
-    in_hand = content.mount == "eye-in-hand"
-    return {
+    frames = {
         "robot_base_frame": ROS_FRAMES["base"] if in_hand else content.parent,
         "robot_effector_frame": content.parent if in_hand else ROS_FRAMES["flange"],
         "tracking_base_frame": content.child,
         "tracking_marker_frame": "target",
     }
-
-
-def _write_easy_handeye2(content: Content) -> str:
-    """Writes what easy_handeye2 keeps in its calibrations' folder."""
-    # The fields are those of its message HandeyeCalibration (easy_handeye2_msgs, msg/), as
-    # `save_calibration` of its handeye_calibration.py writes them and its publisher reads them: the
-    # pose of `tracking_base_frame` in the effector's frame, or in the base's for a fixed camera.
-    in_hand = content.mount == "eye-in-hand"
-    document = {
-        "parameters": {
-            "name": "visioncal",
-            "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
-            **_calibrated_frames(content),
-            "freehand_robot_movement": True,
-            "move_group_namespace": "/",
-            "move_group": "manipulator",
-        },
-        "transform": _message(content),
-    }
-    use = "its publisher finds it as ~/.ros2/easy_handeye2/calibrations/visioncal.calib"
-    return comments("#", [*_ros_notes(content), use]) + yaml_text(document)
-
-
-ROS = ExportFormat(
-    "ros",
-    "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
-    _write_transform,
-    frames=ROS_FRAMES,
-    # A document of YAML for each transform.
-    write_all=lambda contents: "---\n".join(map(_write_transform, contents)),
-)
-EASY_HANDEYE = ExportFormat(
-    "easy-handeye",
-    "a calibration of ROS 1's easy_handeye, YAML [m, quaternion x, y, z, w]",
-    _write_easy_handeye,
-    holds="hand-eye",
-    frames=ROS_FRAMES,
-)
-EASY_HANDEYE2 = ExportFormat(
-    "easy-handeye2",
-    "a .calib of easy_handeye2 [m, quaternion x, y, z, w]",
-    _write_easy_handeye2,
-    holds="hand-eye",
-    frames=ROS_FRAMES,
-)
+    message = _message(content)
+    if version == 1:
+        names = {"namespace": "/visioncal/", "eye_on_hand": in_hand, **frames}
+        flat = message["translation"] | {f"q{k}": v for k, v in message["rotation"].items()}
+        transformation: dict[str, Any] = {"transformation": flat}
+        file = "~/.ros/easy_handeye/visioncal.yaml"
+    else:
+        kind = "eye_in_hand" if in_hand else "eye_on_base"
+        names = {"name": "visioncal", "calibration_type": kind, **frames}
+        names["freehand_robot_movement"] = True
+        transformation = {"transform": message}
+        file = "~/.ros2/easy_handeye2/calibrations/visioncal.calib"
+    group = {"move_group_namespace": "/", "move_group": "manipulator"}
+    notes = comments("#", [*_ros_notes(content), f"its publisher finds it as {file}"])
+    return notes + yaml_text({"parameters": {**names, **group}, **transformation})
 
 
 def _ros_notes(content: Content) -> list[str]:
@@ -243,3 +174,49 @@ def _ros_notes(content: Content) -> list[str]:
     names = zip((content.parent, content.child), content.frames, strict=True)
     meanings = [f"{name}: {_MEANINGS[own]}" for name, own in names if own in _MEANINGS]
     return [*content.notes, *meanings]
+
+
+ROS_FORMATS = (
+    ExportFormat(
+        "ros",
+        "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
+        _write_transform,
+        frames=ROS_FRAMES,
+        # A document of YAML for each transform.
+        write_all=lambda contents: "---\n".join(map(_write_transform, contents)),
+    ),
+    ExportFormat(
+        "ros-launch",
+        "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
+        _write_launch,
+        frames=ROS_FRAMES,
+        write_all=_write_launches,
+    ),
+    ExportFormat(
+        "moveit",
+        "the same laid out as MoveIt 2's hand-eye calibration writes it [m, quaternion]",
+        _write_moveit,
+        frames=ROS_FRAMES,
+    ),
+    ExportFormat(
+        "easy-handeye",
+        "a calibration of ROS 1's easy_handeye, YAML [m, quaternion x, y, z, w]",
+        partial(_write_easy_handeye, 1),
+        holds="hand-eye",
+        frames=ROS_FRAMES,
+    ),
+    ExportFormat(
+        "easy-handeye2",
+        "a .calib of easy_handeye2 [m, quaternion x, y, z, w]",
+        partial(_write_easy_handeye, 2),
+        holds="hand-eye",
+        frames=ROS_FRAMES,
+    ),
+    ExportFormat(
+        "urdf",
+        "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
+        lambda content: _write_urdf_all([content]),
+        frames=ROS_FRAMES,
+        write_all=_write_urdf_all,
+    ),
+)

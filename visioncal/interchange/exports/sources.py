@@ -177,26 +177,19 @@ def _of_cell(
         for name, parent in tree.parents.items()
         if name not in tree.flanges
     }
-    lens = None
-    if camera is not None or len(lenses) == 1:
-        lens = lenses[_camera(lenses, camera)]
+    lens = next(iter(lenses.values())) if len(lenses) == 1 else None
+    if camera is not None:
+        frame = next((name for name in (camera, f"cam_{camera}") if name in lenses), None)
+        if frame is None:
+            raise DataError(
+                f"There is no camera {camera!r}; this cell has {', '.join(lenses) or 'none'}.",
+                culprits=["--camera"],
+                next_step=did_you_mean(camera, list(lenses)),
+            )
+        lens = lenses[frame]
     frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
     by_name = {**edges, **frames}
     return Placements(by_name, tuple(frames), "this cell", None, lens, source, lenses)
-
-
-def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
-    names = list(lenses)
-    if camera is None:
-        return names[0]
-    for frame in (camera, f"cam_{camera}"):
-        if frame in lenses:
-            return frame
-    raise DataError(
-        f"There is no camera {camera!r}; this cell has {', '.join(names) or 'none'}.",
-        culprits=["--camera"],
-        next_step=did_you_mean(camera, names),
-    )
 
 
 def _in_cell(source: Calibration, edge: Edge) -> Placement:
