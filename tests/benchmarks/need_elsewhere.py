@@ -23,20 +23,21 @@ from pathlib import Path
 
 import numpy as np
 from elsewhere import COLUMNS, ROWS, SQUARE_M, WORLDS, Case, cell, lifted, pose, seen
-from need import PICKS, Outcome, in_bins, some_need, table
 from results import first, wished, write_section
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.need import Picks
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import exp, invert, rotation_angle
 from visioncal.core.types import Corners, FloatArray, Need
+from visioncal.estimation.tolerance_probability import radius_within
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.session import Session
 
-SEEDS = 6
+SEEDS, PICKS, BINS = 6, 20, 10
 GRID = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
 THING = SQUARE_M * np.column_stack([GRID, np.zeros(len(GRID))])
 TO_MIDDLE = pose(np.zeros(3), THING.mean(axis=0))
@@ -44,10 +45,12 @@ TO_MIDDLE = pose(np.zeros(3), THING.mean(axis=0))
 
 @dataclass(frozen=True)
 class Trial:
-    """One cell: its world, what it states of its need and what lands, and its verdict."""
+    """One cell: what it states of its need, the share of picks that land within, its verdict."""
 
     world: str
-    outcome: Outcome
+    mount: str
+    stated: float
+    landed: float
     status: str
 
 
@@ -67,9 +70,15 @@ def of_one_cell(at: tuple[str, str, bool, int], folder: Path) -> Trial | None:
     (picks,) = known.findings.picks
     need, result = some_need(picks, rng), result_of(known)
     landed = float(np.mean(lands(case, known, CalibratedCamera.of(result), need, rng)))
-    kind = (mount, "lens given" if given else "lens estimated")
-    outcome = Outcome(kind, need.deg is not None, picks.probability(need), landed)
-    return Trial(world, outcome, result.verdict.status)
+    return Trial(world, mount, picks.probability(need), landed, result.verdict.status)
+
+
+def some_need(picks: Picks, rng: np.random.Generator) -> Need:
+    """A need that some share of picks meets, of place alone or of place and rotation."""
+    quantile, both = float(rng.uniform(0.02, 0.98)), bool(rng.integers(2))
+    mm = 1e3 * radius_within(picks.covariances, quantile, picks.freedom)
+    turned = float(np.sqrt(np.trace(picks.covariances[:, :3, :3], axis1=1, axis2=2).mean()))
+    return Need(mm, float(np.rad2deg(turned * rng.uniform(0.7, 1.8))) if both else None)
 
 
 def lands(
@@ -139,11 +148,11 @@ def main(seeds: int) -> None:
         mine = [trial for trial in found if trial.world == world]
         rows.append((world, *(in_words(group) for group in (
             mine,
-            [trial for trial in mine if trial.outcome.kind[0] == "eye-in-hand"],
-            [trial for trial in mine if trial.outcome.kind[0] == "eye-to-hand"],
+            [trial for trial in mine if trial.mount == "eye-in-hand"],
+            [trial for trial in mine if trial.mount == "eye-to-hand"],
             [trial for trial in mine if trial.status == "good"],
         ))))  # fmt: skip
-    bins = in_bins([trial.outcome for trial in found])
+    bins = in_bins(found)
     text = f"""{len(every)} cells of `elsewhere.py`, {seeds} seeds of each; {PICKS} picks of each.
 {len(every) - len(found)} sessions were refused. The standard error is in brackets.
 
@@ -157,11 +166,33 @@ def main(seeds: int) -> None:
     )
 
 
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in lines)
+
+
+def in_bins(found: Sequence[Trial]) -> list[tuple[str, ...]]:
+    """By ten bins of what is stated: cells, means of stated and landed, and the difference."""
+    rows, places = [], np.array([min(int(BINS * trial.stated), BINS - 1) for trial in found])
+    for place in np.unique(places):
+        mine = [trial for trial, at in zip(found, places, strict=True) if at == place]
+        stated, landed = (
+            np.array([getattr(trial, name) for trial in mine]) for name in ("stated", "landed")
+        )
+        low, error = 100 * place / BINS, float(np.std(landed - stated) / np.sqrt(len(mine)))
+        rows.append(
+            (f"{low:.0f} to {low + 100 / BINS:.0f} %", str(len(mine)),
+             f"{100 * stated.mean():.1f} %", f"{100 * landed.mean():.1f} %",
+             f"{100 * (landed - stated).mean():+.1f} ({100 * error:.1f})")
+        )  # fmt: skip
+    return rows
+
+
 def in_words(trials: Sequence[Trial]) -> str:
     """By how much picks land more often than stated, with its standard error [percent points]."""
     if not trials:
         return "none"
-    away = 100 * np.array([trial.outcome.landed - trial.outcome.stated for trial in trials])
+    away = 100 * np.array([trial.landed - trial.stated for trial in trials])
     return f"{away.mean():+.1f} ({float(np.std(away)) / np.sqrt(len(away)):.1f})"
 
 

@@ -148,9 +148,9 @@ def test_a_closed_form_is_diagnosed_too():
     cell = simulate(replace(FINE, seed=2))
     joint, park = (calibrated(cell, solver=name).accuracy_at_work for name in ("joint", "park"))
     assert {"pixels", "robot", "total"} < set(park.budget_mm)
-    # The levels of noise belong to the session, whichever solver gave the estimate: both maximise the
-    # same restricted likelihood, to the tolerance of its search. What is held pulls at a fit that is
-    # at rest only.
+    # The levels of noise belong to the session, whichever solver gave the estimate: both maximise
+    # the same restricted likelihood, to the tolerance of its search. What is held pulls at a fit
+    # that is at rest only.
     assert "held_values" not in park.budget_mm
     noise = [np.hypot(work.budget_mm["pixels"], work.budget_mm["robot"]) for work in (joint, park)]
     assert noise[1] == pytest.approx(noise[0], rel=1e-3)

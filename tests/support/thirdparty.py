@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
@@ -126,35 +125,3 @@ def talos(data: Path, held: Sequence[int] = ()) -> Session:
     read = np.array([[float(row[name]) for name in ("x1", "y1", "z1")] for row in rows])
     robot = read_robot_document(str(folder / "talos.urdf"), tip="gripper_left_base_link")
     return readings_session("talos", robot, CONTACT, q, read, held=held)
-
-
-def figaroh_ur10(data: Path) -> Session:
-    """23 poses of a UR10, by a camera that scatters."""
-    with (data / "figaroh_small" / "ur10_pose_calibration.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    q = np.array([[float(row[name]) for name in row if name.endswith("_joint")] for row in rows])
-    places = np.array([[float(row[name]) for name in ("x1", "y1", "z1")] for row in rows])
-    angles = [[float(row[f"phi{name}1"]) for name in "xyz"] for row in rows]
-    turns = Rotation.from_euler("xyz", angles).as_quat()
-    robot = read_robot_document("ur10", tip="tool0")
-    read = np.column_stack([places, turns])
-    noise = {"sigma_m": 1e-3, "sigma_rad": 2e-3}
-    return readings_session("figaroh-ur10", robot, noise, q, read)
-
-
-def positioner(data: Path) -> Session:
-    """205 poses of a target on a positioner of two axes, by a camera."""
-    text = (data / "ric_positioner_camera_kinematics" / "measurements.yaml").read_text()
-    rows = list(yaml.safe_load(text).values())
-    q = np.array([row["target_joints"] for row in rows])
-    keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    read = np.array([[row["pose"][key] for key in keys] for row in rows])
-    joints = [
-        {"name": "tilt", "alpha_rad": -0.5 * np.pi, "a_m": 0.0, "d_m": 0.0},
-        {"name": "turn", "alpha_rad": 0.0, "a_m": 0.0, "d_m": -0.475},
-    ]
-    for joint, theta in zip(joints, (0.0, -0.5 * np.pi), strict=True):
-        joint["theta_offset_rad"] = theta
-    robot = {"schema": 1, "name": "positioner", "tip": "flange", "convention": "standard"}
-    noise = {"sigma_m": 2e-4, "sigma_rad": 5e-4}
-    return readings_session("positioner", robot | {"joint": joints}, noise, q, read)
