@@ -10,7 +10,7 @@ from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.interchange.formats.view_exchange import exchange_views
+from visioncal.interchange.formats.rereading import exchange_views
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (

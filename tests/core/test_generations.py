@@ -17,8 +17,8 @@ from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation
-from visioncal.interchange.merge_results import rewrite_result
 from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import rewrite_result
 from visioncal.present import recording, report
 from visioncal.results import Calibration
 from visioncal.simulation import CellOptions, simulate, write_session

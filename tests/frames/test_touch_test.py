@@ -20,7 +20,7 @@ from visioncal.frames.touch_test import (
     touch_targets,
     touch_test_finding,
 )
-from visioncal.interchange.merge_results import rewrite_result
+from visioncal.interchange.result_files import rewrite_result
 from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm

@@ -17,7 +17,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_exportable
 from visioncal.results import CameraResult, Verdict, to_document
-from visioncal.session.choosing import Choice
+from visioncal.session.selecting import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
 
 CELL = made_up_cell(4)

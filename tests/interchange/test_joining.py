@@ -15,9 +15,8 @@ from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.options import NeedOptions, WorkOptions
 from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
-from visioncal.interchange.merge_results import frames_to_keep, rewrite_result
 from visioncal.interchange.outputs import write_outputs
-from visioncal.interchange.result_files import load_stored
+from visioncal.interchange.result_files import frames_to_keep, load_stored, rewrite_result
 from visioncal.present.recording import read_calibration, read_evidence, read_session
 from visioncal.results import Calibration, FrameFile, to_document
 from visioncal.session import Session

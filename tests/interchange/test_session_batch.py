@@ -15,7 +15,7 @@ from support.commands import visioncal
 
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
-from visioncal.interchange.batch import Options, batch, executors, jobs_of
+from visioncal.interchange.batch import Options, batch, jobs_of
 from visioncal.interchange.batch import run as batch_run
 from visioncal.interchange.batch.work import work
 from visioncal.interchange.outputs import RECORDING, REPORT
@@ -111,7 +111,7 @@ def fatal(job):
 
 
 def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
-    monkeypatch.setattr(executors, "work", fatal)
+    monkeypatch.setattr(batch_run, "work", fatal)
     rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=2, without=BARE).rows
     states = {row.name: row.state for row in rows}
     assert states == {
@@ -164,7 +164,7 @@ def test_a_changed_result_is_told(fleet, tmp_path):
 
 
 def test_a_scheduler_needs_the_extra(fleet, tmp_path, monkeypatch):
-    monkeypatch.setattr(executors, "find_spec", lambda _: None)
+    monkeypatch.setattr(batch_run, "find_spec", lambda _: None)
     done = visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1")
     assert done.status == 2
     assert "visioncal[cluster]" in done.err
@@ -226,7 +226,7 @@ def test_a_lost_scheduler_leaves_what_is_finished(fleet, tmp_path, monkeypatch):
                 future.set_running_or_notify_cancel()
             return future
 
-    monkeypatch.setattr(executors, "_cluster", lambda _: Lost(1))
+    monkeypatch.setattr(batch_run, "_cluster", lambda _: Lost(1))
     done = visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1")
     assert done.status == 2
     assert "1 of 2 sessions" in done.err
@@ -268,8 +268,8 @@ def test_poses_in_millimetres_are_named_without_a_fleet_to_compare_with(fleet, t
 
 def test_a_finished_batch_starts_no_process(fleet, tmp_path, monkeypatch):
     batch(fleet / "robot_0", tmp_path, workers=1, without=BARE)
-    monkeypatch.setattr(executors, "_pool", None)
-    monkeypatch.setattr(executors, "_cluster", None)
+    monkeypatch.setattr(batch_run, "_pool", None)
+    monkeypatch.setattr(batch_run, "_cluster", None)
     for scheduler in (None, "tcp://x:1"):
         again = batch(fleet / "robot_0", tmp_path, scheduler=scheduler, without=BARE)
         assert again.counts["kept"] == 2

@@ -7,8 +7,8 @@ from support.commands import visioncal
 
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
-from visioncal.interchange.merge_results import rewrite_result
 from visioncal.interchange.outputs import RECORDING, write_outputs
+from visioncal.interchange.result_files import rewrite_result
 from visioncal.present.recording import read_calibration, read_evidence, read_session
 from visioncal.results import Calibration
 from visioncal.session import Session

@@ -10,7 +10,7 @@ from support.tracked import known_of
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
-from visioncal.session.loads import loads_of
+from visioncal.session.table import loads_of
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
 
 HEADER = ("view", "cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw")

@@ -95,8 +95,8 @@ def calibrate_command(
     from visioncal.cli.parsing import views_in
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
-    from visioncal.interchange.merge_results import frames_to_keep
     from visioncal.interchange.outputs import RECORDING, write_outputs
+    from visioncal.interchange.result_files import frames_to_keep
 
     # Of several sessions, the recording is that of the joined session.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING

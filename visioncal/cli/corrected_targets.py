@@ -30,8 +30,8 @@ from visioncal.results.compensation.table import (
     table_to_send,
 )
 from visioncal.robot import Loads
-from visioncal.session.choosing import ARM, EYE
 from visioncal.session.columns import column_of
+from visioncal.session.selecting import ARM, EYE
 
 _MOST_SHOWN = 10
 _MOST_DEG = 720.0

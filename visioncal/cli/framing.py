@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from visioncal.frames.drawing_points import NominalPoints
     from visioncal.results import Calibration, Frame
     from visioncal.session import Session
-    from visioncal.session.choosing import Choice, Part
+    from visioncal.session.selecting import Choice, Part
 
 PointOption: TypeAlias = Annotated[
     str | None,
@@ -182,7 +182,7 @@ class FrameLocation:
         return self._write({**self._frames(), self.name: frame})
 
     def _write(self, frames: "dict[str, Frame]") -> Written:
-        from visioncal.interchange.merge_results import rewrite_result
+        from visioncal.interchange.result_files import rewrite_result
         from visioncal.results import FrameFile
 
         if self.file is not None:
@@ -326,7 +326,7 @@ def place_frame(
             each other.
     """
     from visioncal.interchange.formats.touches import robots_of
-    from visioncal.session.choosing import ARM, EYE, Choice
+    from visioncal.session.selecting import ARM, EYE, Choice
 
     kind, part, source = request.kind, request.part, request.source
     if source is None or request.goes.remove is not None:

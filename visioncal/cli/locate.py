@@ -104,8 +104,7 @@ def locate_command(
     from visioncal.frames.target_in_image import check_image_size
     from visioncal.interchange.result_files import load_result
     from visioncal.results.selecting import targets_fixed_to_base
-    from visioncal.session.choosing import EYE, Choice
-    from visioncal.session.selecting import has_several, select
+    from visioncal.session.selecting import EYE, Choice, has_several, select
     from visioncal.vision.finders.imaging import read_image
 
     result = load_result(named_result(calibration, "-c", "locate: the camera's calibration"))

@@ -12,7 +12,7 @@ from visioncal.interchange.outputs import RECORDING, REPORT
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.session import Session
-    from visioncal.session.choosing import Choice
+    from visioncal.session.selecting import Choice
 
 SessionArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session's folder, or its .rrd recording.")
@@ -67,7 +67,7 @@ class PartOptions:
     @property
     def choice(self) -> "Choice":
         """The choice, for sessions and results."""
-        from visioncal.session.choosing import Choice
+        from visioncal.session.selecting import Choice
 
         return Choice(self.camera, self.robot, self.target)
 

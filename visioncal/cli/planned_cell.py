@@ -35,8 +35,7 @@ from visioncal.live.planning.recorded import (
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
-from visioncal.session.choosing import ANY, LENS, Choice
-from visioncal.session.selecting import must_select_one, select
+from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, select
 from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"

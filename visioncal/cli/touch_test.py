@@ -88,8 +88,7 @@ def touch_test_command(
     status 3: they are larger, or nothing was done as the calibration or the tool is bad.
     """
     from visioncal.frames.touch_test import evaluate_gaps, touch_targets, touch_test_finding
-    from visioncal.interchange.merge_results import rewrite_result
-    from visioncal.interchange.result_files import load_result
+    from visioncal.interchange.result_files import load_result, rewrite_result
     from visioncal.results import to_document
     from visioncal.session import Session
 

@@ -17,8 +17,7 @@ from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.validate import Prediction, fit_friction_to_known, predict, validate
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
-from visioncal.session.choosing import ARM, Choice
-from visioncal.session.selecting import check_one_of_each, select
+from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
 
 # Share of the fastest motion, at its end, held out for validation where no other stream is.
 HELD_OUT = 0.3

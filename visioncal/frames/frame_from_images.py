@@ -31,7 +31,7 @@ from visioncal.frames.target_in_image import PoseCandidates, target_pose_candida
 from visioncal.frames.target_pose import TargetPose, place_target
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, select_matching
 from visioncal.session import Session, View
-from visioncal.session.choosing import EYE, Choice
+from visioncal.session.selecting import EYE, Choice
 
 # Key of the detail that identifies the calibration of a frame's camera.
 SEEN_BY = "camera_calibrated"

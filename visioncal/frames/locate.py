@@ -21,7 +21,7 @@ from visioncal.frames.camera_chain import (
 from visioncal.frames.located import Located
 from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.results import Calibration
-from visioncal.session.choosing import EYE, Choice
+from visioncal.session.selecting import EYE, Choice
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import load_target
 

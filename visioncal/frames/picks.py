@@ -16,7 +16,7 @@ from visioncal.frames.session_observations import (
 )
 from visioncal.results import Calibration, select_matching
 from visioncal.session import Session, View
-from visioncal.session.choosing import EYE, Choice
+from visioncal.session.selecting import EYE, Choice
 
 _ORIGIN = (0.0, 0.0, 0.0)
 

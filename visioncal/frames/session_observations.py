@@ -17,7 +17,7 @@ from visioncal.results import HELD_BACK, Calibration
 from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session, View
-from visioncal.session.loads import loads_of
+from visioncal.session.table import loads_of
 
 # Largest difference of a stated lens from the calibrated one, as a share of the focal length.
 _OTHER_LENS = 0.03

@@ -14,8 +14,7 @@ from visioncal.estimation.problem_parts import Noise
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.choosing import ARM, Choice
-from visioncal.session.selecting import check_one_of_each, select
+from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
 
 # Plausible limits: an arm's reach [m] and a joint's range [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi

@@ -14,7 +14,7 @@ from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
 from visioncal.results.edge import PoseSigmas
-from visioncal.session.choosing import ANY, Choice
+from visioncal.session.selecting import ANY, Choice
 from visioncal.vision.camera import intrinsics
 
 # Significance level of a pair of calibrations over all tests.

@@ -5,8 +5,10 @@ from collections.abc import Collection
 from visioncal.core.errors import DataError
 from visioncal.results.result import Calibration
 from visioncal.session import Session
-from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.session.selecting import (
+    PARTS,
+    Choice,
+    Part,
     check_one_of_each,
     chosen_of,
     has_several,

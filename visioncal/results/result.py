@@ -39,8 +39,8 @@ from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, ViewResult
 from visioncal.robot import Loads, Robot, deflected_joints
 from visioncal.robot.thermal import ThermalModel
-from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.session.frames import CELL
+from visioncal.session.selecting import PARTS, Choice, Part
 
 if TYPE_CHECKING:
     from visioncal.present.report.drawing import Drawing

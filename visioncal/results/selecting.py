@@ -17,8 +17,8 @@ from visioncal.results.parts import RobotResult
 from visioncal.results.sections import JointFit, NoiseIntervals
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, rms_of
-from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.frames import frames_of_kind, object_name, robots_between
+from visioncal.session.selecting import PARTS, Choice, Chosen, Part, choose
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration

@@ -71,20 +71,12 @@ def of_corners(
 ) -> AssembleArguments:
     """Content of a session of corners; see `Session.from_corners`."""
     matrices = _matrices(poses, "corners", len(corners))
-    checked = [_corners(at, *corner) for at, corner in enumerate(corners)]
-    counts = [len(ids) for ids, _ in checked]
-    table = CornerTable(
-        np.repeat(np.arange(len(checked)), counts),
-        np.concatenate([np.zeros(0, dtype=np.int64), *(ids for ids, _ in checked)]),
-        np.concatenate([np.zeros((0, 2)), *(px for _, px in checked)]),
-        ("",) * sum(counts),
-        is_file=False,
-    )
+    table = CornerTable.of_lists([_corners(at, *corner) for at, corner in enumerate(corners)])
     content = _content(matrices, board, cell, {}, MemoryImages({}), resolution)
     return {**content, "corners": table}
 
 
-def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[int, IntArray, FloatArray]:
     """Checked numbers (k,) and positions (k, 2) of a view's corners; None counts as no corners."""
     name = f"corners[{view}]"
     numbers = np.asarray([] if ids is None else ids)
@@ -109,7 +101,7 @@ def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[IntArray
             culprits=[f"{name}: px[{at}]"],
             next_step="Leave corners that were not found out of ids and px.",
         )
-    return numbers.astype(np.int64), places
+    return view, numbers.astype(np.int64), places
 
 
 def _matrices(poses: Poses, what: str, count: int) -> FloatArray:

@@ -13,9 +13,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside, sha256
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Corners, FloatArray, IntArray, Target
-from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration
-from visioncal.session.kinds import name_of
+from visioncal.session.kinds import COLUMN, name_of
 from visioncal.session.table import View
 from visioncal.vision.targets import point_numbers
 
@@ -45,6 +44,18 @@ class CornerTable:
     is_file: bool = True
     # (n,) line of each row in its file; None where rows follow the header.
     lines: IntArray | None = None
+
+    @classmethod
+    def of_lists(cls, by_view: Sequence[tuple[int, IntArray, FloatArray]]) -> "CornerTable":
+        """The corners of arrays: for each view its number, (k,) points and (k, 2) px."""
+        counts = [len(points) for _, points, _ in by_view]
+        return cls(
+            np.repeat([view for view, _, _ in by_view], counts).astype(np.int64),
+            np.concatenate([np.zeros(0, np.int64), *(points for _, points, _ in by_view)]),
+            np.concatenate([np.zeros((0, 2)), *(px for _, _, px in by_view)]),
+            ("",) * sum(counts),
+            is_file=False,
+        )
 
     def __len__(self) -> int:
         return len(self.views)
@@ -287,7 +298,20 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     numbers = {name: frozenset(point_numbers(targets[name])) for name in by_name}
     for name, used in by_name.items():
         _check_first_number(used, numbers[name], targets[name], file)
-    _check_exchanged(by_name, numbers, file)
+    for one, other in combinations(by_name, 2):
+        wrong, right = (other, one) if by_name[one] <= numbers[one] else (one, other)
+        if len(by_name[wrong] - numbers[wrong]) < _FEWEST_EXCHANGED:
+            continue
+        if not (by_name[one] <= numbers[other] and by_name[other] <= numbers[one]):
+            continue
+        raise DataError(
+            f"Targets {one} and {other} are exchanged: {file} has points {min(by_name[wrong])} to "
+            f"{max(by_name[wrong])} of {wrong}, which has {min(numbers[wrong])} to "
+            f"{max(numbers[wrong])}; {right} has them all.",
+            culprits=[f"target {one}", f"target {other}"],
+            next_step=f"Exchange {one} and {other}: in [targets] of session.toml what each is, or "
+            "in column target of views.csv which one each row shows.",
+        )
     problems: list[TableProblem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
@@ -320,26 +344,6 @@ def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: s
                 next_step=f"In {file}, write point {sign} 1 in the place of point"
                 f"{rig * (target.kind == 'points')}.",
             )
-
-
-def _check_exchanged(
-    seen: Mapping[str, Set[int]], known: Mapping[str, Set[int]], file: str
-) -> None:
-    """Checks that no two targets are exchanged: each with the other's point numbers."""
-    for one, other in combinations(seen, 2):
-        wrong, right = (other, one) if seen[one] <= known[one] else (one, other)
-        if len(seen[wrong] - known[wrong]) < _FEWEST_EXCHANGED:
-            continue
-        if not (seen[one] <= known[other] and seen[other] <= known[one]):
-            continue
-        raise DataError(
-            f"Targets {one} and {other} are exchanged: {file} has points {min(seen[wrong])} to "
-            f"{max(seen[wrong])} of {wrong}, which has {min(known[wrong])} to "
-            f"{max(known[wrong])}; {right} has them all.",
-            culprits=[f"target {one}", f"target {other}"],
-            next_step=f"Exchange {one} and {other}: in [targets] of session.toml what each is, or "
-            "in column target of views.csv which one each row shows.",
-        )
 
 
 def _range(target: Target) -> str:

@@ -11,7 +11,7 @@ from functools import cached_property
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.session.document import Declaration, Kind
+from visioncal.session.document import Declaration, Kind, RobotTable
 from visioncal.session.kinds import (
     has_robot_state,
     is_camera_observation,
@@ -19,7 +19,6 @@ from visioncal.session.kinds import (
     name_of,
 )
 from visioncal.session.table import View
-from visioncal.session.tables import RobotTable
 
 CELL = "cell"
 _WHERE = "session.toml: frames"

@@ -1,4 +1,4 @@
-"""Camera, robot, target and instrument of each row, and the robots' models.
+"""Camera, robot, target and instrument of each row, and the robots' and boards' files.
 
 Boards and robots are shared between sessions, so files that session.toml names may be outside of
 the session's folder. Since a session may be untrusted, a warning names each such file, and its
@@ -13,11 +13,13 @@ from typing import Any, TypeAlias
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, is_inside
 from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.types import Target
+from visioncal.core.verdict import READ_AGAIN
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session.columns import POSITION
-from visioncal.session.document import KINDS, Declaration, Kind
+from visioncal.session.document import KINDS, Declaration, Kind, RobotTable
 from visioncal.session.table import View
-from visioncal.session.tables import RobotTable
+from visioncal.vision.targets import misspelt_keys, read_target, target_from_document
 
 _Test: TypeAlias = Callable[[View], bool]
 
@@ -70,52 +72,45 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         DataError: A row names none of several, or one that is not declared.
     """
     for kind in KINDS:
-        _check_kind(declaration, kind, views)
+        named = {view.number: view.text.get(kind, "").strip() for view in views}
+        declared = list(declaration.named(kind))
+        if declared in ([], [""]):
+            _check_one_name(kind, bool(declared), sorted({*named.values()} - {""}))
+            continue
+        known = ", ".join(declared)
+        unknown = {view: name for view, name in named.items() if name and name not in declared}
+        if unknown:
+            view, name = next(iter(unknown.items()))
+            others = len(unknown) - 1
+            raise DataError(
+                f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
+                f"declares {known}{f' ({others} more such rows)' if others else ''}.",
+                culprits=[f"views.csv: view {index}" for index in unknown],
+                next_step=did_you_mean(name, declared)
+                or f"Add [{kind}s.{name}], or correct the row.",
+            )
+        needs, whose, hint = _NAMING_RULES[kind]
+        without = [str(row.number) for row in views if needs(row) and not named[row.number]]
+        if len(declared) > 1 and without:
+            raise DataError(
+                f"views.csv: of several {kind}s ({known}), the column {kind} must name {whose}; it "
+                f"is empty in view {some_of(without)}.",
+                culprits=[f"views.csv: view {name}" for name in without],
+                next_step=f"Name the {kind} in each of these rows{hint}.",
+            )
 
 
-def _check_kind(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
-    plural = f"{kind}s"
-    named = {view.number: view.text.get(kind, "").strip() for view in views}
-    declared = list(declaration.named(kind))
-    if declared in ([], [""]):
-        _check_single(kind, bool(declared), sorted({name for name in named.values() if name}))
-        return
-    known = ", ".join(declared)
-    unknown = {view: name for view, name in named.items() if name and name not in declared}
-    if unknown:
-        view, name = next(iter(unknown.items()))
-        others = len(unknown) - 1
-        raise DataError(
-            f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
-            f"declares {known}{f' ({others} more such rows)' if others else ''}.",
-            culprits=[f"views.csv: view {index}" for index in unknown],
-            next_step=did_you_mean(name, declared) or f"Add [{plural}.{name}], or correct the row.",
-        )
-    if len(declared) < 2:
-        return
-    needs, whose, hint = _NAMING_RULES[kind]
-    without = [str(view.number) for view in views if needs(view) and not named[view.number]]
-    if without:
-        raise DataError(
-            f"views.csv: of several {plural} ({known}), the column {kind} must name {whose}; it "
-            f"is empty in view {some_of(without)}.",
-            culprits=[f"views.csv: view {name}" for name in without],
-            next_step=f"Name the {kind} in each of these rows{hint}.",
-        )
-
-
-def _check_single(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
+def _check_one_name(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
     """Checks that rows have only one name for a kind that is not in a plural table."""
-    if len(names) < 2:
-        return
-    tables = ", ".join(f"[{kind}s.{name}]" for name in names)
-    of_target = ", each with target = a name or a path" if kind == "target" else ""
-    raise DataError(
-        f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
-        f"{f'has the one {kind} for all' if is_declared else 'declares none'}.",
-        culprits=[f"session.toml: {kind}s"],
-        next_step=f"Declare {tables}{of_target}.",
-    )
+    if len(names) > 1:
+        tables = ", ".join(f"[{kind}s.{name}]" for name in names)
+        of_target = ", each with target = a name or a path" if kind == "target" else ""
+        raise DataError(
+            f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
+            f"{f'has the one {kind} for all' if is_declared else 'declares none'}.",
+            culprits=[f"session.toml: {kind}s"],
+            next_step=f"Declare {tables}{of_target}.",
+        )
 
 
 def kind_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
@@ -143,7 +138,6 @@ def read_robots(
         The model, with several robots the models by name, or None; and messages for models that
         could not be read.
     """
-    several = len(declaration.robots) > 1
     if document is not None:
         return document, []
     models, problems = {}, []
@@ -151,24 +145,20 @@ def read_robots(
         if not isinstance(table, RobotTable) or table.model is None:
             continue
         try:
-            models[name] = _read_robot(table, table.model, folder)
+            with without_content(table.model, "model", folder):
+                model = read_robot_document(table.model, tip=table.tip, folder=folder)
+                if outside_file(table.model, "model", folder) is not None:
+                    # Recordings contain only valid robots.
+                    Robot.from_document(model)
         except DataError as error:
             path = f"robots.{name}" if name else "robot"
             problems.append(f"session.toml: {path}.model: {error}")
-    if several:
+        else:
+            gravity = table.gravity_m_s2
+            models[name] = model if gravity is None else model | {"gravity_m_s2": gravity}
+    if len(declaration.robots) > 1:
         return models or None, problems
     return next(iter(models.values()), None), problems
-
-
-def _read_robot(table: RobotTable, model: str, folder: Path | None) -> dict[str, Any]:
-    with without_content(model, "model", folder):
-        document = read_robot_document(model, tip=table.tip, folder=folder)
-        if outside_file(model, "model", folder) is not None:
-            # Recordings contain only valid robots.
-            Robot.from_document(document)
-    if table.gravity_m_s2 is not None:
-        document |= {"gravity_m_s2": table.gravity_m_s2}
-    return document
 
 
 @contextmanager
@@ -213,17 +203,125 @@ def outside_file(named: str, field: str, folder: Path | None) -> Path | None:
 
 def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
     """Warnings that name the files outside of the folder that were read."""
-    places: list[tuple[str, str]] = []
     fields: tuple[tuple[Kind, str], ...] = (("target", "target"), ("robot", "model"))
-    for kind, field in fields:
-        for table in declaration.named(kind).values():
-            named = getattr(table, field)
-            if named is not None:
-                places.append((named, field))
-    for named, field in dict.fromkeys(places):
+    places = dict.fromkeys(
+        (getattr(table, field), field)
+        for kind, field in fields
+        for table in declaration.named(kind).values()
+        if getattr(table, field) is not None
+    )
+    for named, field in places:
         file = outside_file(named, field, folder)
         if file is not None and not absence(file):
             yield (
                 f"session.toml: {field} = {named!r} lies outside of the session's folder: {file} "
                 "was read."
             )
+
+
+# The column of views.csv that names the target of a row.
+COLUMN = "target"
+
+
+def read_targets(
+    declaration: Declaration, folder: Path | None, document: Mapping[str, Any] | None
+) -> tuple[dict[str, Target], Mapping[str, Any] | None]:
+    """Reads the targets that a session declares.
+
+    Args:
+        declaration: The typed session.toml.
+        folder: Base of relative paths; the working directory where None.
+        document: Content of the target's file, if already read; with several targets, contents by
+            name.
+
+    Returns:
+        The targets by name, which is empty for the only one, and their document in the form of the
+        argument; None without targets.
+
+    Raises:
+        DataError: There is no such target, or its description is wrong.
+    """
+    paths = _declared_targets(declaration)
+    is_only = len(paths) == 1
+    given = dict.fromkeys(paths, document) if is_only and document is not None else document
+    targets: dict[str, Target] = {}
+    contents: dict[str, Mapping[str, Any]] = {}
+    for name, path in paths.items():
+        if given is None:
+            targets[name], contents[name] = _load(path, folder)
+        elif name in given:
+            contents[name] = given[name]
+            targets[name] = target_from_document(contents[name], Path(path).stem)
+        else:
+            raise DataError(
+                f"session.toml: targets.{name}: its description is not among those given.",
+                culprits=[f"session.toml: targets.{name}"],
+            )
+    if is_only:
+        return {"": next(iter(targets.values()))}, next(iter(contents.values()))
+    return (targets, contents) if paths else ({}, document)
+
+
+def _load(path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    with without_content(path, "target", folder):
+        try:
+            return read_target(path, folder)
+        except DataError as error:
+            if "metres, such as" not in error.message:
+                raise
+            # All sizes in millimetres can be converted at once.
+            raise type(error)(
+                error.message, culprits=error.culprits, next_step=str(READ_AGAIN)
+            ) from error
+
+
+def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
+    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
+    for name, path in (paths := _declared_targets(declaration)).items():
+        described = document if len(paths) == 1 else (document or {}).get(name)
+        for words in misspelt_keys(described or {}):
+            yield f"{path}: {words}"
+
+
+def _declared_targets(declaration: Declaration) -> dict[str, str]:
+    """Built-in names or paths of the targets, by their names in rows."""
+    if declaration.target is not None:
+        return {"": declaration.target}
+    return {name: table.target for name, table in declaration.targets.items()}
+
+
+def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
+    """Checks that target and camera are declared where there are images.
+
+    Raises:
+        DataError: One is not declared, and a view has an image or corners.
+    """
+    with_image = [view for view in views if view.image or view.has_corners]
+    for field, declared, example in (
+        (
+            "target",
+            declaration.target or declaration.targets or None,
+            'target = "charuco_9x6_30mm", or the name or .toml of your board',
+        ),
+        ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
+    ):
+        if with_image and declared is None:
+            for key, value in (declaration.model_extra or {}).items():
+                if key.lower()[:3] == field[:3] or did_you_mean(key, (field,)):
+                    raise DataError(
+                        f"session.toml: {key} is no known name; {field} is needed.",
+                        culprits=[f"session.toml: {key}"],
+                        next_step=f"In session.toml, replace {_as_written(key, value)} by "
+                        f"{_as_written(field, value)}.",
+                    )
+            raise DataError(
+                f"session.toml: {field} is missing, but view {with_image[0].number} has "
+                f"{'an image' if with_image[0].image else 'rows in corners.csv'}.",
+                culprits=[f"session.toml: {field}"],
+                next_step=f"Add {example}.",
+            )
+
+
+def _as_written(key: str, value: object) -> str:
+    """A key as written in session.toml: that of a table in brackets."""
+    return f"[{key}]" if isinstance(value, Mapping) else key

@@ -19,9 +19,6 @@ from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as cols
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
-from visioncal.session.boards import COLUMN, read_targets, target_warnings
-from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
-from visioncal.session.choosing import Choice
 from visioncal.session.corners import (
     FILE,
     CornerTable,
@@ -31,20 +28,30 @@ from visioncal.session.corners import (
     with_corners,
     write_corners,
 )
-from visioncal.session.digest import digest_facts
-from visioncal.session.document import Declaration, declaration_warnings, read_declaration
+from visioncal.session.document import (
+    CameraTable,
+    Declaration,
+    InstrumentTable,
+    RobotTable,
+    declaration_warnings,
+    read_declaration,
+)
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import (
+    COLUMN,
+    check_images_can_be_used,
     check_kinds_named,
     is_camera_observation,
     kind_warnings,
     outside_warnings,
     read_robots,
+    read_targets,
+    target_warnings,
 )
 from visioncal.session.observations import Observation, observations_of, stop_warnings
-from visioncal.session.saving import placed_files, write_folder
-from visioncal.session.selecting import keep_views, select
+from visioncal.session.saving import digest_facts, placed_files, write_folder
+from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import (
     FOLDER,
     Stream,
@@ -53,8 +60,14 @@ from visioncal.session.streams import (
     read_streams,
     write_stream,
 )
-from visioncal.session.table import View, parse_csv, read_views, write_csv
-from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
+from visioncal.session.table import (
+    View,
+    check_times,
+    parse_csv,
+    read_views,
+    view_warnings,
+    write_csv,
+)
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
 

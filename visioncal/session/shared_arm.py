@@ -13,9 +13,9 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.session.boards import COLUMN as TARGET
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
+from visioncal.session.kinds import COLUMN as TARGET
 from visioncal.session.selecting import has_several
 from visioncal.session.session import Session
 from visioncal.session.table import View
@@ -100,7 +100,8 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     tables: list[CornerTable] = []
     views, stops, until_s = 0, 0, -np.inf
     for name, session in by_name.items():
-        shift_s = _time_shift_s(session, until_s)
+        stamps = _stamps(session.views)
+        shift_s = until_s + _BETWEEN_S - min(stamps) if stamps and min(stamps) <= until_s else 0.0
         for view in session.views:
             changed = {
                 "view": str(views + view.number),
@@ -185,12 +186,6 @@ def _priors(by_name: Mapping[str, Session]) -> Iterator[tuple[str, Any]]:
 
 def _stamps(views: Sequence[View]) -> list[float]:
     return [view.stamp_s for view in views if view.stamp_s is not None]
-
-
-def _time_shift_s(session: Session, until_s: float) -> float:
-    """Shift of a session's times that puts them after earlier sessions [s]."""
-    stamps = _stamps(session.views)
-    return until_s + _BETWEEN_S - min(stamps) if stamps and min(stamps) <= until_s else 0.0
 
 
 def _joined_corners(tables: Sequence[CornerTable]) -> CornerTable:

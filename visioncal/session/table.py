@@ -1,6 +1,6 @@
-"""views.csv: reading, checking and writing of its rows, one for each observation."""
+"""views.csv: reading, checking and writing of its rows, one for each observation, and loads."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,14 +10,22 @@ from visioncal.core.documents.columns import Column, TableReader, as_whole
 from visioncal.core.documents.tables import TextTable, parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
+from visioncal.robot import Loads
 from visioncal.session import columns as cols
 from visioncal.session.images import image_path
-from visioncal.session.loads import load_problems
 
 # Largest numbers of rows and columns: two days of a stop every ten seconds.
 _MOST_VIEWS, _MOST_COLUMNS = 20_000, 1_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
+_CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
+_FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
+# Approach direction of the joints to a stop, by the cells of column approach.
+SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
+# Median position above which the unit is millimetres, not inches or centimetres.
+_SURELY_MM = 200.0
+# Plausible limits: an arm's reach [m] and a joint's range [rad].
+_FAR_M, _WIDE_RAD = 20.0, 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +146,13 @@ def parse_csv(text: str, label: str) -> TextTable:
 
 def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
     """Text of a views.csv with the columns in the given order."""
+
+    def quoted(cell: str) -> str:
+        # csv.writer does not quote a lone carriage return.
+        return '"' + cell.replace('"', '""') + '"' if {*cell} & {*',"\r\n'} else cell
+
     rows = [columns, *([view.cell(column) for column in columns] for view in views)]
-    return "".join(",".join(map(_quoted, row)) + "\n" for row in rows)
-
-
-def _quoted(cell: str) -> str:
-    """Quotes a cell where needed; csv.writer does not quote a lone carriage return."""
-    needs_quotes = any(character in cell for character in ',"\r\n')
-    return '"' + cell.replace('"', '""') + '"' if needs_quotes else cell
+    return "".join(",".join(map(quoted, row)) + "\n" for row in rows)
 
 
 def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, ...]:
@@ -188,7 +195,7 @@ def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, .
         for row in range(reader.count)
     )
     for row, view in enumerate(views):
-        for column, words in load_problems(view.numbers, view.text.get("approach", "").strip()):
+        for column, words in _load_problems(view):
             reader.report(row, column, words)
     joints = cols.joint_columns(columns)
     # Robots may have different numbers of joints.
@@ -216,19 +223,16 @@ def _observation_problem(
 ) -> tuple[str, str, str]:
     """Column, message and remedy of a view that observes nothing; empty texts for others."""
     state = [name for name in ("x_m", "q1_rad", *_OBSERVED) if name in view.numbers]
-    if view.is_of_lens:
-        if not state and (view.image or with_corners):
-            return "", "", ""
-        words = f"{state[0]}; leave that empty" if state else "no image"
-        return (
-            "role",
+    pictured = bool(view.image) or with_corners
+    if view.is_of_lens and (state or not pictured):
+        words = (
             "intrinsics is for an image that serves the camera's lens alone, but the row has "
-            f"{words}",
-            "",
+            f"{f'{state[0]}; leave that empty' if state else 'no image'}"
         )
+        return "role", words, ""
     # A row of a stop may have only the pose of one of several robots.
     is_of_robot = state and view.stop is not None and "robot" in view.text
-    if view.image or with_corners or {*state} & {*_OBSERVED} or "point" in view.text or is_of_robot:
+    if pictured or {*state} & {*_OBSERVED} or "point" in view.text or is_of_robot:
         return "", "", ""
     absent = "it is empty" if "image" in columns else "there is no such column"
     return (
@@ -243,3 +247,79 @@ def _role(cell: str) -> str:
     if cell not in ("fit", "holdout", "intrinsics"):
         raise DataError(f'{cell!r} is no role; "fit", "holdout", "intrinsics" or nothing is needed')
     return cell
+
+
+def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | None = None) -> Loads:
+    """Loads of views by their numbers, zero where not stated, and by their cells of approach."""
+    sides = [SIDES.get(approach.strip(), 0.0) for approach in approaches or [""] * len(rows)]
+
+    def read(*names: str) -> FloatArray:
+        return np.array([[row.get(name, 0.0) for name in names] for row in rows])
+
+    return Loads(
+        read("payload_kg").reshape(-1),
+        read(*_CENTRE).reshape(-1, 3),
+        read(*_FORCE).reshape(-1, 3),
+        np.array(sides),
+    )
+
+
+def _load_problems(view: View) -> Iterator[tuple[str, str]]:
+    """Columns of a row with an invalid load or approach, with messages."""
+    approach = view.text.get("approach", "").strip()
+    if approach not in SIDES:
+        yield "approach", f'{approach!r} is no side; "+", "-" or nothing is needed'
+    placed = [name for name in _CENTRE if name in view.numbers]
+    if placed and "payload_kg" not in view.numbers:
+        yield (
+            placed[0],
+            "it gives a payload's centre, and payload_kg, its mass, is missing; a row "
+            "without a payload has payload_kg = 0 or leaves all of them empty",
+        )
+
+
+def check_times(views: Sequence[View]) -> None:
+    """Checks that times are plausible, so that their stamps resolve microseconds.
+
+    Raises:
+        DataError: One is not; it names the view.
+    """
+    for view in views:
+        wrong = "" if view.stamp_s is None else cols.column_of("stamp_s").fault(view.stamp_s)
+        if wrong:
+            place = f"views.csv, view {view.number}, column stamp_s"
+            raise DataError(f"{place}: {wrong}.", culprits=[place])
+
+
+def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
+    """Warning that most positions, in columns `names`, seem to be in another unit than metres."""
+    norms = [
+        float(np.linalg.norm([view.numbers[name] for name in names]))
+        for view in views
+        if names[0] in view.numbers
+    ]
+    far = [norm for norm in norms if norm > _FAR_M]
+    if 2 * len(far) <= len(norms):
+        return ""
+    size, share = float(np.median(far)), ""
+    if len(far) < len(norms):
+        share = f" in {len(far)} of {len(norms)} rows"
+    unit = (
+        f"It looks like millimetres: multiply these columns by 0.001{share and ' there'}."
+        if size > _SURELY_MM
+        else "Metres are needed, and these are inches, centimetres or millimetres."
+    )
+    return f"views.csv: the median length of ({', '.join(names)}) is {size:.4g} m{share}. {unit}"
+
+
+def view_warnings(views: Sequence[View]) -> Iterator[str]:
+    """Warnings of positions and angles in another unit."""
+    for names in (cols.POSITION, cols.MEASURED_CAM_POSE[:3]):
+        if words := unit_warning(views, names):
+            yield words
+    angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
+    if angles and float(np.median(angles)) > _WIDE_RAD:
+        yield (
+            f"views.csv: the largest joint angle of a row is {np.median(angles):.4g} rad in the "
+            "median. It looks like degrees: multiply q1_rad ... by pi / 180."
+        )

@@ -38,8 +38,8 @@ from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, F
 from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.checks import unit_warning
 from visioncal.session.columns import POSE, POSITION
+from visioncal.session.table import unit_warning
 
 _MISREAD = "misread_poses"
 # A robot that turns by at most the first did not move; a target that turns by at least the second

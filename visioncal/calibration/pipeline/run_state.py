@@ -17,8 +17,8 @@ from visioncal.core.choices import Convention, SolverName
 from visioncal.core.types import Corners, Mount
 from visioncal.results import Verdict
 from visioncal.robot import Loads
-from visioncal.session.loads import loads_of
 from visioncal.session.selecting import is_whole_cell
+from visioncal.session.table import loads_of
 
 _T = TypeVar("_T")
 

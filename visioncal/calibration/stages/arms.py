@@ -54,7 +54,7 @@ from visioncal.results.arm import (
 )
 from visioncal.robot import Loads
 from visioncal.session import Session, View
-from visioncal.session.loads import loads_of
+from visioncal.session.table import loads_of
 
 # Rounding of written poses and joints [m, rad].
 _ROUNDING = 1e-5

@@ -21,8 +21,8 @@ from visioncal.core.types import Camera, Corners, FloatArray, Rejection
 from visioncal.core.verdict import EMPTY_IMAGE, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
+from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
-from visioncal.session.tables import CameraTable
 from visioncal.vision.dense import KINDS as DENSE_KINDS
 from visioncal.vision.dense import DenseCorners, find_densely
 from visioncal.vision.finders.template import refine

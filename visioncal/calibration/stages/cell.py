@@ -18,9 +18,9 @@ from visioncal.estimation.problem_parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.results import HELD_BACK
 from visioncal.session import Observation, Session, frame_name
+from visioncal.session.document import PriorTable
 from visioncal.session.kinds import is_camera_observation
 from visioncal.session.selecting import is_whole_cell
-from visioncal.session.tables import PriorTable
 
 _CELL = "cell"
 

@@ -29,8 +29,8 @@ from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.problem_parts import Effect
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
+from visioncal.session.document import ClockTable
 from visioncal.session.kinds import is_camera_observation
-from visioncal.session.tables import ClockTable
 from visioncal.vision.targets import numbered_positions
 
 T = TypeVar("T", bound=Observed)

@@ -19,8 +19,8 @@ from visioncal.estimation.scene import Scene
 from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.document import CameraTable
 from visioncal.session.images import FolderImages
-from visioncal.session.tables import CameraTable
 from visioncal.vision.dense import DenseCorners
 
 # Views of one reason that are listed.

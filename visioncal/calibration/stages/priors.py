@@ -15,7 +15,7 @@ from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import FramePrior, State
 from visioncal.estimation.tree import Tree
-from visioncal.session.tables import PriorTable
+from visioncal.session.document import PriorTable
 
 _COMPONENTS = ("x_m", "y_m", "z_m")
 # A measured component is contradicted beyond this many combined sigmas.

@@ -38,7 +38,7 @@ from visioncal.estimation.model_evidence import (
 )
 from visioncal.results import Calibration, select_matching
 from visioncal.session import Session
-from visioncal.session.choosing import Choice
+from visioncal.session.selecting import Choice
 
 _LIMITS = CheckLimits()
 _PAIRS = (BOTH, REPLACED)

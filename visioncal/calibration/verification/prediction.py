@@ -26,7 +26,7 @@ from visioncal.results import CameraResult
 from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.boards import COLUMN
+from visioncal.session.kinds import COLUMN
 from visioncal.vision.targets import numbered_positions, target_document
 
 # Models whose flanges differ by less are of the same robot; tables are written with six digits.

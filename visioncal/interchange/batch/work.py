@@ -107,7 +107,16 @@ def work(job: Job) -> FleetRow:
     begin = time.perf_counter()
     try:
         with one_blas_thread():
-            row = _calibrated_row(job)
+            session = _session(job)
+            calibration, written = _calibrated(job, session)
+            row = row_of(job.name, str(job.session), calibration, __version__)
+            has_report = job.folder / REPORT in written.files
+            row = replace(
+                row, has_picture=_draw(job.folder, session, calibration), has_report=has_report
+            )
+            # Written last: it marks the session as done.
+            document = {**_made_by(job, session), "row": asdict(row)}
+            write_atomically(job.folder / ROW, json.dumps(document, indent=1))
     except VisioncalError as error:
         row = failed_row(job, type(error).__name__, error.message, error.next_step)
     except Exception as error:  # noqa: BLE001 - a bug in one of a thousand ends no batch
@@ -160,18 +169,6 @@ def _made_by(job: Job, session: Session) -> dict[str, object]:
         "need": None if session.need is None else list(map(str, asdict(session.need).values())),
         "options": asdict(job.options) | {"without": list(job.options.without)},
     }
-
-
-def _calibrated_row(job: Job) -> FleetRow:
-    session = _session(job)
-    calibration, written = _calibrated(job, session)
-    row = row_of(job.name, str(job.session), calibration, __version__)
-    has_report = job.folder / REPORT in written.files
-    row = replace(row, has_picture=_draw(job.folder, session, calibration), has_report=has_report)
-    # Written last: it marks the session as done.
-    document = {**_made_by(job, session), "row": asdict(row)}
-    write_atomically(job.folder / ROW, json.dumps(document, indent=1))
-    return row
 
 
 def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:

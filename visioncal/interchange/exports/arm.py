@@ -1,4 +1,7 @@
-"""Content of exported arms, and what a foreign format cannot hold of them."""
+"""The calibrated arm as a URDF, a DH table, UR's own file or JSON, and the table of corrections.
+
+What a format cannot hold of the arm is said in its comments and warnings.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,20 +11,31 @@ import numpy as np
 
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.errors import DataError
+from visioncal.core.files import json_text
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import log
+from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports.content import Format, Selection
 from visioncal.interchange.exports.sources import Source
-from visioncal.results import Calibration, Verdict
-from visioncal.results.arm import JointFunctions, JointRange, WorkspaceSigma
+from visioncal.results import Calibration
+from visioncal.results.arm import JointRange
 from visioncal.robot import (
     DHTable,
     Robot,
+    corrected_tip,
+    corrected_urdf,
     fit_links,
     parallel_axes,
+    small_urdf,
     table_from_document,
     table_of,
+    table_toml,
     unexportable_functions,
+    ur_flange,
+    ur_kinematics_yaml,
+    urdf_with_inertias,
+    with_inertias,
     without_functions,
 )
 
@@ -36,23 +50,12 @@ _WORKSPACE_WEIGHT = 0.1
 class ArmContent:
     """Content for a format of arms."""
 
+    calibration: Calibration
     nominal: Robot
     robot: Robot
-    origin: str  # Where the result comes from, in one line.
-    verdict: Verdict
-    # Predicted standard deviation of a tool's position over the workspace; None where unknown.
-    sigma_mm: WorkspaceSigma | None
-    # Repeatable errors of the joints by their angles; None where none were found.
-    functions: JointFunctions | None = None
     convention: Convention | None = None
     # The hash by which the driver recognises the arm, if stated.
     calibration_hash: str | None = None
-    # Largest deflection of the flange under the arm's own weight [mm]; zero for a rigid arm.
-    sag_mm: float = 0.0
-    # Least and greatest reference temperature of its links [deg C], for an arm that drifts.
-    cold_c: tuple[float, float] | None = None
-    # Largest drift of its flange with temperature, in one posture of the session [mm].
-    drift_mm: float = 0.0
     # The arm with fitted constant links, where the format cannot hold it as a whole, and the
     # remaining error in words.
     links: tuple[Robot, str] | None = None
@@ -66,33 +69,36 @@ class ArmContent:
     @property
     def omitted(self) -> tuple[str, ...]:
         """Bending and thermal drift that no file holds, with their size."""
-        omitted = []
-        if self.sag_mm and self.links is None:
+        omitted, source = [], self.calibration
+        if (sag_mm := _sag_mm(source)) and self.links is None:
             omitted.append(
                 "its joints bend under load, which has no place in it: this is the arm without "
-                f"weight. Under its own it stands off by up to {self.sag_mm:.2g} mm (visioncal "
-                "correct counts that)"
+                f"weight. Under its own it stands off by up to {sag_mm:.2g} mm (visioncal correct "
+                "counts that)"
             )
-        if self.cold_c is not None:
-            low, high = (f"{value:.0f}" for value in self.cold_c)
+        if source.thermal is not None:
+            cold_c = source.drift.reference_c
+            low, high = (f"{value:.0f}" for value in (cold_c.min(), cold_c.max()))
             links = f"links at {low} deg C" if low == high else f"links at {low} to {high} deg C"
+            drift_mm = max(point.drift_mm for point in source.thermal.course)
             omitted.append(
                 "it drifts with its temperature, which has no place in it: this is the arm with "
-                f"{links}. In one posture of the session its flange moved by up to "
-                f"{self.drift_mm:.2g} mm as it warmed up (visioncal correct --temperatures counts "
-                "that)"
+                f"{links}. In one posture of the session its flange moved by up to {drift_mm:.2g} "
+                "mm as it warmed up (visioncal correct --temperatures counts that)"
             )
         return tuple(omitted)
 
     @property
     def notes(self) -> list[str]:
         """Comment lines: origin, quality, and what the arm belongs to."""
-        quality = f"verdict {self.verdict.status}"
-        if self.sigma_mm is not None:
-            median, high = self.sigma_mm.median, self.sigma_mm.p95
+        source = self.calibration
+        quality = f"verdict {source.verdict.status}"
+        sigma_mm = None if source.arm is None else source.arm.workspace_sigma_mm
+        if sigma_mm is not None:
+            median, high = sigma_mm.median, sigma_mm.p95
             quality += f"; sigma over the workspace {median:.2g} mm, at 95 % of it under {high:.2g}"
         return [
-            self.origin,
+            f"calibrated by visioncal from {source.session_name!r}, {source.created}",
             quality,
             f"{self.robot.name}, calibrated: base_from_flange, the pose of {self.robot.tip} in the "
             "base; the calibration's transforms go with this arm, not with the nominal one",
@@ -127,7 +133,11 @@ class ArmContent:
     @property
     def left_out(self) -> str:
         """What links and offsets alone leave out, with the resulting error; empty for nothing."""
-        sag = ("its joints bend under its own weight, and under a load",) if self.sag_mm else ()
+        sag = (
+            ("its joints bend under its own weight, and under a load",)
+            if _sag_mm(self.calibration)
+            else ()
+        )
         missing = (*unexportable_functions(self.robot), *sag)
         if not missing:
             return ""
@@ -201,33 +211,14 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
             f"{', '.join(CONVENTIONS)}.",
             culprits=["--convention"],
         )
-    sag_mm = _sag_mm(source)
-    cold_c, drift_mm = None, 0.0
-    if source.thermal is not None:
-        reference_c = source.drift.reference_c
-        cold_c = float(reference_c.min()), float(reference_c.max())
-        drift_mm = max(point.drift_mm for point in source.thermal.course)
-    with_functions = form.holds == "functions" or selection.with_corrections
-    robot = arm.robot if with_functions else without_functions(arm.robot)
-    loses = sag_mm > 0.0 or (not with_functions and bool(unexportable_functions(arm.robot)))
-    links = (
-        _fit_constant_links(source, robot, arm.measured) if form.holds != "all" and loses else None
-    )
-    return ArmContent(
-        nominal,
-        arm.robot,
-        f"calibrated by visioncal from {source.session_name!r}, {source.created}",
-        source.verdict,
-        arm.workspace_sigma_mm,
-        arm.functions,
-        selection.convention,
-        selection.calibration_hash,
-        sag_mm,
-        cold_c,
-        drift_mm,
-        links,
-        with_functions,
-    )
+    corrected = form.holds == "functions" or selection.with_corrections
+    loses = not corrected and bool(unexportable_functions(arm.robot))
+    links = None
+    if form.holds != "all" and (loses or _sag_mm(source)):
+        robot = arm.robot if corrected else without_functions(arm.robot)
+        links = _fit_constant_links(source, robot, arm.measured)
+    convention, known_hash = selection.convention, selection.calibration_hash
+    return ArmContent(source, nominal, arm.robot, convention, known_hash, links, corrected)
 
 
 def _fit_constant_links(
@@ -276,3 +267,189 @@ def joint_function_error_mm(robot: Robot) -> float:
     q = postures(robot, _POSTURES)
     differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
     return 1e3 * float(np.linalg.norm(differences[:, :3, 3], axis=1).max())
+
+
+# A longer offset along an axis is an artefact of nearly parallel axes, whose common normal is far
+# away [m].
+_FAR_M = 10.0
+# Tolerance of the flange's pose, below which no note is needed [mm, deg].
+_TOLERANCE = 1e-4
+# Range of corrections for joints without limits [deg].
+_WIDEST_DEG = 360.0
+# Placeholder for an unknown hash, which no controller has.
+_NO_HASH = "calib_visioncal"
+
+
+def _write_urdf(content: ArmContent) -> str:
+    if "urdf" in content.nominal.document:
+        robot = without_functions(content.written)
+        return corrected_urdf(content.nominal, robot, content.all_notes)
+    return small_urdf(without_functions(content.written), content.all_notes)
+
+
+def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
+    warnings = content.left_out_warnings
+    if "urdf" not in content.nominal.document:
+        return warnings
+    tip = corrected_tip(content.nominal, content.written)
+    if tip != content.robot.tip:
+        warnings += (
+            f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link of "
+            f"its own in the file: {tip}. Poses are of that.",
+        )
+    return warnings
+
+
+def _warn_dh(content: ArmContent) -> tuple[str, ...]:
+    table = content.table
+    far = int(np.argmax(np.abs(table.d_m)))
+    if abs(table.d_m[far]) < _FAR_M:
+        return content.left_out_warnings
+    return (
+        *content.left_out_warnings,
+        f"d_m of {table.joint_names[far]} is {table.d_m[far]:.0f} m: its axis and a neighbour are "
+        f"nearly parallel, and the {table.convention} convention goes to their common normal. "
+        "--convention hayati does not.",
+    )
+
+
+def _warn_ur(content: ArmContent) -> tuple[str, ...]:
+    warnings = content.left_out_warnings
+    difference = log(ur_flange(content.written, content.nominal_table))
+    turned = np.rad2deg(np.linalg.norm(difference[:3]))
+    moved = 1e3 * np.linalg.norm(difference[3:])
+    if max(turned, moved) > _TOLERANCE:
+        warnings += (
+            f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
+            "for that: a comment in the file has its pose. What sits on the flange goes behind it.",
+        )
+    if content.calibration_hash is None:
+        warnings += (
+            f"its hash is {_NO_HASH!r}, which no controller has: the driver will report that the "
+            "calibration does not match, and go on. Give the one that ur_calibration extracts with "
+            "--hash.",
+        )
+    return warnings
+
+
+def _write_corrections(content: ArmContent) -> str:
+    """A table of corrections: a line for each joint and degree."""
+    robot, arm = content.written, content.calibration.arm
+    functions = None if arm is None else arm.functions
+    lines = [f"# {note}" for note in content.notes]
+    lines.append("joint,angle_deg,correction_deg,sigma_deg")
+    limits = np.rad2deg([robot.lower_rad, robot.upper_rad]).clip(-_WIDEST_DEG, _WIDEST_DEG)
+    for at, joint in enumerate(robot.joint_names):
+        if robot.chain.prismatic[at]:
+            continue
+        # One turn, or the joint's range if its gear ratio is not 1.
+        degrees = np.arange(-180, 180)
+        if robot.chain.functions[at, 1] != 1.0:
+            low, high = limits[:, at]
+            degrees = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
+        angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
+        # The joint with its links alone: with its offset, and a ratio of 1.
+        sent = robot.chain.encoded(robot.chain.functions[:, 0] + angles)
+        corrections = np.rad2deg(sent - angles)[:, at]
+        sigmas = [""] * len(degrees)
+        if functions is not None:
+            nodes_deg = np.rad2deg(1e-3 * np.array(functions.joints[at].sigma_mrad))
+            nodes = np.linspace(-180.0, 180.0, len(nodes_deg), endpoint=False)
+            interpolated = np.interp(degrees, nodes, nodes_deg, period=360.0)
+            sigmas = [f"{value:.6f}" for value in interpolated.tolist()]
+        rows = zip(degrees.tolist(), corrections.tolist(), sigmas, strict=True)
+        lines += [f"{joint},{angle},{correction:.6f},{sigma}" for angle, correction, sigma in rows]
+    return "\n".join([*lines, ""])
+
+
+ARMS = (
+    ArmFormat(
+        "robot-urdf",
+        "the calibrated arm as a URDF: the session's own with other origins, or a small one "
+        "[m, rad]",
+        _write_urdf,
+        takes=frozenset({"with-corrections"}),
+        warn=_warn_urdf,
+        holds="links",
+    ),
+    ArmFormat(
+        "robot-dh",
+        "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati "
+        "[m, rad]",
+        lambda content: table_toml(content.table, "visioncal", content.all_notes),
+        takes=frozenset({"convention", "with-corrections"}),
+        warn=_warn_dh,
+        holds="links",
+    ),
+    ArmFormat(
+        "ur-kinematics",
+        "the calibrated UR as ur_description's kinematics_params_file (YAML), --hash its hash "
+        "[m, rad]",
+        lambda content: ur_kinematics_yaml(
+            without_functions(content.written),
+            calibration_hash=content.calibration_hash or _NO_HASH,
+            like=content.nominal_table,
+            notes=content.all_notes,
+        ),
+        takes=frozenset({"hash", "with-corrections"}),
+        warn=_warn_ur,
+        holds="links",
+    ),
+    ArmFormat(
+        "robot-json",
+        "the calibrated arm with all that was found: 4x4 placements, axes, joints' functions "
+        "[m, rad]",
+        lambda content: json_text({**content.robot.document, "source": "; ".join(content.notes)}),
+    ),
+    ArmFormat(
+        "joint-corrections",
+        "what to add to each joint's angle, degree by degree, for encoders that err (CSV) [deg]",
+        _write_corrections,
+        warn=lambda content: (
+            "It corrects what joints err by as functions of their angles, for the links and "
+            "offsets that --to robot-urdf, robot-dh or ur-kinematics writes --with-corrections: "
+            "send each joint to its angle and the correction there. Without it the flange of that "
+            f"arm is off by up to {joint_function_error_mm(content.written):.2g} mm"
+            f"{content.bending_error_words}.",
+            *(f"{name}." for name in content.omitted),
+        ),
+        holds="functions",
+    ),
+)
+# Formats that hold the inertias of an arm's links.
+_OF_INERTIAS = ("robot-urdf", "robot-json")
+
+
+def write_dynamics(identified: Identified, to: str, selection: Selection) -> str:
+    """Writes an arm with the identified inertias of its links.
+
+    Args:
+        identified: The result.
+        to: `robot-urdf`: its own URDF, or a small one; `robot-json`: a chain, which a session may
+            name as its robot.
+        selection: The user's selection, which must be empty.
+
+    Returns:
+        The text.
+
+    Raises:
+        DataError: The format holds no inertias, an option does not apply to it, or no inertias were
+            identified.
+    """
+    if to not in _OF_INERTIAS:
+        raise DataError(
+            f"Identified dynamics are inertias of an arm's links, which {to} does not hold; "
+            f"{' and '.join(_OF_INERTIAS)} do.",
+            culprits=[to],
+            next_step=f"visioncal export DYNAMICS --to {_OF_INERTIAS[0]}",
+        )
+    next(form for form in ARMS if form.name == to).check(selection)
+    arm = ArmDynamics.of(identified)
+    session = identified.facts["session"]["name"]
+    notes = [f"dynamics identified by visioncal from {session!r}, {identified.facts['created']}"]
+    if to == "robot-json":
+        document = with_inertias(arm.robot.corrected(), arm.inertias).document
+        return json_text({**document, "source": notes[0]})
+    if "urdf" in arm.robot.document:
+        return urdf_with_inertias(arm.robot, arm.inertias, notes)
+    return small_urdf(arm.weighed(), notes)

@@ -12,8 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified, judge
-from visioncal.interchange.exports.arm import ArmFormat, select_arm
-from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
+from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
 from visioncal.interchange.exports.lens import LENSES
 from visioncal.interchange.exports.matrices import MATRICES
@@ -31,7 +30,7 @@ from visioncal.interchange.exports.sources import (
     placements,
 )
 from visioncal.results import Calibration, Edge, Verdict
-from visioncal.session.choosing import ARM, EYE, PARTS, Choice
+from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ROS_FORMATS,
@@ -97,7 +96,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{name}." for name in arm.omitted)
-        return Document(form.write(arm), arm.verdict, (*form.warn(arm), *omitted))
+        return Document(form.write(arm), arm.calibration.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
         contents = _select_all(source, selection, form)
         written = "" if form.write_all is None else form.write_all(contents)

@@ -10,8 +10,7 @@ common name of a field needs no format: it is added to the keys in `poses`, `fie
 """
 
 from visioncal.interchange.formats.assemble import assemble
-from visioncal.interchange.formats.foreign import ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
+from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.registry import (
     FOREIGN_FORMATS,
     convert,

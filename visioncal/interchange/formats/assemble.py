@@ -17,8 +17,11 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import read_target_description, target_name
 from visioncal.interchange.formats.corner_lists import with_corners
-from visioncal.interchange.formats.foreign import ForeignRecording, ForeignSweep, rows_of
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import (
+    ForeignRecording,
+    ImportOptions,
+    rows_of,
+)
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
@@ -61,10 +64,6 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
     if requested.robot_model is not None:
         tip = {} if requested.tip is None else {"tip": requested.tip}
         foreign = replace(foreign, arm={"model": requested.robot_model} | tip)
-    return _with_lens(foreign, requested)
-
-
-def _with_lens(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
     lens, notes = dict(foreign.lens or {}), foreign.notes
     if requested.intrinsics == "estimate":
         lens = {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
@@ -96,15 +95,23 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
-    foreign = with_observations_only(
-        foreign if foreign.sweep is None else _with_camera_samples(foreign, foreign.sweep)
-    )
-    rows = _view_rows(foreign)
+    sweep = foreign.sweep
+    if sweep is not None:
+        # All samples of the camera, without the robot's poses: those become a stream.
+        foreign = replace(
+            foreign,
+            robot=PoseNumbers.empty(sweep.camera.places),
+            camera=sweep.camera,
+            stamps_s=sweep.camera_s,
+            views=(),
+            columns={},
+        )
+    foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
-    files = {path: file for row in rows for path, file in row.image.items()}
     notes = list(foreign.notes)
-    if files:
-        _check_images(foreign.name, list(files.values()), notes)
+    paths = _image_paths(foreign.images, foreign.name, notes)
+    files = {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
+    rows = _view_rows(foreign, paths)
     has_images = bool(files or foreign.corners)
     if has_images:
         document["camera"] = _camera(foreign, list(files.values()))
@@ -112,8 +119,10 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
-    columns = list(dict.fromkeys(name for row in rows for name in row.cells))
-    cells = [[row.cells.get(name, "") for name in columns] for row in rows]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [[row.get(name, "") for name in columns] for row in rows]
+    numbered = zip(foreign.views or range(len(rows)), foreign.corners, strict=False)
+    found = [(view, item.ids, item.px) for view, item in numbered if item is not None]
     session = Session.assemble(
         document,
         columns,
@@ -121,60 +130,21 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         FileImages(files) if files else MemoryImages({}),
         target_document=target,
         robot_document=robot,
-        corners=_corner_table(foreign) if foreign.corners else None,
+        corners=CornerTable.of_lists(found) if foreign.corners else None,
     )
-    if foreign.sweep is not None:
-        session = session.with_streams({"robot": _stream(foreign.sweep)})
+    if sweep is not None:
+        poses = pose_cells(sweep.robot, session_columns.POSE)
+        numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in poses])
+        values = np.hstack([sweep.robot_s[:, None], numbers])
+        values.setflags(write=False)
+        stream = Stream(("stamp_s", *session_columns.POSE), values)
+        session = session.with_streams({"robot": stream})
     elif foreign.joints_rad is None and not foreign.robot.present.all():
         missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.present)]
         notes.append(
             f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
-
-
-def _with_camera_samples(foreign: ForeignRecording, sweep: ForeignSweep) -> ForeignRecording:
-    """All samples of the camera, without the robot's poses: those become a stream."""
-    return replace(
-        foreign,
-        robot=PoseNumbers.empty(sweep.camera.places),
-        camera=sweep.camera,
-        stamps_s=sweep.camera_s,
-        views=(),
-        columns={},
-    )
-
-
-def _stream(sweep: ForeignSweep) -> Stream:
-    rows = pose_cells(sweep.robot, session_columns.POSE)
-    numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in rows])
-    values = np.hstack([sweep.robot_s[:, None], numbers])
-    values.setflags(write=False)
-    return Stream(("stamp_s", *session_columns.POSE), values)
-
-
-def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
-    missing = [file for file in files if not file.is_file()]
-    if not missing:
-        return
-    summary = (
-        f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
-    )
-    if len(missing) == len(files):
-        raise DataError(
-            f"{name}: {summary}.",
-            culprits=[str(missing[0])],
-            next_step="Name the folder that holds them with --images.",
-        )
-    notes.append(f"{summary}. --images names the folder that holds them.")
-
-
-@dataclass(frozen=True)
-class _ViewRow:
-    """One row of views.csv, and its image file by the path in the session."""
-
-    cells: dict[str, str]
-    image: dict[str, Path]
 
 
 def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
@@ -230,50 +200,50 @@ def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignReco
     return replace(foreign, images=(), corners=())
 
 
-def _view_rows(foreign: ForeignRecording) -> list[_ViewRow]:
-    images = _image_paths(foreign)
+def _view_rows(foreign: ForeignRecording, paths: Sequence[str]) -> list[dict[str, str]]:
+    """Cells of views.csv by column; `paths` are those of the images in the session."""
     robot = pose_cells(foreign.robot, session_columns.POSE)
     camera: list[dict[str, str]] = [{}] * len(foreign.robot)
     if foreign.camera is not None:
         camera = pose_cells(foreign.camera, session_columns.MEASURED_CAM_POSE)
-    extra = _extra_columns(foreign)
+    extra, stamps_s, joints_rad = _extra_columns(foreign), foreign.stamps_s, foreign.joints_rad
     rows = []
     for at in range(len(foreign.robot)):
-        image = images[at]
         cells = {"view": str(foreign.views[at] if foreign.views else at)}
-        if foreign.images:
-            cells["image"] = "" if image is None else image[0]
-        cells |= _scalars(foreign, at) | robot[at] | camera[at]
-        cells |= {name: column[at] for name, column in extra.items()}
-        rows.append(_ViewRow(cells, dict([image]) if image is not None else {}))
+        if paths:
+            cells["image"] = paths[at]
+        if stamps_s is not None and np.isfinite(stamps_s[at]):
+            cells["stamp_s"] = repr(float(stamps_s[at]))
+        for number, angle in enumerate([] if joints_rad is None else joints_rad[at].tolist(), 1):
+            cells[f"q{number}_rad"] = "" if np.isnan(angle) else repr(angle)
+        further = {name: column[at] for name, column in extra.items()}
+        rows.append(cells | robot[at] | camera[at] | further)
     return rows
 
 
-def _corner_table(foreign: ForeignRecording) -> CornerTable:
-    views = foreign.views or range(len(foreign.robot))
-    pairs = zip(views, foreign.corners, strict=True)
-    shown = [(view, corners) for view, corners in pairs if corners is not None]
-    counts = [len(corners.ids) for _, corners in shown]
-    return CornerTable(
-        np.repeat([view for view, _ in shown], counts),
-        np.concatenate([corners.ids for _, corners in shown]),
-        np.concatenate([corners.px for _, corners in shown]),
-        ("",) * sum(counts),
-        is_file=False,
-    )
-
-
-def _scalars(foreign: ForeignRecording, at: int) -> dict[str, str]:
-    cells = {}
-    if foreign.stamps_s is not None and np.isfinite(foreign.stamps_s[at]):
-        cells["stamp_s"] = repr(float(foreign.stamps_s[at]))
-    if foreign.joints_rad is not None:
-        angles = foreign.joints_rad[at].tolist()
-        names = [f"q{number}_rad" for number in range(1, len(angles) + 1)]
-        cells |= {
-            name: "" if np.isnan(a) else repr(a) for name, a in zip(names, angles, strict=True)
-        }
-    return cells
+def _image_paths(images: Sequence[Path | None], name: str, notes: list[str]) -> list[str]:
+    """Paths of images in the session, empty for none; a name already in use gets a number."""
+    paths: dict[Path, str] = {}
+    taken: set[str] = set()
+    for at, file in enumerate(images):
+        if file is None or file in paths:
+            continue
+        names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
+        # Some file systems do not distinguish upper and lower case.
+        paths[file] = next(name for name in names if name.casefold() not in taken)
+        taken.add(paths[file].casefold())
+    missing = [file for file in paths if not file.is_file()]
+    listed = some_of([*map(str, missing)], 3)
+    summary = f"{len(missing)} of {len(paths)} images are missing: {listed}"
+    if missing and len(missing) == len(paths):
+        raise DataError(
+            f"{name}: {summary}.",
+            culprits=[str(missing[0])],
+            next_step="Name the folder that holds them with --images.",
+        )
+    if missing:
+        notes.append(f"{summary}. --images names the folder that holds them.")
+    return ["" if image is None else f"images/{paths[image]}" for image in images]
 
 
 def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str]]:
@@ -322,24 +292,6 @@ def _is_meant(name: str, cells: Sequence[str]) -> bool:
         return len(filled) < 2
     finite = (is_number(word) and np.isfinite(float(word)) for word in filled)
     return not session_columns.is_number(name) or all(finite)
-
-
-def _image_paths(foreign: ForeignRecording) -> list[tuple[str, Path] | None]:
-    """Paths of images in the session; a name already in use gets a number in front."""
-    if not foreign.images:
-        return [None] * len(foreign.robot)
-    paths: dict[Path, str] = {}
-    taken: set[str] = set()
-    for at, file in enumerate(foreign.images):
-        if file is None or file in paths:
-            continue
-        names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
-        # Some file systems do not distinguish upper and lower case.
-        paths[file] = next(name for name in names if name.casefold() not in taken)
-        taken.add(paths[file].casefold())
-    return [
-        None if image is None else (f"images/{paths[image]}", image) for image in foreign.images
-    ]
 
 
 def _camera(foreign: ForeignRecording, files: Sequence[Path]) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.calibration.stages.clock_offset import LEAST_CORRELATION
+from visioncal.calibration.stages.motion import slow_and_new
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents import (
     read_json,
@@ -18,7 +20,14 @@ from visioncal.core.documents import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
+from visioncal.estimation.clock_correlation import (
+    WIDEST_OFFSET_S,
+    ImageTimes,
+    Match,
+    turning_matches,
+)
+from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 from visioncal.interchange.formats.fields import (
     Fields,
     fields_of_arrays,
@@ -34,8 +43,13 @@ from visioncal.interchange.formats.file_search import (
     images_named,
     is_image_name,
 )
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ForeignSweep
-from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ForeignSweep,
+    ImportOptions,
+    PoseImportOptions,
+)
 from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
 from visioncal.interchange.formats.printed import (
     PROGRAMS,
@@ -44,11 +58,15 @@ from visioncal.interchange.formats.printed import (
     printed_fields,
     program_fields,
 )
-from visioncal.interchange.formats.streams import in_seconds, pair_streams, seconds
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *PROGRAMS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
+# Limits of the overlap of two streams [s]: a shorter one determines no offset, a longer one is no
+# calibration motion.
+_SHORTEST_S, _LONGEST_S = 2.0, 3600.0
+# Present epochs are about 1e9 s: (larger than, seconds a unit).
+_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 # Numbers of values that a pose in one field may have.
 _WHOLE_POSES = (6, 7, 12, 16)
 
@@ -207,37 +225,32 @@ def foreign_from(
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     paths, image_name, more = _images(fields, requested, images, used)
     if camera is None and not paths:
-        _check_no_unnamed_poses(fields, used)
+        candidates = [
+            name
+            for name, numbers in fields.numbers.items()
+            if numbers.ndim > 1 and numbers[0].size in _WHOLE_POSES and name not in used
+        ]
+        if candidates:
+            raise DataError(
+                f"{fields.name}: which of its fields are the target's poses is not known; "
+                f"{some_of(candidates)} may be.",
+                culprits=candidates,
+                next_step="Name them with --camera-columns; where they are of the camera in the "
+                "target, with --camera-inverse.",
+            )
     return ForeignRecording(
         name=fields.name,
         robot=robot,
         camera=camera,
         images=paths,
         joints_rad=joints,
-        stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
+        stamps_s=_in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         views=fields.views or view_numbers(fields),
         columns={
             name: cells for name, cells in fields.texts.items() if name not in used | {image_name}
         },
         notes=(*notes, *more),
     )
-
-
-def _check_no_unnamed_poses(fields: Fields, used: Collection[str]) -> None:
-    """Raises DataError where unnamed fields may be poses of the target."""
-    candidates = [
-        name
-        for name, numbers in fields.numbers.items()
-        if numbers.ndim > 1 and numbers[0].size in _WHOLE_POSES and name not in used
-    ]
-    if candidates:
-        raise DataError(
-            f"{fields.name}: which of its fields are the target's poses is not known; "
-            f"{some_of(candidates)} may be.",
-            culprits=candidates,
-            next_step="Name them with --camera-columns; where they are of the camera in the "
-            "target, with --camera-inverse.",
-        )
 
 
 def view_numbers(fields: Fields) -> tuple[int, ...]:
@@ -305,16 +318,20 @@ def with_camera_file(
     """
     robot, robot_names, first = _poses(robot_fields, requested.robot, "robot")
     camera, camera_names, second = _poses(camera_fields, requested.camera, "camera")
-    notes = (*first, *second)
+    notes, name = (*first, *second), robot_fields.name
     robot_stamp = stamp_name(robot_fields, robot_names)
     camera_stamp = stamp_name(camera_fields, camera_names)
-    if not robot_stamp or not camera_stamp:
-        return _row_by_row(robot_fields, robot, camera, notes)
-    robot_s, camera_s = (
-        seconds(fields.column(name)[:, 0], fields.places)
-        for fields, name in ((robot_fields, robot_stamp), (camera_fields, camera_stamp))
-    )
-    return _by_time(robot_fields.name, (robot_s, robot), (camera_s, camera), notes)
+    if robot_stamp and camera_stamp:
+        robot_s, robot = _timed(robot_fields, robot_stamp, robot)
+        camera_s, camera = _timed(camera_fields, camera_stamp, camera)
+        return _by_time(name, ForeignSweep(robot_s, robot, camera_s, camera), notes)
+    if len(robot) != len(camera):
+        raise DataError(
+            f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
+            "times; as many of both are needed.",
+            culprits=[robot.places[-1], camera.places[-1]],
+        )
+    return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)
 
 
 def _poses(
@@ -338,52 +355,102 @@ def _poses(
     return poses, names, notes
 
 
-def _row_by_row(
-    fields: Fields, robot: PoseNumbers, camera: PoseNumbers, notes: tuple[str, ...]
-) -> ForeignRecording:
-    if len(robot) != len(camera):
+def _timed(fields: Fields, stamp: str, numbers: PoseNumbers) -> tuple[FloatArray, PoseNumbers]:
+    """Times [s] and poses of the samples that have a pose."""
+    stamps, places = fields.column(stamp)[:, 0], fields.places
+    if not np.isfinite(stamps).all():
+        place = places[int(np.argmin(np.isfinite(stamps)))]
+        raise DataError(f"{place}: the time is missing.", culprits=[place])
+    not_increasing = np.diff(stamps) <= 0
+    if not_increasing.any():
+        place = places[int(np.argmax(not_increasing)) + 1]
         raise DataError(
-            f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
-            "times; as many of both are needed.",
-            culprits=[robot.places[-1], camera.places[-1]],
+            f"{place}: the time does not increase from the row before.",
+            culprits=[place],
+            next_step="Sort the rows by time and remove doubled ones.",
         )
-    return ForeignRecording(name=fields.name, robot=robot, camera=camera, notes=notes)
-
-
-def _by_time(
-    name: str,
-    robot: tuple[FloatArray, PoseNumbers],
-    camera: tuple[FloatArray, PoseNumbers],
-    notes: tuple[str, ...],
-) -> ForeignRecording:
-    robot_s, robot_poses, robot_rows = _with_pose(*robot)
-    camera_s, camera_poses, camera_rows = _with_pose(*camera)
-    paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
-    seen = camera[1].rows(camera_rows)
-    sampled = seen.rows(paired.rows)
-    return ForeignRecording(
-        name=name,
-        robot=PoseNumbers.written(paired.base_from_flange, robot[1].reading, sampled.places),
-        camera=sampled,
-        stamps_s=camera_s[paired.rows],
-        sweep=ForeignSweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),
-        notes=(
-            *notes,
-            f"The camera's clock is about {1e3 * paired.match.offset_s:+.0f} ms ahead of the "
-            "robot's, as both turn alike there with a correlation of "
-            f"{paired.match.correlation:.2f}; calibrate estimates it finer.",
-            f"All {len(seen)} samples of the camera are kept as views, and the robot's as a stream "
-            "beside them: calibrate takes the robot's poses from there.",
-        ),
-    )
-
-
-def _with_pose(
-    stamps_s: FloatArray, numbers: PoseNumbers
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Samples that have a pose: (times [s], (m, 4, 4) poses [m], their rows)."""
     rows = np.flatnonzero(numbers.present)
     if len(rows) < 3:
         place = numbers.places[0]
         raise DataError(f"{place}: {len(rows)} poses; 3 or more are needed.", culprits=[place])
-    return stamps_s[rows], numbers.poses()[rows], rows
+    return _in_seconds(stamps)[rows], numbers.rows(rows)
+
+
+def _in_seconds(stamps: FloatArray) -> FloatArray:
+    """Converts stamps to seconds; the size of an epoch shows milli-, micro- or nanoseconds."""
+    sizes = np.abs(stamps[np.isfinite(stamps)])
+    largest = float(sizes.max()) if len(sizes) else 0.0
+    return stamps * next((unit_s for limit, unit_s in _EPOCHS if largest > limit), 1.0)
+
+
+def _by_time(name: str, sweep: ForeignSweep, notes: tuple[str, ...]) -> ForeignRecording:
+    """Estimates a coarse clock offset, and samples times at which the robot is slow."""
+    robot_s, camera_s = sweep.robot_s, sweep.camera_s
+    common_s = min(robot_s[-1], camera_s[-1]) - max(robot_s[0], camera_s[0])
+    if common_s < _SHORTEST_S:
+        raise DataError(
+            f"The streams have {max(common_s, 0.0):.1f} s in common (robot {robot_s[0]:.2f} to "
+            f"{robot_s[-1]:.2f}, camera {camera_s[0]:.2f} to {camera_s[-1]:.2f}); "
+            f"{_SHORTEST_S:g} s or more are needed.",
+            culprits=["robot", "camera"],
+            next_step="Stamp both with the same clock, to within a few seconds.",
+        )
+    if common_s > _LONGEST_S:
+        raise DataError(
+            f"The streams have {common_s:.0f} s in common; up to {_LONGEST_S:.0f} are read.",
+            culprits=["robot", "camera"],
+            next_step="Cut the recording into parts.",
+        )
+    flange = Trajectory(robot_s, sweep.robot.poses())
+    match = _match(flange, ImageTimes("eye-in-hand", camera_s, sweep.camera.poses()))
+    robot_clock_s = camera_s - match.offset_s
+    rows = np.flatnonzero(flange.covers(robot_clock_s))
+    if len(rows) < 3:
+        raise DataError(
+            f"The robot's poses cover {len(rows)} samples of the camera's; 3 or more are "
+            f"needed. They are {flange.step_s:.2f} s apart; where the gap is {LONGEST_GAP_S} s or "
+            "more, nothing is interpolated.",
+            culprits=["robot", "camera"],
+            next_step="Log the robot's pose ten times a second or more.",
+        )
+    poses = flange.at(robot_clock_s[rows])
+    chosen = slow_and_new(poses, flange.speeds(robot_clock_s[rows]))
+    sampled = sweep.camera.rows(rows[chosen])
+    return ForeignRecording(
+        name=name,
+        robot=PoseNumbers.written(poses[chosen], sweep.robot.reading, sampled.places),
+        camera=sampled,
+        stamps_s=camera_s[rows[chosen]],
+        sweep=sweep,
+        notes=(
+            *notes,
+            f"The camera's clock is about {1e3 * match.offset_s:+.0f} ms ahead of the robot's, as "
+            f"both turn alike there with a correlation of {match.correlation:.2f}; calibrate "
+            "estimates it finer.",
+            f"All {len(sweep.camera)} samples of the camera are kept as views, and the robot's as "
+            "a stream beside them: calibrate takes the robot's poses from there.",
+        ),
+    )
+
+
+def _match(flange: Trajectory, frames: ImageTimes) -> Match:
+    best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
+    if flange.step_s >= LONGEST_GAP_S:
+        # Too sparse to compare; the caller reports the uncovered samples.
+        return best
+    if best.correlation < LEAST_CORRELATION:
+        raise DataError(
+            f"The turning of robot and camera agrees with a correlation of {best.correlation:.2f} "
+            f"at best, {best.offset_s:+.2f} s apart; {LEAST_CORRELATION} is needed.",
+            culprits=["robot", "camera"],
+            next_step="Check that both streams are of the same motion.",
+        )
+    if best.at_end:
+        raise DataError(
+            f"The turning of robot and camera agrees best {best.offset_s:+.2f} s apart, "
+            f"where the search ends: offsets within {WIDEST_OFFSET_S:g} s and a quarter of the "
+            "time in common are tried.",
+            culprits=["robot", "camera"],
+            next_step="Stamp both with clocks that differ by less, or record for longer.",
+        )
+    return best

@@ -40,20 +40,20 @@ def files_in(folder: Path) -> tuple[Path, ...]:
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
     """Images of a folder in natural order."""
-    images = tuple(path for path in files_in(folder) if is_image_name(path.name))
-    if not images:
-        is_folder = folder.is_dir()
+    if images := tuple(path for path in files_in(folder) if is_image_name(path.name)):
+        return images
+    if folder.is_dir():
         raise DataError(
-            f"{folder} has no images (png, jpg, tif, bmp, webp)."
-            if is_folder
-            else f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder "
-            "of the images is needed.",
+            f"{folder} has no images (png, jpg, tif, bmp, webp).",
             culprits=[str(folder)],
-            next_step="Name the folder of the images with --images."
-            if is_folder
-            else "Check the path and its spelling.",
+            next_step="Name the folder of the images with --images.",
         )
-    return images
+    raise DataError(
+        f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder of the "
+        "images is needed.",
+        culprits=[str(folder)],
+        next_step="Check the path and its spelling.",
+    )
 
 
 def head(path: Path) -> str:
@@ -73,7 +73,7 @@ def images_named(
 
     Args:
         names: (n,) image names; None or empty in a row without an image.
-        base: What the names are relative to.
+        base: What the names are relative to: they are there, or in the folder `images` beside.
         folder: Where the images are now; matched by name, else by the number in it.
 
     Returns:
@@ -82,11 +82,23 @@ def images_named(
     Raises:
         DataError: A name leaves the folder, or is not an image's.
     """
-    if folder is None:
-        paths = [_beside(base, name) if name else None for name in names]
-    else:
-        paths = _images_by_name(names, folder)
-    for name, path in zip(names, paths, strict=True):
+    images = () if folder is None else _images_in(folder)
+    by_name = {item.stem: item for item in images} | {item.name: item for item in images}
+    numbers = [number_in(name) for name in names if name]
+    is_unique = len(set(numbers)) == len(numbers) and None not in numbers
+    by_number = _unique_numbers(images) if is_unique else {}
+    paths: list[Path | None] = []
+    for name in names:
+        path: Path | None = None
+        if name and folder is not None:
+            plain = name.replace("\\", "/").rsplit("/", 1)[-1]
+            path = by_name.get(plain) or by_number.get(number_in(plain))
+            path = path or path_inside(folder, plain)
+        elif name:
+            path = path_inside(base, name)
+            inner = base / "images" / path.name
+            if not path.exists() and is_inside(inner, base) and inner.exists():
+                path = inner
         if path is not None and not is_image_name(path.name):
             raise DataError(
                 f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif, bmp or "
@@ -94,27 +106,8 @@ def images_named(
                 culprits=[str(name)[:80]],
                 next_step="Correct it, or name the column of the images with --image-column.",
             )
+        paths.append(path)
     return tuple(paths)
-
-
-def _images_by_name(names: Sequence[str | None], folder: Path) -> list[Path | None]:
-    images = _images_in(folder)
-    by_name = {item.stem: item for item in images} | {item.name: item for item in images}
-    by_number = _unique_numbers(images)
-    numbers = [number_in(name) for name in names if name]
-    is_unique = len(set(numbers)) == len(numbers) and None not in numbers
-    paths: list[Path | None] = []
-    for name in names:
-        if not name:
-            paths.append(None)
-            continue
-        plain = name.replace("\\", "/").rsplit("/", 1)[-1]
-        number = number_in(plain)
-        match = by_name.get(plain)
-        if match is None and is_unique and number is not None:
-            match = by_number.get(number)
-        paths.append(match or path_inside(folder, plain))
-    return paths
 
 
 def is_image_name(name: str) -> bool:
@@ -122,17 +115,15 @@ def is_image_name(name: str) -> bool:
     return name.lower().endswith(IMAGE_ENDINGS)
 
 
-def _beside(base: Path, name: str) -> Path:
-    """Path of a named image, as the name says or in the folder `images` beside the source."""
-    path = path_inside(base, name)
-    inner = base / "images" / path.name
-    return inner if not path.exists() and is_inside(inner, base) and inner.exists() else path
-
-
-def _images_of(
-    folder: Path, views: Sequence[int], labels: Sequence[str], *, numbered: bool
+def images_beside(
+    folder: Path,
+    chosen: Path | None,
+    views: Sequence[int],
+    labels: Sequence[str],
+    *,
+    numbered: bool,
 ) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
-    """Pairs rows with the images of a folder, by number or in order.
+    """Pairs rows by number or in order with the images of `chosen`, else with any in the folder.
 
     With `numbered` the rows' numbers are from the source's names; otherwise rows and images are
     paired in natural order, and their counts must agree.
@@ -141,8 +132,11 @@ def _images_of(
         (n,) paths, None in a row whose number no image has; and a note where order decides.
 
     Raises:
-        DataError: There are no images, several a pose, or not as many as rows.
+        DataError: `chosen` has no images, several a pose, or not as many as there are rows.
     """
+    if chosen is None and not any(is_image_name(path.name) for path in files_in(folder)):
+        return (), ()
+    folder = chosen or folder
     images = _images_in(folder)
     by_number = _unique_numbers(images)
     kinds = Counter(series_name(path) for path in images if number_in(path.name) in set(views))
@@ -159,8 +153,8 @@ def _images_of(
         by_number = _unique_numbers(images)
     if numbered and len(by_number) == len(images) and by_number.keys() & set(views):
         return tuple(by_number.get(view) for view in views), ()
+    first, last = images[0].name, images[-1].name
     if len(images) != len(views):
-        first, last = images[0].name, images[-1].name
         raise DataError(
             f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(views)} "
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
@@ -170,37 +164,16 @@ def _images_of(
             "images are shifted.",
         )
     return images, (
-        f"Rows and images are paired in order, {labels[0]} with {images[0].name}, {labels[-1]} "
-        f"with {images[-1].name}; --image-column names a column that names each row's image.",
+        f"Rows and images are paired in order, {labels[0]} with {first}, {labels[-1]} with {last}; "
+        "--image-column names a column that names each row's image.",
     )
 
 
-def images_beside(
-    folder: Path,
-    chosen: Path | None,
-    views: Sequence[int],
-    labels: Sequence[str],
-    *,
-    numbered: bool,
-) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
-    """Pairs rows by number or in order with the images of `chosen`, else with any in the folder.
-
-    Returns:
-        (n,) paths, None in a row whose number no image has; and a note where order decides.
-
-    Raises:
-        DataError: `chosen` has no images, or not as many as there are rows.
-    """
-    beside = any(is_image_name(path.name) for path in files_in(folder))
-    if chosen is None and not beside:
-        return (), ()
-    return _images_of(chosen or folder, views, labels, numbered=numbered)
-
-
-def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
-    numbers = [(number_in(path.name), path) for path in paths]
-    counts = Counter(number for number, _ in numbers)
-    return {number: path for number, path in numbers if number is not None and counts[number] == 1}
+def _unique_numbers(paths: Sequence[Path]) -> dict[int | None, Path]:
+    """Files by the number in their names, where only one has it."""
+    counts = Counter(number_in(path.name) for path in paths)
+    by_number = {number_in(path.name): path for path in paths}
+    return {n: path for n, path in by_number.items() if n is not None and counts[n] == 1}
 
 
 def path_inside(base: Path, name: str) -> Path:

@@ -19,8 +19,7 @@ from visioncal.interchange.formats.file_search import (
     number_in,
     path_inside,
 )
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 
 # Other formats have the pose itself under this key.

@@ -12,18 +12,17 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.file_search import files_in
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
+    exchange_views,
     load_for_rereading,
     reread,
     reread_session,
 )
 from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
-from visioncal.interchange.formats.view_exchange import exchange_views
 from visioncal.interchange.formats.views import VIEWS
 from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
 from visioncal.session import Session
@@ -82,7 +81,11 @@ def convert(
             written, or reads back differently.
     """
     source, dest = Path(source), Path(dest)
-    _check_dest(source, dest, force=force)
+    is_folder = not _is_recording(dest)
+    # An empty folder is checked by the session's writer.
+    if not (is_folder and dest.is_dir()):
+        same = source.exists() and dest.exists() and dest.samefile(source)
+        check_free(dest, force=force, replaceable=not is_folder and not same)
     if form is not None or not _is_session(source):
         foreign = read_foreign(source, requested, form)
         if choose is None:
@@ -168,7 +171,7 @@ def _is_session(path: Path) -> bool:
     return is_folder or (path.is_file() and _is_recording(path))
 
 
-def _check_source(source: Path) -> None:
+def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     if not source.exists():
         raise DataError(
             f"{source} does not exist.",
@@ -181,18 +184,6 @@ def _check_source(source: Path) -> None:
             culprits=[str(source)],
             next_step="Save what it gives as a file first.",
         )
-
-
-def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
-    is_folder = not _is_recording(dest)
-    # An empty folder is checked by the session's writer.
-    if not (is_folder and dest.is_dir()):
-        same = source.exists() and dest.exists() and dest.samefile(source)
-        check_free(dest, force=force, replaceable=not is_folder and not same)
-
-
-def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
-    _check_source(source)
     names = [foreign_format.name for foreign_format in FOREIGN_FORMATS]
     if form is not None and form not in names:
         raise DataError(

@@ -21,11 +21,13 @@ from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
-from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
+from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
 from visioncal.interchange.formats.foreign import ForeignRecording
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
+    INSTRUMENT_POSITION,
+    INSTRUMENT_QUATERNION,
     MEASURED_CAM_POSE,
     POSE,
     POSITION,
@@ -259,7 +261,10 @@ def reread_session(
     reading = candidate.hypothesis
     _check_applies(candidate, robot)
     if _is_one_log(chain_poses(session), robot):
-        _reorder(cells, reading.rows(len(cells)), joint_columns(session.columns))
+        names = joint_columns(session.columns)
+        before = [{name: row[name] for name in names} for row in cells]
+        for row, at in zip(cells, reading.rows(len(cells)), strict=True):
+            row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
     if robot.present.any():
         _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
     if camera.present.any():
@@ -374,12 +379,6 @@ def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:
     return bool(np.corrcoef(steps[0][finite], steps[1][finite])[0, 1] > _LEAST_CORRELATION)
 
 
-def _reorder(rows: Sequence[dict[str, str]], order: IntArray, names: Sequence[str]) -> None:
-    before = [{name: row[name] for name in names} for row in rows]
-    for row, at in zip(rows, order, strict=True):
-        row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
-
-
 def _replace_cells(
     rows: Sequence[dict[str, str]], cells: Sequence[Mapping[str, str]], names: Sequence[str]
 ) -> None:
@@ -394,3 +393,55 @@ def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
         name: factor * value if name in _LENGTHS and isinstance(value, int | float) else value
         for name, value in target.items()
     }
+
+
+# Columns of what a view shows; the rest of its row is the robot's pose.
+_OBSERVED = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)
+# Columns that must agree between the two views.
+_MUST_AGREE = ("camera", "target", "instrument", "point")
+
+
+def exchange_views(session: Session, first: int, second: int) -> Session:
+    """Exchanges the images, corners and readings of two views; the session notes it in `corrected`.
+
+    Raises:
+        DataError: There are no two such views.
+    """
+    cells = {
+        view.number: {name: view.cell(name) for name in session.columns} for view in session.views
+    }
+    for view in (first, second):
+        if view not in cells:
+            raise DataError(
+                f"There is no view {view} in session {session.name!r}; it has views "
+                f"{min(cells, default=0)} to {max(cells, default=0)}.",
+                culprits=["--exchange"],
+            )
+    first_cells, second_cells = cells[first], cells[second]
+    differing = [
+        name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
+    ]
+    if first == second or differing:
+        what = f"are of another {' and '.join(differing)}" if differing else "are the same view"
+        raise DataError(
+            f"Views {first} and {second} {what}: two views that see the same are exchanged.",
+            culprits=["--exchange"],
+        )
+    for name in {*_OBSERVED} & {*session.columns}:
+        first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
+    corners = session.corner_table
+    if corners is not None:
+        is_first, is_second = corners.views == first, corners.views == second
+        views = np.where(is_first, second, np.where(is_second, first, corners.views))
+        corners = replace(corners, views=views)
+    note = f"the images of views {first} and {second} were exchanged"
+    rows: Sequence[dict[str, str]] = [*cells.values()]
+    return Session.assemble(
+        {**session.document, "corrected": [*session.declaration.corrected, note]},
+        session.columns,
+        [[row[name] for name in session.columns] for row in rows],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=corners,
+    ).with_streams(session.streams)

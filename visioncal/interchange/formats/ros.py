@@ -8,8 +8,7 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import mapping, number, read_json, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats.file_search import head
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
 

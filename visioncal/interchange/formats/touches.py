@@ -13,7 +13,7 @@ from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.touches import TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, read_fields, view_numbers
 from visioncal.interchange.formats.fields import Fields, unnamed_columns
-from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
+from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.poses import check_radians, pose_names
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
@@ -43,7 +43,13 @@ def read_touches(
     unnamed = unnamed_columns(fields)["robot"]
     named = pose_names(fields, requested.robot.names, unnamed, "robot", ())
     if positions and (not named or (requested.robot.names and len(named) == 3)):
-        return _rows_of(fields, path, _positions_alone(fields, requested.robot), None)
+        form = POSE_FORMS.get(requested.robot.form or "")
+        unit = requested.robot.unit or (form.unit if form else None)
+        poses = np.full((len(fields), 4, 4), np.nan)
+        poses[:, :3, 3] = _coordinates(
+            fields, *_axes(fields, unit, "--robot-unit", requested.robot.names)
+        )
+        return _rows_of(fields, path, poses, None)
     joints = requested.joints or joint_columns(tuple(fields.numbers))
     if not named and not joints and _has_axes(fields):
         raise DataError(
@@ -108,15 +114,6 @@ def _rows_of(
     )
 
 
-def _positions_alone(fields: Fields, requested: PoseImportOptions) -> FloatArray:
-    """Poses (n, 4, 4) with NaN rotations [m]."""
-    form = POSE_FORMS.get(requested.form or "")
-    unit = requested.unit or (form.unit if form else None)
-    poses = np.full((len(fields), 4, 4), np.nan)
-    poses[:, :3, 3] = _coordinates(fields, *_axes(fields, unit, "--robot-unit", requested.names))
-    return poses
-
-
 def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
     """Reads a table of CAD coordinates.
 
@@ -137,7 +134,17 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
             culprits=[str(path)],
             next_step="Name the touches first, and the drawing's table with --cad.",
         )
-    names = _names(fields)
+    column = next((name for name in _NAMES if name in fields.texts), None)
+    if column is None:
+        raise DataError(
+            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point; "
+            f"there are {fields.listing()}.",
+            culprits=[fields.name],
+        )
+    names = tuple(text.strip() for text in fields.texts[column])
+    if not all(names):
+        place = fields.places[names.index("")]
+        raise DataError(f"{place}: the point has no name.", culprits=[place])
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if twice:
         raise DataError(
@@ -152,21 +159,6 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
             culprits=[fields.places[index] for index in bad],
         )
     return NominalPoints(path.name, names, positions, _sigmas(fields, length_m))
-
-
-def _names(fields: Fields) -> tuple[str, ...]:
-    column = next((name for name in _NAMES if name in fields.texts), None)
-    if column is None:
-        raise DataError(
-            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point; "
-            f"there are {fields.listing()}.",
-            culprits=[fields.name],
-        )
-    names = tuple(text.strip() for text in fields.texts[column])
-    if not all(names):
-        place = fields.places[names.index("")]
-        raise DataError(f"{place}: the point has no name.", culprits=[place])
-    return names
 
 
 def _sigmas(fields: Fields, length_m: float) -> FloatArray:

@@ -25,8 +25,7 @@ from visioncal.interchange.formats.file_search import (
     number_in,
     series_name,
 )
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 
 _LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
 # Rotation forms by the code of the representation (create_pose): angles about x, y, z in the

@@ -11,10 +11,9 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, mapping, read_yaml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.types import MOUNTS, FloatArray, Mount
+from visioncal.core.types import MOUNTS, FloatArray
 from visioncal.interchange.formats.file_search import files_in, head, images_beside, number_in
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
-from visioncal.interchange.formats.import_options import ImportOptions
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
@@ -89,12 +88,15 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         else {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
     )
     camera = requested.camera.applied_to(_poses([camera_files.get(view) for view in views], places))
+    stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
+    if stated is not None:
+        notes.append(f"The mount is taken from the folder's name: {stated}.")
     return ForeignRecording(
         name=path.resolve().name,
         robot=requested.robot.applied_to(_poses(files, places)),
         camera=camera if camera_files else None,
         images=images,
-        mount=_mount(path, notes),
+        mount=(stated),
         target=None if requested.target else _target(path, notes),
         lens=_lens(path, notes),
         views=views,
@@ -116,13 +118,6 @@ def _pose(path: Path) -> list[float]:
             culprits=[str(path)],
         )
     return [float(value) for value in flat]
-
-
-def _mount(path: Path, notes: list[str]) -> Mount | None:
-    stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
-    if stated is not None:
-        notes.append(f"The mount is taken from the folder's name: {stated}.")
-    return stated
 
 
 def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:

@@ -17,7 +17,7 @@ from visioncal.present.recording.results import log_results
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
-from visioncal.session.checks import check_images_can_be_used
+from visioncal.session.kinds import check_images_can_be_used
 from visioncal.session.table import View, read_views
 
 

@@ -24,7 +24,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import WorkspacePlace
 from visioncal.robot import Loads, Robot, joint_deflections
 from visioncal.robot.inverse import Inverse, Posture
-from visioncal.session.choosing import ARM, Choice
+from visioncal.session.selecting import ARM, Choice
 
 # Transforms, or their (4, 4) or (m, 4, 4) matrices.
 Poses: TypeAlias = FloatArray | RigidTransform
