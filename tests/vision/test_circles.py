@@ -22,7 +22,6 @@ from visioncal.simulation import (
     write_session,
 )
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
-from visioncal.vision.finders.identify import identify
 from visioncal.vision.targets import (
     corner_positions,
     rotations,
@@ -97,7 +96,6 @@ def test_light_circles_on_dark_are_as_exact(table):
         assert isinstance(found, DetectedCorners)
         # As for dark circles of such a picture below: twice the template's own noise.
         assert np.sqrt(np.mean((numbered(found, px + 200) - px - 200) ** 2)) < 0.012
-        assert identify(negative).kind == "circles"
 
 
 def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
@@ -127,16 +125,6 @@ def test_another_page_is_named(change, words):
     assert isinstance(found, NotFound)
     assert found.misfit
     assert words in found.reason
-
-
-@pytest.mark.parametrize("target", [SHIFTED, EVEN])
-def test_a_photograph_names_it(target):
-    identity = identify(photograph(target, SHOT, 3)[0])
-    found = identity.target("board", target.square_m)
-    assert identity.corners_seen == len(corner_positions(target))
-    assert found.diameter_m == pytest.approx(target.diameter_m, rel=0.05)
-    same = replace(found, diameter_m=target.diameter_m, square_sigma_m=target.square_sigma_m)
-    assert same == target
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
 _ON_ONE_LINE = 1e-6
 
 # Fewer squares do not determine a pose robustly; more do not fit a printable board.
-_MIN_SQUARES, _MAX_SQUARES = 3, 100
+FEWEST_SQUARES, _MAX_SQUARES = 3, 100
 
 # One tag's four corners suffice. Kalibr's pages have tags of this family with borders of two
 # modules, and gaps of at most a tag's side.
@@ -192,8 +192,8 @@ def _described(table: DocumentTable, name: str) -> Target:
         return _rig(table, name)
     if kind == "circles":
         return _circles(table, name)
-    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
-    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    columns = table.integer("columns", FEWEST_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", FEWEST_SQUARES, _MAX_SQUARES)
     if kind == "charuco":
         _check_one_unit(table)
     square_m = _size(table, "square_m")
@@ -299,8 +299,8 @@ def _aprilgrid(table: DocumentTable, name: str) -> Target:
 
 
 def _circles(table: DocumentTable, name: str) -> Target:
-    columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
-    rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
+    columns = table.integer("columns", FEWEST_SQUARES, _MAX_SQUARES)
+    rows = table.integer("rows", FEWEST_SQUARES, _MAX_SQUARES)
     square_m = _size(table, "square_m")
     asymmetric = table.flag("asymmetric", default=False)
     diameter_m = table.number("diameter_m", positive=True)

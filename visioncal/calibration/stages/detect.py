@@ -30,9 +30,9 @@ from visioncal.session.kinds import name_of
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fitting_layouts
 from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
+from visioncal.vision.finders.checkerboard import miscounted
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, poor_image_reason
 from visioncal.vision.targets import corner_positions, point_numbers
 
@@ -182,11 +182,7 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
             return False
         if isinstance(find_target(image, target, quick=True), DetectedCorners):
             return False
-        seen = find_squares(image)
-        if seen is None or not seen.found or seen.cut:
-            if not _shows_markers_alone(image, target):
-                return False
-        elif {seen.columns, seen.rows} == {target.columns, target.rows}:
+        if miscounted(image, target) is None and not _shows_markers_alone(image, target):
             return False
     return bool(sample)
 

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ from visioncal.session import Session, View
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
-from visioncal.vision.finders.identify import Identity, identify
+from visioncal.vision.finders import DetectedCorners
+from visioncal.vision.finders.checkerboard import find_checkerboard, miscounted
+from visioncal.vision.finders.identify import DESCRIBE_IT, Identity, identify
 from visioncal.vision.finders.identify_text import SIDES, describe
 from visioncal.vision.finders.imaging import blur_of_edges, decode_image, poor_image_reason
 from visioncal.vision.targets import board_words, load_target, marker_cells, target_names
@@ -24,16 +27,12 @@ from visioncal.vision.targets import board_words, load_target, marker_cells, tar
 # Names that are listed, and images that are searched for any board.
 _LISTED, _LOOKED_AT = 6, 3
 # Properties of a board that an image shows, beside its markers' dictionary.
-_COMPARED = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
+_COMPARED = ("kind", "columns", "rows", "legacy", "marker_id")
 # Least share of a board's corners in an image that identifies it.
 _LEAST_CORNERS = 0.2
 _UNREAD, _MIRRORED = "unread_markers", "mirrored_images"
-# Blur (sigma) in modules up to which markers are read, and from which on they leave light squares
-# plain; and from which on dark squares look like circles with diameters of this share of their
-# spacing.
-_READ, _PLAIN, _ROUND, _WIDE = 0.4, 1.2, 0.9, 0.9
-# Largest blur of a lens in focus [px].
-_SHARP_PX = 1.2
+# Blur (sigma) up to which markers are read [modules], and the largest of a lens in focus [px].
+_READ, _SHARP_PX = 0.4, 1.2
 # Relative difference of square sizes by rounding.
 _SAME_SIZE = 0.01
 # Stands in a command for a size that has to be measured first.
@@ -208,84 +207,51 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         image = decode_image(session.images.read(view.image))
         if isinstance(image, str):
             continue
-        why = poor_image_reason(image, MAX_BLUR_PX)
-        if why:
-            unreadable = unreadable or _blurred_finding(view, why, existing)
-            continue
         identity = _identified(image, declared)
-        cause = _unread(view, image, identity, declared)
-        if cause is not None and (identity is not None or cause.kind == _MIRRORED):
-            return cause
-        unreadable = unreadable or cause
-        if identity is not None and (best is None or _is_better(identity, best[1])):
+        if identity is None:
+            why = poor_image_reason(image, MAX_BLUR_PX)
+            blurred = _blurred_finding(view, why, existing) if why else None
+            cause = blurred or _unread(view, image, declared)
+            if cause is not None and cause.kind == _MIRRORED:
+                return cause
+            unreadable = unreadable or cause
+        elif best is None or _is_better(identity, best[1]):
             best = view, identity
             if identity.whole and identity.corners_seen == identity.corners:
                 break
-    if best is None or (
-        unreadable and unreadable.kind == _UNREAD and _has_its_squares(best[1], declared)
-    ):
+    if best is None:
         return unreadable
     view, identity = best
     # A single tag of a grid or a rig identifies no board: the finder states what it lacks.
-    if declared.kind in ("aprilgrid", "points") and _is_its_tag(identity, declared):
+    is_own_tag = declared.kind in ("aprilgrid", "points") and _is_its_tag(identity, declared)
+    if is_own_tag or _matches(identity, declared):
         return None
-    return None if _matches(identity, declared) else _other_board_finding(view, identity, declared)
+    return _other_board_finding(view, identity, declared)
 
 
 def _identified(image: Image, declared: Target) -> Identity | None:
-    """The board of an image; None where few of its corners are seen, as where it is blurred."""
-    # A single marker is no evidence against a declared ChArUco board.
+    """The board of an image by its markers, or a checkerboard whose squares were miscounted.
+
+    None where few of its corners are seen, as where it is blurred.
+    """
     try:
         identity = identify(image)
     except DataError:
-        return None
+        board = miscounted(image, declared) if declared.kind == "checkerboard" else None
+        if board is None:
+            return None
+        corners = board.columns * board.rows
+        return Identity(board.kind, board.columns, board.rows, True, corners, corners)
+    # A single marker is no evidence against a declared ChArUco board.
     if declared.kind == "charuco" and _is_its_tag(identity, declared):
         return None
-    if identity.corners_seen >= _LEAST_CORNERS * identity.corners:
-        return identity
-    # The squares of a blurred board may be counted where its corners are not found one by one.
-    has_many = 2 * identity.corners > (declared.columns - 1) * (declared.rows - 1)
-    blurred = identity.is_filled and has_many and _lacks_markers(image, identity, declared)
-    return identity if blurred else None
+    return identity if identity.corners_seen >= _LEAST_CORNERS * identity.corners else None
 
 
 def _is_its_tag(identity: Identity, declared: Target) -> bool:
     """Whether a single marker is of the declared board's dictionary."""
     dictionaries = (identity.dictionary, *identity.larger)
     return identity.kind == "marker" and declared.dictionary in dictionaries
-
-
-def _has_its_squares(identity: Identity, declared: Target) -> bool:
-    """Whether a checkerboard has the squares of the declared ChArUco board."""
-    inner = {declared.columns - 1, declared.rows - 1}
-    is_pair = declared.kind == "charuco" and identity.kind == "checkerboard"
-    return is_pair and {identity.columns, identity.rows} == inner
-
-
-def _module_px(identity: Identity, declared: Target) -> float:
-    """Width of the modules of a declared ChArUco board's markers, by its squares [px]."""
-    modules = len(marker_cells(declared.dictionary, 0))
-    return identity.square_px * declared.marker_m / declared.square_m / modules
-
-
-def _lacks_markers(image: Image, identity: Identity, declared: Target) -> bool:
-    """Whether the squares of a declared ChArUco board are seen without its markers."""
-    if declared.kind != "charuco" or identity.kind not in ("checkerboard", "circles"):
-        return False
-    blur = blur_of_edges(image) / _module_px(identity, declared)
-    if identity.is_filled:
-        return blur > _READ or _has_its_squares(identity, declared)
-    if identity.kind == "circles":
-        return identity.asymmetric and identity.diameter_share > _WIDE and blur > _ROUND
-    return blur > _PLAIN and not _is_larger(identity, declared)
-
-
-def _is_larger(identity: Identity, declared: Target) -> bool:
-    """Whether a checkerboard has more squares along a side than a ChArUco board."""
-    squares, inner = (sorted((board.columns, board.rows)) for board in (identity, declared))
-    return any(
-        count > declared_count - 1 for count, declared_count in zip(squares, inner, strict=True)
-    )
 
 
 def _is_better(new: Identity, best: Identity) -> bool:
@@ -342,46 +308,54 @@ def _counting_mistake(identity: Identity, declared: Target) -> str:
     return ""
 
 
-def _unread(
-    view: View, image: Image, identity: Identity | None, declared: Target
-) -> Finding | None:
-    """Finding for an image without a readable board, or with its squares alone."""
-    if identity is not None and not _lacks_markers(image, identity, declared):
-        return None
+def _unread(view: View, image: Image, declared: Target) -> Finding | None:
+    """Finding for an image without a readable board, or with the declared one's squares alone."""
     mirrored = _identified(np.ascontiguousarray(image[:, ::-1]), declared)
     # Squares look alike mirrored: only readable markers show it.
     readable = ("charuco",) if declared.kind == "charuco" else ("charuco", "aprilgrid", "marker")
     if mirrored is not None and mirrored.kind in readable:
         return _mirrored_finding(view)
-    squares = identity or mirrored
-    if squares is None or not _lacks_markers(image, squares, declared):
+    if declared.kind != "charuco":
         return None
-    blur_px, module_px = blur_of_edges(image), _module_px(squares, declared)
-    if blur_px > max(_READ * module_px, _SHARP_PX):
-        return Finding(
-            _UNREAD,
-            f"The images are too blurred for the markers of {declared.name}: their edges have a "
-            f"blur (sigma) of {blur_px:.1f} px, and a marker's modules are {module_px:.1f} px wide "
-            f"(view {view.number}); up to {_READ * module_px:.1f} px are read.",
-            Remedy(
-                "Focus the lens, expose for a shorter time with more light, or bring the board "
-                "nearer; then record again."
-            ),
-            (view.number,),
-        )
-    marker_px = squares.square_px * declared.marker_m / declared.square_m
-    step = Remedy("Bring the board nearer, focus, or use a board of fewer and larger squares.")
-    if identity is not None:  # Where a few markers are read after all, it is no checkerboard.
-        step = Remedy(
-            f"{step.words} Where all of it is in the images, it serves as a checkerboard: write "
-            'target = "seen.toml" in session.toml, which this command makes.',
-            _describe_command(view, f"{1e3 * declared.square_m:g}"),
-        )
+    plain = replace(
+        declared, kind="checkerboard", columns=declared.columns - 1, rows=declared.rows - 1
+    )
+    squares = find_checkerboard(image, plain)
+    blur_px = blur_of_edges(image)
+    if isinstance(squares, DetectedCorners):
+        grid = squares.px.reshape(plain.rows, plain.columns, 2)
+        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+        marker_px = square_px * declared.marker_m / declared.square_m
+        module_px = marker_px / len(marker_cells(declared.dictionary, 0))
+        width = f"and a marker's modules are {module_px:.1f} px wide"
+        if blur_px <= max(_READ * module_px, _SHARP_PX):
+            return Finding(
+                _UNREAD,
+                f"The images show the squares of {declared.name}, but its markers cannot be read: "
+                f"they are {marker_px:.0f} px wide, {module_px:.1f} px a module (view "
+                f"{view.number}).",
+                Remedy(
+                    "Bring the board nearer, focus, or use a board of fewer and larger squares. "
+                    "Where all of it is in the images, it serves as a checkerboard: in board.toml "
+                    f'write kind = "checkerboard", columns = {plain.columns}, rows = {plain.rows}, '
+                    f"square_m = {declared.square_m:g}, and in session.toml target = "
+                    '"board.toml".'
+                ),
+                (view.number,),
+            )
+    elif blur_px > _SHARP_PX:
+        width = f"and markers are read where their modules are {blur_px / _READ:.1f} px or wider"
+    else:
+        return None
     return Finding(
         _UNREAD,
-        f"The images show the squares of {declared.name}, but its markers cannot be read: they are "
-        f"{marker_px:.0f} px wide, {module_px:.1f} px a module (view {view.number}).",
-        step,
+        f"The images are too blurred for the markers of {declared.name}: their edges have a blur "
+        f"(sigma) of {blur_px:.1f} px, {width} (view {view.number}).",
+        Remedy(
+            "Focus the lens, expose for a shorter time with more light, or bring the board nearer; "
+            "then record again."
+            + ("" if isinstance(squares, DetectedCorners) else f" {DESCRIBE_IT}")
+        ),
         (view.number,),
     )
 

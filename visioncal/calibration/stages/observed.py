@@ -22,6 +22,7 @@ from visioncal.session import Session
 from visioncal.session.document import CameraTable
 from visioncal.session.images import FolderImages
 from visioncal.vision.dense import DenseCorners
+from visioncal.vision.finders.identify import DESCRIBE_IT
 
 # Views of one reason that are listed.
 _LISTED = 40
@@ -229,7 +230,7 @@ def nothing_seen(observed: Observed) -> DataError:
     return DataError(
         f"session {observed.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
-        f"declares?{_identify_command(observed)}",
+        f"declares?{_identify_command(observed)} {DESCRIBE_IT}",
     )
 
 

@@ -1,10 +1,13 @@
 """Detection of checkerboards."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.result import DetectedCorners, NotFound
+from visioncal.vision.targets import FEWEST_SQUARES
 
 # OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
@@ -46,6 +49,20 @@ def find_checkerboard(
     return NotFound(
         f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
     )
+
+
+def miscounted(image: Image, target: Target) -> Target | None:
+    """The board of one row and column less or more than stated, where a quick search finds it.
+
+    Squares are easily counted in the place of inner corners.
+    """
+    for more in (-1, 1):
+        other = replace(target, columns=target.columns + more, rows=target.rows + more)
+        if min(other.columns, other.rows) >= FEWEST_SQUARES and isinstance(
+            find_checkerboard(image, other, quick=True), DetectedCorners
+        ):
+            return other
+    return None
 
 
 def _is_checkered(image: Image, grid: FloatArray) -> bool:

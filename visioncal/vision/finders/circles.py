@@ -55,9 +55,10 @@ class Circles:
 def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Centres of a grid of circles in a (h, w) grey image, to about a pixel, or why there are none.
 
-    For a symmetric grid, the numbering with the least rotation in the image is used.
+    Circles are dark on light or, where no such grid is seen, light on dark. For a symmetric grid,
+    the numbering with the least rotation in the image is used.
     """
-    seen = seen_grids(image)
+    seen = _seen_grids(image) or _seen_grids(255 - image)
     for circles in seen:
         if (circles.columns, circles.rows, circles.asymmetric) == (
             target.columns,
@@ -88,17 +89,11 @@ def _article(asymmetric: bool) -> str:
     return "an asymmetric" if asymmetric else "a symmetric"
 
 
-def seen_grids(image: Image) -> tuple[Circles, ...]:
-    """A grid of circles in a (h, w) grey image, in each order that forms a grid, or nothing.
-
-    Circles are dark on light or, where no such grid is seen, light on dark. The least rotated order
-    comes first.
-    """
-    return _seen_grids(image) or _seen_grids(255 - image)
-
-
 def _seen_grids(image: Image) -> tuple[Circles, ...]:
-    """The orders of a grid of dark circles."""
+    """A grid of dark circles in a (h, w) grey image, in each order that forms a grid, or nothing.
+
+    The least rotated order comes first.
+    """
     blobs = _blobs(image)
     if len(blobs.px) < _LEAST:
         return ()

@@ -12,7 +12,6 @@ from visioncal.vision.targets import board_words, target_document
 SIDES: Mapping[TargetKind, str] = {
     "charuco": "side of a square",
     "checkerboard": "side of a square",
-    "circles": "distance of neighbouring rows",
     "aprilgrid": "side of a tag",
     "marker": "side of the dark square",
 }
@@ -46,11 +45,6 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
         }
     if identity.kind == "aprilgrid":
         document |= {"spacing": identity.spacing, "border": identity.border}
-    if identity.kind == "circles":
-        document |= {
-            "asymmetric": identity.asymmetric,
-            "diameter_over_distance": identity.diameter_share,
-        }
     if square_m is not None:
         document["target"] = target_document(identity.target("board", square_m))
     return document
@@ -74,13 +68,13 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
         )
     # An unknown size is arbitrary here: its lines are replaced below.
     document = target_document(identity.target("board", 1.0 if square_m is None else square_m))
-    sized = {size, "square_sigma_m", "marker_m", "diameter_m"}
+    sized = {size, "square_sigma_m", "marker_m"}
     for key, value in document.items():
         if key not in sized or square_m is not None:
             lines.append(f"{key} = {_literal(value)}{_remark(identity, key)}")
         elif key == size:
             lines.append(f"# {size} =  # the {what} [m], {where}")
-        elif key in ("marker_m", "diameter_m"):
+        elif key == "marker_m":
             lines.append(f"# {key} ={_remark(identity, key)}")
     return "\n".join(lines) + "\n"
 
@@ -91,7 +85,6 @@ def describe(identity: Identity) -> str:
     if identity.kind == "marker":
         return words
     more = {
-        "circles": f"diameter of {identity.diameter_share:.2f} of their rows' distance",
         "aprilgrid": f"{identity.spacing:g} of a tag apart",
         "charuco": f"markers of {identity.marker_share:.3f} of a square",
     }
@@ -103,8 +96,6 @@ def describe(identity: Identity) -> str:
 def _remark(identity: Identity, key: str) -> str:
     if key == "square_sigma_m":
         return "  # 0.1 %, as printers keep their size: replace it by how well you measured"
-    if key == "diameter_m":
-        return f"  # {identity.diameter_share:.2f} of square_m, by the image"
     if key != "marker_m":
         return ""
     share, sigma = identity.marker_share, identity.marker_share_sigma
