@@ -18,21 +18,18 @@ from support.killed import kill_and_resume
 from support.planned import true_cell
 
 from visioncal.core.errors import VisioncalError
-from visioncal.live.capture.core import CaptureEvent, Watcher
-from visioncal.live.capture.facts import CaptureFacts
+from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import Journal
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.record import record
+from visioncal.live.capture.recording import CaptureEvent, Watcher, record
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.simulated.arm import ControllerOptions
-from visioncal.live.simulated.camera import SimulatedCamera
-from visioncal.live.simulated.controller import SimulatedController, spawn
+from visioncal.live.simulated.cell import SimulatedCamera
+from visioncal.live.simulated.controller import ControllerOptions, SimulatedController, spawn
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.arms import ArmErrors
@@ -44,7 +41,7 @@ STOPS, KILLS = few((30, 20), (3, 1))
 CONTROLLER = ControllerOptions(errors=ArmErrors())
 CELL = CellOptions(robot="ur10e", views=1)
 TAKING = CaptureOptions(speed=1.0, acceleration=1.5)
-FAULTS = ("die", "freeze", "protective-stop", "emergency-stop", "local-control", "power-off")
+FAULTS = ("link-lost", "silent", "protective-stop", "emergency-stop", "remote-off", "power-off")
 # A fault comes so long after the first view, on the way to the second [s].
 ON_THE_WAY_S = 1.5
 
@@ -91,7 +88,7 @@ def live_cell() -> Iterator[tuple[LiveCell, SimulatedCamera, SimulatedController
     """A simulated cell at work: its devices, and its controller."""
     with spawn(CONTROLLER) as controller, closing(UrArm(controller.host)) as arm:
         camera = SimulatedCamera(simulate(CELL), lambda at: controller.state(at.tolist()).q)
-        yield LiveCell(arm, camera), camera, controller
+        yield LiveCell(arm, (camera,)), camera, controller
 
 
 def planned(stops: int) -> PlanFile:
@@ -121,7 +118,7 @@ def recorded(live: LiveCell, plan: PlanFile, folder: Path, watcher: Watcher) -> 
         plan.digest,
     )
     journal = Journal.begin(folder, facts, live.clock.unix_offset_s(), len(plan.stops))
-    return record(live, plan, journal, TAKING, Consent(None), [watcher], lens=camera.factory)
+    return record(live, plan, journal, TAKING, Consent(None), [watcher])
 
 
 def times_of_views(folder: Path) -> str:
@@ -131,9 +128,9 @@ def times_of_views(folder: Path) -> str:
         compared, begun = Compared(truth), time.perf_counter()
         steps = recorded(live, plan, folder / "views", compared)
         took_s = time.perf_counter() - begun
-    worked = np.array([step.times.worked_s for step in steps])
-    moved_s = sum(step.times.moved_s for step in steps)
-    settled_s = sum(step.times.settled_s for step in steps)
+    worked = np.array([step.worked_s for step in steps])
+    moved_s = sum(step.moved_s for step in steps)
+    settled_s = sum(step.settled_s for step in steps)
     rest_s = (took_s - moved_s - settled_s) / len(steps)
     repeats = CONTROLLER.repeatability_rad
     return (

@@ -25,8 +25,7 @@ from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.cell import Limits, cell_of_calibration, touching_model
-from visioncal.live.simulated.arm import ControllerOptions
-from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.controller import ControllerOptions, spawn
 from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
 from visioncal.session import Session

@@ -11,13 +11,12 @@ from support.recorded import QUICK, REPEATABILITY_M, errors_m, recorded
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
-from visioncal.live.capture.core import missed_stops
-from visioncal.live.capture.drive import JointPace
-from visioncal.live.capture.joint_pose_check import JointPoseCheck
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.assessment import JointPoseCheck
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.gate import JointPace
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.record import CheckedPaths, motion_summary
-from visioncal.live.capture.still import image_motion_px
+from visioncal.live.capture.recording import checked_path, missed_stops, motion_summary
+from visioncal.live.capture.take import image_motion_px
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
@@ -71,7 +70,7 @@ def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     assert len(session.views) == len(plan.stops)
     # It trembles by a millimetre and more at first, and the views waited for its end.
     assert max(errors_m(session, camera)) < REPEATABILITY_M
-    assert all(step.times.settled_s > 0.8 for step in steps)
+    assert all(step.settled_s > 0.8 for step in steps)
 
 
 def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):
@@ -169,7 +168,7 @@ def test_a_board_that_is_lost_once_is_told_and_three_times_ends(plan, tmp_path):
     # The first move goes to the first stop.
     camera.hidden_at = (2,)
     steps = recorded(tmp_path / "once", plan, arm, camera)
-    lost = dict(missed_stops(steps))
+    lost = missed_stops(steps)
     assert list(lost) == [2]
     assert "uniform" in lost[2]
     assert len(Session.load(tmp_path / "once").views) == len(plan.stops) - 1
@@ -200,7 +199,7 @@ def test_stale_joint_angles_are_no_view(plan, tmp_path):
 
     camera.frame = stale_views
     steps = recorded(tmp_path / "live", plan, arm, camera)
-    lost = dict(missed_stops(steps))
+    lost = missed_stops(steps)
     assert list(lost) == [3]
     assert "joint" in lost[3]
 
@@ -248,17 +247,16 @@ def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):
 
 
 def test_ways_from_elsewhere_are_looked_at(plan):
-    ways = CheckedPaths(plan)
     first, second = plan.stops[:2]
-    assert len(ways.to(first, first.q)) == 1
-    assert np.array_equal(ways.to(second, first.q)[-1], second.q)
+    assert len(checked_path(plan, first, first.q)) == 1
+    assert np.array_equal(checked_path(plan, second, first.q)[-1], second.q)
     # A box where the goal's flange is lets no way lead there.
     far = next(stop for stop in plan.stops if np.abs(stop.q - first.q).max() > 0.5)
     flange = plan.cell.robot.base_from_flange(far.q[None])[0]
     box = Box("post", compose(np.eye(3), flange[:3, 3]), np.full(3, 0.02))
     walled = replace(plan, cell=replace(plan.cell, boxes=(box,)))
     with pytest.raises(DataError, match=r"no clear way leads there .*post"):
-        CheckedPaths(walled).to(far, first.q + 0.1)
+        checked_path(walled, far, first.q + 0.1)
 
 
 def test_a_plan_for_another_arm_is_not_driven(plan):
@@ -268,7 +266,7 @@ def test_a_plan_for_another_arm_is_not_driven(plan):
     state, offset = moved.state, compose(np.eye(3), np.array([0.3, 0.0, 0.0]))
     moved.state = lambda: replace(said := state(), base_from_flange=offset @ said.base_from_flange)
     with pytest.raises(DataError, match=r"its flange is 300 mm and 0 deg from where the model"):
-        motion_summary(LiveCell(moved, camera, arm.clock), plan, (), QUICK)
+        motion_summary(LiveCell(moved, (camera,), arm.clock), plan, (), QUICK)
 
 
 def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():

@@ -7,12 +7,10 @@ from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of
 
 from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.types import Corners
-from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, CaptureEvent
-from visioncal.live.capture.follow import ask_and_take, follow
-from visioncal.live.capture.joint_pose_check import JointPoseCheck
+from visioncal.live.capture.assessment import Coach
+from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.journal import Journal
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.recording import Capture, CaptureEvent, ask_and_take, follow
 from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
@@ -125,12 +123,6 @@ def test_typed_poses_make_a_session(plan, tmp_path):
 
 def _capture(folder, plan: PlanFile, arm: FakeArm, camera: FakeCamera) -> Capture:
     journal = Journal.begin(folder, facts_of(plan, arm, camera), arm.clock.unix_offset_s(), 0)
-    return Capture(
-        LiveCell(arm, camera, arm.clock),
-        plan.cell.target,
-        journal,
-        QUICK,
-        JointPoseCheck(plan.cell.robot),
-        Coach(plan.cell.target, camera.resolution, camera.lens),
-        None,
-    )
+    cell = LiveCell(arm, (camera,), arm.clock)
+    planned = plan.cell
+    return Capture(cell, planned.target, planned.robot, camera.lens, journal, QUICK, None)

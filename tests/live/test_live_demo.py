@@ -8,7 +8,7 @@ from support.commands import visioncal
 
 from visioncal.cli import demo
 from visioncal.core.transforms import exp, invert, pose_difference
-from visioncal.live.simulated.cell import GUESS_M, GUESS_RAD, live_simulation
+from visioncal.live.simulated.cell import GUESS_M, GUESS_RAD, Bench
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import read_truth
@@ -67,7 +67,7 @@ def test_a_fault_without_a_robot_is_refused(tmp_path):
 
 
 def test_the_cell_is_guessed_as_roughly_as_is_said():
-    cell, again = live_simulation(5), live_simulation(5)
+    cell, again = Bench(5), Bench(5)
     for guess, true, same in zip(
         (cell.known.x, cell.known.z),
         cell.truth.transforms.values(),

@@ -6,7 +6,7 @@ from support.live_cell import FakeClock
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers.protocols import CameraDevice
-from visioncal.live.simulated.camera import SimulatedCamera
+from visioncal.live.simulated.cell import SimulatedCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.live import LiveView
 from visioncal.vision.finders.charuco import find_charuco

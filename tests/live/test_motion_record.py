@@ -10,8 +10,7 @@ from visioncal.core.errors import DriverError
 from visioncal.live.capture import motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.protocols import JointSample
-from visioncal.live.simulated.arm import ControllerOptions
-from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.controller import ControllerOptions, spawn
 from visioncal.session import Session
 
 RATE_HZ = 100.0

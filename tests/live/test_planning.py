@@ -13,9 +13,8 @@ from visioncal.core.transforms import exp
 from visioncal.estimation.linalg import covariance_root
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.design import choose_stops, shortfall
+from visioncal.live.planning.design import Wish, choose_stops, shortfall
 from visioncal.live.planning.information import predict_worlds, stop_factors
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of

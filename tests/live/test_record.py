@@ -24,7 +24,7 @@ from support.recorded import REPEATABILITY_M
 from visioncal.cli import recorded_cell
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
-from visioncal.live.capture.live import HostClock
+from visioncal.live.capture.cell import HostClock
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.live.planning.purposes import purpose_of

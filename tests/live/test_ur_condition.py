@@ -11,8 +11,7 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.drivers.ur_net import check_states_come, connect, read_tool_offset, resolve
 from visioncal.live.drivers.ur_status import read_condition
-from visioncal.live.simulated.arm import ControllerOptions
-from visioncal.live.simulated.controller import free_host, spawn
+from visioncal.live.simulated.controller import ControllerOptions, free_host, spawn
 
 OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
 
@@ -36,7 +35,7 @@ def test_a_healthy_controller_passes_every_check(controller):
 FAULTS = [
     ("protective-stop", "PROTECTIVE_STOP.*Enable Robot"),
     ("emergency-stop", "EMERGENCY_STOP.*pull out the emergency-stop button"),
-    ("local-control", "local control.*Remote Control at the upper right"),
+    ("remote-off", "local control.*Remote Control at the upper right"),
     ("power-off", "mode is POWER_OFF.*circle at the lower left"),
 ]
 
@@ -48,35 +47,19 @@ def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fa
         with pytest.raises(DriverError, match=message):
             read_condition(controller.host).check_moves()
     finally:
-        controller.inject("release")
-        controller.inject("remote-control")
+        controller.inject("none")
     read_condition(controller.host).check_moves()
 
 
 def test_a_frozen_controller_is_said_to_be_silent(controller):
-    controller.inject("freeze")
+    controller.inject("silent")
     try:
         with pytest.raises(DriverError, match="does not answer: timed out"):
             read_condition(controller.host)
         with pytest.raises(DriverError, match="sends no states"):
             check_states_come(controller.host)
     finally:
-        controller.inject("thaw")
-
-
-@pytest.mark.parametrize(
-    ("banner", "message"),
-    [
-        ("URSoftware 1.8.16941", "answers 'URSoftware 1.8.16941'.*four numbers"),
-        ("URSoftware 3.2.0.1000", "has PolyScope 3.2.0; ur-rtde needs 3.4"),
-        ("URSoftware 10.7.0.1000", "has PolyScope 10.7.0"),
-    ],
-)
-def test_an_unfit_version_is_told(banner, message):
-    with spawn(ControllerOptions(polyscope=banner)) as old:
-        with pytest.raises(DriverError, match=message) as refusal:
-            read_condition(old.host)
-        assert refusal.value.next_step
+        controller.inject("none")
 
 
 @contextmanager
@@ -99,6 +82,24 @@ def listening(host, port, greeting):
         yield
         server.shutdown(socket.SHUT_RDWR)
         thread.join()
+
+
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [
+        ("URSoftware 1.8.16941", "answers 'URSoftware 1.8.16941'.*four numbers"),
+        ("URSoftware 3.2.0.1000", "has PolyScope 3.2.0; ur-rtde needs 3.4"),
+        ("URSoftware 10.7.0.1000", "has PolyScope 10.7.0"),
+    ],
+)
+def test_an_unfit_version_is_told(version, message):
+    host, banner = free_host(), "Connected: Universal Robots Dashboard Server"
+    with (
+        listening(host, 29999, f"{banner}\n{version}\n".encode()),
+        pytest.raises(DriverError, match=message) as refusal,
+    ):
+        read_condition(host)
+    assert refusal.value.next_step
 
 
 def test_another_service_at_the_port_is_no_controller():

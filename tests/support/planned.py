@@ -10,9 +10,8 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.problem_parts import Noise
-from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.design import Design, choose_stops
+from visioncal.live.planning.design import Design, Wish, choose_stops
 from visioncal.live.planning.information import WORLDS, predict_worlds
 from visioncal.live.planning.plan import stop_contributions
 from visioncal.live.planning.purposes import Purpose

@@ -6,13 +6,11 @@ from pathlib import Path
 import numpy as np
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
-from visioncal.live.capture.core import CaptureEvent, Watcher
-from visioncal.live.capture.facts import CaptureFacts
+from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import Journal
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.record import record
+from visioncal.live.capture.recording import CaptureEvent, Watcher, record
 from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
@@ -53,7 +51,7 @@ def recorded(
     begin = Journal.resume if resume else Journal.begin
     facts = facts_of(plan, arm, camera)
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
-    cell = LiveCell(arm, camera, arm.clock)
+    cell = LiveCell(arm, (camera,), arm.clock)
     return record(cell, plan, journal, options, Consent(None), watchers)
 
 

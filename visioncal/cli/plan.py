@@ -97,7 +97,7 @@ def _begin(
 
 
 def _report(plan: "Plan") -> None:
-    from visioncal.live.planning.messages import accuracy_words, looks_note, need_words, summary_of
+    from visioncal.live.planning.messages import looks_note, need_words, summary_of
 
     console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
@@ -116,7 +116,7 @@ def _report(plan: "Plan") -> None:
     elif note := looks_note(plan):
         console.print(escape(note))
     if plan.design.met:
-        after = accuracy_words(plan.design.predicted)
+        after = plan.design.predicted.words
         console.print(escape(f"that meets the wish, with {len(plan.stops)} stops: {after}"))
     if plan.need is not None and plan.need.met:
         console.print(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")

@@ -80,7 +80,7 @@ class PlanOptions:
         import numpy as np
 
         from visioncal.core.types import Need
-        from visioncal.live.planning.accuracy import Wish
+        from visioncal.live.planning.design import Wish
         from visioncal.live.planning.plan import PlanRequest
 
         purpose = purpose_of(self.purpose, "--for")

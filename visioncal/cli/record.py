@@ -86,7 +86,7 @@ def record_command(
     from visioncal.live.capture.devices import ArmSetup, is_folder
     from visioncal.live.capture.gate import Consent
     from visioncal.live.capture.journal import Journal
-    from visioncal.live.capture.record import motion_summary
+    from visioncal.live.capture.recording import motion_summary
 
     scene = scene_of(plan, described)
     drives = not follow and arm.partition(":")[0] != "manual"

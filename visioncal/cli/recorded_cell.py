@@ -16,25 +16,23 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import target_named
-from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import (
+from visioncal.live.capture.assessment import RecordedAccuracy
+from visioncal.live.capture.cell import HostClock, LiveCell
+from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
+from visioncal.live.capture.gate import Consent
+from visioncal.live.capture.journal import CaptureFacts, Journal
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.recording import (
     Capture,
     CaptureEvent,
+    MotionSummary,
     Watcher,
-    line_of,
+    ask_and_take,
+    follow,
     missed_stops,
-    note_of,
+    motion_summary,
+    record,
 )
-from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
-from visioncal.live.capture.facts import CaptureFacts
-from visioncal.live.capture.follow import ask_and_take, follow
-from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.joint_pose_check import JointPoseCheck
-from visioncal.live.capture.journal import Journal
-from visioncal.live.capture.live import HostClock, LiveCell
-from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.predict import RecordedAccuracy
-from visioncal.live.capture.record import MotionSummary, motion_summary, record
 from visioncal.live.capture.take import Missed
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
 from visioncal.live.planning.plan_file import PlanFile, read_plan
@@ -67,7 +65,7 @@ class Shown:
                 outcome.state.base_from_flange,
                 outcome.state.q,
                 sigma_mm,
-                note_of(step),
+                step.note,
             )
         )
 
@@ -198,17 +196,10 @@ def record_guided(
     """
     prediction = RecordedAccuracy(journal.folder)
     lens = cell.camera.factory or scene.lens
-    capture = Capture(
-        cell,
-        scene.target,
-        journal,
-        taking,
-        JointPoseCheck(scene.robot),
-        Coach(scene.target, cell.camera.resolution, lens),
-        prediction,
-        watchers,
-    )
     try:
+        capture = Capture(
+            *(cell, scene.target, scene.robot, lens, journal, taking, prediction.after, watchers)
+        )
         if not isinstance(cell.arm, MovingArm):
             if ask is None:
                 say("Poses are read from stdin, one a line, and no question is asked; q ends.")
@@ -262,7 +253,7 @@ def opened(arm: str, wish: ArmSetup, camera: str, requested: DeviceSetup) -> Ite
                 next_step="Guide it by hand: --follow.",
             )
         with closing(open_camera(camera, requested)) as device:
-            yield LiveCell(opened, device, HostClock())
+            yield LiveCell(opened, (device,), HostClock())
 
 
 class ViewLines:
@@ -270,7 +261,7 @@ class ViewLines:
 
     def stepped(self, step: CaptureEvent) -> None:
         """Prints the line."""
-        say(line_of(step))
+        say(step.line)
 
 
 def record_driven(
@@ -286,7 +277,7 @@ def record_driven(
     report_departure(leaving, cell, taking)
     if not leaving.stops:
         return []
-    return record(cell, scene.planned, journal, taking, consent, watchers, lens=cell.camera.factory)
+    return record(cell, scene.planned, journal, taking, consent, watchers)
 
 
 def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
@@ -318,7 +309,7 @@ def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOpti
 
 def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
-    missing = dict(missed_stops(steps))
+    missing = missed_stops(steps)
     if missing:
         words = "; ".join(f"view {key}: {reason}" for key, reason in missing.items())
         raise DataError(
@@ -350,7 +341,9 @@ def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
         "times_s": [
             {
                 "view": step.view,
-                **{name: round(value, 3) for name, value in vars(step.times).items()},
+                "moved_s": round(step.moved_s, 3),
+                "settled_s": round(step.settled_s, 3),
+                "worked_s": round(step.worked_s, 3),
             }
             for step in steps
         ],

@@ -1,8 +1,9 @@
 """The gate that every command passes before it moves an arm: limits, collisions, consent."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -10,17 +11,50 @@ import numpy as np
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.drive import JointPace, drive
-from visioncal.live.capture.live import LiveArm
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.path import order_stops
 from visioncal.robot import Robot
 from visioncal.robot.collision import Collisions
 
+# Polling interval of the arm while it moves [s].
+_POLL_S = 0.02
+# Polling interval of camera and disk [s]: a failure is noticed within a second.
+_GLANCE_S = 0.3
+# A motion has failed after this factor times its expected duration plus this [s].
+_DURATION_FACTOR, _DURATION_EXTRA_S = 1.5, 3.0
+# Largest joint error at the end of a motion [rad]; an arm that was stopped nearer to its goal gives
+# as good a view.
+_ARRIVED_RAD = 2e-2
 # Greatest flange difference between a nominal model and its own arm; beyond, the paths were checked
 # for another arm or another base.
 _SAME_ARM_MM = 50.0
+
+
+@dataclass(frozen=True)
+class JointPace:
+    """Speed of a synchronised joint motion, led by the joint that travels farthest."""
+
+    speed: float  # Speed of that joint [rad/s].
+    acceleration: float  # Its acceleration [rad/s^2].
+
+    @classmethod
+    def of(cls, options: CaptureOptions) -> "JointPace":
+        """The pace of a recording."""
+        return cls(options.speed, options.acceleration)
+
+    def travel_s(self, start: FloatArray, end: FloatArray) -> float:
+        """Duration of a motion with a trapezoidal or triangular speed profile [s]."""
+        distance = float(np.abs(np.asarray(end) - start).max(initial=0.0))
+        if distance * self.acceleration < self.speed**2:
+            return float(2.0 * np.sqrt(distance / self.acceleration))
+        return distance / self.speed + self.speed / self.acceleration
+
+    def path_duration_s(self, postures: Iterable[FloatArray]) -> float:
+        """Duration of a path from posture to posture [s]."""
+        return sum(self.travel_s(start, end) for start, end in pairwise(postures))
 
 
 @dataclass(eq=False)
@@ -76,7 +110,7 @@ class Consent:
 class Gate:
     """The one way by which a command moves an arm."""
 
-    live: LiveArm
+    live: LiveCell
     robot: Robot  # The arm's model, as in its controller.
     consent: Consent
     pace: JointPace
@@ -84,7 +118,10 @@ class Gate:
     def move(
         self, postures: Sequence[FloatArray], motion: str, look: Callable[[], None] = lambda: None
     ) -> float:
-        """Drives through checked postures (n,) [rad], with consent; see `drive`.
+        """Drives through checked postures (n,) [rad], with consent, until it is at the last.
+
+        The arm's state is monitored throughout. An exception leaves the arm moving;
+        `LiveCell.halting` around it stops it.
 
         Args:
             postures: The postures, as from `clear_path`.
@@ -96,23 +133,62 @@ class Gate:
 
         Raises:
             DataError: There is no consent, or a posture is beyond the joints' limits.
-            DriverError: As from `drive`.
+            DriverError: The arm cannot be driven, was stopped, its connection is lost, it takes too
+                long, or it did not reach its goal.
+            VisioncalError: From `look`.
         """
+        live, name = self.live, self.live.arm.name
         for posture in postures:
             check_limits(self.robot, posture)
-        self.consent.to(f"{self.live.arm.name} will move {motion}")
-        if not isinstance(self.live.arm, MovingArm):
+        self.consent.to(f"{name} will move {motion}")
+        if not isinstance(live.arm, MovingArm):
             raise DriverError(
-                f"{self.live.arm.name} cannot be driven.",
-                culprits=[self.live.arm.name],
-                next_step="Guide it by hand.",
+                f"{name} cannot be driven.", culprits=[name], next_step="Guide it by hand."
             )
-        start = self.live.clock.now()
-        drive(self.live, self.live.arm, postures, self.pace, look=look)
-        return self.live.clock.now() - start
+        start = live.clock.now()
+        for goal in postures:
+            expected_s = self.pace.travel_s(live.joints(), goal)
+            live.arm.start_move(goal, speed=self.pace.speed, acceleration=self.pace.acceleration)
+            self._wait(live.arm, expected_s, look)
+            off_rad = np.abs(live.joints() - goal)
+            if off_rad.max() > _ARRIVED_RAD:
+                joint = int(off_rad.argmax())
+                raise DriverError(
+                    f"{name}: the motion ended {np.rad2deg(off_rad[joint]):.1f} deg before its "
+                    f"goal in joint {joint + 1}; within {np.rad2deg(_ARRIVED_RAD):.1f} deg is "
+                    "needed.",
+                    culprits=[name],
+                    next_step="Was it stopped on the pendant? Start it again there, and go on with "
+                    "--resume.",
+                )
+        return live.clock.now() - start
+
+    def _wait(self, arm: MovingArm, expected_s: float, look: Callable[[], None]) -> None:
+        """Waits until a started arm has stopped, which it should after the expected time [s]."""
+        clock = self.live.clock
+        start = last_look = clock.now()
+        while True:
+            # The time is read before the state: during a stall of this computer or a slow picture
+            # the arm moves on by itself, so that only a newer state can show that it is late.
+            elapsed_s = clock.now() - start
+            self.live.state()
+            if not arm.moving():
+                return
+            if elapsed_s > _DURATION_FACTOR * expected_s + _DURATION_EXTRA_S:
+                raise DriverError(
+                    f"{arm.name}: still moving after {elapsed_s:.1f} s, where {expected_s:.1f} s "
+                    "were expected.",
+                    culprits=[arm.name],
+                    next_step="Check the speed slider on the pendant, and whether somebody holds "
+                    "the arm.",
+                )
+            if clock.now() - last_look > _GLANCE_S:
+                look()
+                last_look = clock.now()
+            clock.sleep(_POLL_S)
 
 
-def check_same_arm(live: LiveArm, robot: Robot, q: FloatArray) -> None:
+def check_same_arm(live: LiveCell, robot: Robot, q: FloatArray) -> None:
     """Checks that an arm at joint angles (n,) is the one whose paths were checked, in that base.
 
     Raises:

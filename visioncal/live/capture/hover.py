@@ -10,9 +10,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.touch_test import TouchTargets
-from visioncal.live.capture.drive import JointPace, joints_of
-from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_path
-from visioncal.live.capture.live import HostClock, LiveArm
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.gate import Consent, Gate, JointPace, check_same_arm, clear_path
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.planning.cell import Limits, PlanCell, cell_of_calibration, touching_model
 from visioncal.results import Calibration
@@ -61,7 +60,7 @@ class Hovering:
         # The controller's own model, for which the targets are.
         limits = Limits(clearance_m=min(Limits.clearance_m, _KEPT * height_m))
         cell = replace(cell_of_calibration(calibration, board, limits), robot=calibration.robot)
-        gate = Gate(LiveArm(arm, HostClock()), cell.robot, consent, _PACE)
+        gate = Gate(LiveCell(arm), cell.robot, consent, _PACE)
         return cls(gate, cell, targets, height_m)
 
     def bring(self, base_from_flange: FloatArray, name: str) -> None:
@@ -75,7 +74,7 @@ class Hovering:
             DriverError: The arm is stopped or lost, or does not arrive.
         """
         live, robot = self.gate.live, self.cell.robot
-        start = joints_of(live)
+        start = live.joints()
         check_same_arm(live, robot, start)
         path = [*self._path(start, base_from_flange, name)]
         self._check(np.array([start, *path]))

@@ -1,33 +1,141 @@
-"""Storage of views on disk: each is complete and flushed before the next one is taken."""
+"""Storage of a recording on disk: each view is complete and flushed before the next is taken."""
 
 import errno
 import json
 import shutil
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import flush_folder, named_errors, read_bytes, read_toml, write_atomically
 from visioncal.core.temporary_files import remove_abandoned
+from visioncal.core.types import Camera, Mount, Target
 from visioncal.core.version import __version__
-from visioncal.live.capture.facts import CaptureFacts, view_of
 from visioncal.live.capture.take import TakenView
+from visioncal.live.drivers.protocols import ArmState
+from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import Session, View
+from visioncal.session.columns import pose_row
 from visioncal.session.table import write_csv
+from visioncal.vision.targets import load_target, target_document, target_names
 
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
-_IMAGES, _TABLE = "images", "views.csv"
+_IMAGES, _TABLE, _TARGET_FILE = "images", "views.csv", "target.toml"
 # Low compression: noise hardly compresses, and speed matters more.
 _PNG_EFFORT = 1
 # Reserve for tables, folders and the disk's own use.
 _SPARE_BYTES = 256_000
 # Length of a digest, which messages shorten.
 _DIGEST = 64
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureFacts:
+    """Facts of a recording that are the same for all views."""
+
+    name: str
+    mount: Mount
+    target: Target
+    robot: Robot | None  # The arm's model; None where it is not known.
+    arm: str  # The name that the arm reports.
+    camera: str  # The name that the camera reports.
+    resolution: tuple[int, int]  # (width, height) of its pictures [px].
+    lens: Camera | None  # Intrinsics that it reports, to be refined; None to have them estimated.
+    settings: Mapping[str, str | float]
+    plan: str  # Digest of the plan that is driven; empty for none.
+
+    def texts(self) -> dict[str, str]:
+        """Files of the session besides its views, by name; session.toml is the last."""
+        texts: dict[str, str] = {}
+        target, robot, lens = self.target, self.robot, self.lens
+        document: dict[str, Any] = {"schema": 1, "name": self.name, "mount": self.mount}
+        # Boards and arms that come with visioncal are named.
+        document["target"] = target.name
+        if target.name not in target_names() or load_target(target.name) != target:
+            document["target"] = _TARGET_FILE
+            texts[_TARGET_FILE] = tomli_w.dumps(target_document(target))
+        camera = {"name": self.camera, "resolution": list(self.resolution)}
+        if lens is not None:
+            camera |= {"model": lens.model, "matrix": lens.matrix.tolist()}
+            camera["distortion"] = lens.distortion.tolist()
+        document["camera"] = camera
+        if robot is not None:
+            shipped = (name for name in robot_names() if _is_shipped(robot, name))
+            model = next(shipped, "")
+            if not model:
+                named = "robot.json" if "kind" in robot.document else ""
+                model, text = robot_file(robot.document, named)
+                texts[model] = text
+            document["robot"] = {"model": model, "tip": robot.tip}
+        texts["session.toml"] = tomli_w.dumps(document)
+        return texts
+
+    def provenance(self) -> dict[str, Any]:
+        """Facts that a resumed recording must share with its beginning."""
+        return {
+            "arm": self.arm,
+            "camera": self.camera,
+            "resolution": list(self.resolution),
+            "mount": self.mount,
+            "target": target_document(self.target),
+            "robot": "" if self.robot is None else self.robot.name,
+            "plan": self.plan,
+        }
+
+    def view_of(self, number: int, image: str, taken: TakenView, unix_offset_s: float) -> View:
+        """Builds the row of views.csv for a view; the offset is from monotonic to UNIX time [s]."""
+        state, frame = taken.state, taken.frame
+        numbers = {
+            "stamp_s": round(frame.stamp_s + unix_offset_s, 6),
+            **pose_row(state.base_from_flange),
+        }
+        joints = range(1, 100)
+        for form, names, values in (
+            ("q{}_rad", joints, state.q),
+            ("current{}_a", joints, state.currents_a),
+            ("temp{}_c", joints, state.temperatures_c),
+            ("payload{}_kg", [""], None if state.payload_kg is None else [state.payload_kg]),
+            ("payload_{}_m", "xyz", state.payload_m),
+        ):
+            if values is not None:
+                numbers |= {
+                    form.format(name): float(value)
+                    for name, value in zip(names, values, strict=False)
+                }
+        # Columns that calibration passes through: what the devices report.
+        texts = {
+            "safety": state.safety,
+            "blur_px": f"{taken.corners.blur_px:.2f}",
+            "motion_px": f"{taken.motion_px:.3f}",
+        }
+        if state.flange_from_tool is not None:
+            tcp = pose_row(state.flange_from_tool).values()
+            texts["tcp"] = " ".join(f"{value:.9g}" for value in tcp)
+        if frame.exposure_s is not None:
+            texts["exposure_ms"] = f"{1e3 * frame.exposure_s:.3f}"
+        texts |= {f"device_{name}": str(value) for name, value in self.settings.items()}
+        return View(number, image=image, numbers=numbers, text=texts)
+
+
+def _is_shipped(robot: Robot, name: str) -> bool:
+    shipped = load_robot(name)
+    return shipped.name == robot.name and dict(shipped.document) == dict(robot.document)
+
+
+def state_of(view: View) -> ArmState | None:
+    """Joints and pose of a row; None where it has no pose."""
+    pose = view.base_from_flange()
+    if pose is None:
+        return None
+    return ArmState(view.stamp_s or 0.0, np.asarray(pose.as_matrix()), view.joints_rad)
 
 
 class Journal:
@@ -116,7 +224,7 @@ class Journal:
             DataError: It cannot be written; the session is unchanged.
         """
         image = f"{_IMAGES}/{number:03d}.png"
-        view = view_of(number, image, taken, self._facts, self._offset_s)
+        view = self._facts.view_of(number, image, taken, self._offset_s)
         _, png = cv2.imencode(".png", taken.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_EFFORT])
         data = png.tobytes()
         self._check_room(len(data), f"view {number}")
@@ -125,7 +233,7 @@ class Journal:
             for name, text in self._facts.texts().items():
                 self._write(name, text)
         views = (*self.views, view)
-        columns = self._columns or _columns(view)
+        columns = self._columns or ("view", "image", *view.numbers, *view.text)
         self._write(_TABLE, write_csv(columns, views))
         self.views, self._columns = views, columns
         return view
@@ -169,10 +277,6 @@ class Journal:
             culprits=[str(self.folder)],
             next_step="Make room on that disk and go on with --resume.",
         )
-
-
-def _columns(view: View) -> tuple[str, ...]:
-    return ("view", "image", *view.numbers, *view.text)
 
 
 def _check_same(before: dict[str, Any], facts: CaptureFacts, folder: Path) -> None:

@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DriverError
-from visioncal.core.types import Corners, Image, Rejection, Target
-from visioncal.live.capture.live import LiveCell
-from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.still import StillFrame, grey, why_arm_moves, why_image_moves
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import Corners, FloatArray, Image, Rejection, Target
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.vision.finders import blur_of
 
@@ -18,6 +20,16 @@ from visioncal.vision.finders import blur_of
 _EARLY_S = 0.02
 # Attempts per view, as frames during which something moved are discarded.
 _ROUNDS = 3
+# Number of tracked points, and their window [px].
+_POINTS, _WINDOW_PX = 80, 21
+# With fewer points the image is featureless, and gives no view anyway.
+_FEWEST = 8
+# With less contrast [grey levels] there is only noise to track.
+_CONTRAST = 20
+# Least share of points that must be found again.
+_FOUND_SHARE = 0.5
+# Greatest difference of grey levels between matching windows.
+_GREY_DIFFERENCE = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,129 +50,167 @@ class Missed:
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
-    """First and latest frame of a rest that has lasted long enough."""
+class _StillFrame:
+    """Frame with the states of the arm before and after its exposure."""
 
-    first: StillFrame
-    last: StillFrame
+    frame: Frame
+    before: ArmState
+    after: ArmState
 
+    @classmethod
+    def of(cls, cell: LiveCell) -> "_StillFrame":
+        """Takes a frame."""
+        asked, before = cell.clock.now(), cell.state()
+        frame, after = cell.camera.frame(), cell.state()
+        if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
+            raise DriverError(
+                f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked:+.3f} s from "
+                "when it was asked for; a picture exposed after that is needed.",
+                culprits=[cell.camera.name],
+                next_step="The camera hands out old pictures, or its clock is not the host's.",
+            )
+        return cls(frame, before, after)
 
-def _capture_still(cell: LiveCell) -> StillFrame:
-    """Takes a frame, with the states of the arm around its exposure."""
-    asked = cell.clock.now()
-    before = cell.state()
-    frame = cell.camera.frame()
-    after = cell.state()
-    if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
-        raise DriverError(
-            f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked:+.3f} s from when "
-            "it was asked for; a picture exposed after that is needed.",
-            culprits=[cell.camera.name],
-            next_step="The camera hands out old pictures, or its clock is not the host's.",
-        )
-    return StillFrame(frame, before, after)
-
-
-def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
-    """Waits until arm and image are still.
-
-    Raises:
-        DriverError: A device fails, or the arm is stopped.
-    """
-    still = options.still
-    start = cell.clock.now()
-    first = _capture_still(cell)
-    if options.single:
-        return Settled(first, first)
-    while True:
-        latest = _capture_still(cell)
-        reason = _why_moving(first, latest, options)[0]
+    def why_moved(self, latest: "_StillFrame", still: Stillness) -> tuple[str, float]:
+        """Describes what moved until a later frame, if anything; with the image's motion [px]."""
+        reason = why_arm_moves(self.before, latest.before, still)
+        reason = reason or why_arm_moves(self.before, latest.after, still)
         if reason:
-            first = latest
-        elif latest.after.stamp_s - first.before.stamp_s >= still.quiet_s:
-            return Settled(first, latest)
-        if cell.clock.now() - start > still.patience_s:
-            return Missed(f"nothing came to rest in {still.patience_s:g} s: {reason or 'too slow'}")
-
-
-def _why_moving(
-    first: StillFrame, latest: StillFrame, options: CaptureOptions
-) -> tuple[str, float]:
-    """Describes what moved between two frames, if anything, and measures image motion [px]."""
-    reason = why_arm_moves(first.before, latest.before, options.still)
-    reason = reason or why_arm_moves(first.before, latest.after, options.still)
-    if reason:
-        return reason, 0.0
-    return why_image_moves(grey(first.frame.image), grey(latest.frame.image), options.still)
+            return reason, 0.0
+        motion_px = image_motion_px(_grey(self.frame.image), _grey(latest.frame.image))
+        if motion_px <= still.image_px:
+            return "", motion_px
+        if not np.isfinite(motion_px):
+            return "the image shows something else from frame to frame", motion_px
+        return f"the image moved by {figure(motion_px)} px (limit {still.image_px:g})", motion_px
 
 
 def take(
-    cell: LiveCell, settled: Settled, target: Target, view: int, options: CaptureOptions
-) -> TakenView | Missed:
-    """Takes a view of an arm at rest.
+    cell: LiveCell, target: Target, view: int, options: CaptureOptions
+) -> tuple[TakenView | Missed, float]:
+    """Takes a view once arm and image are still.
 
     In all frames image and arm must be where they were when the rest began; otherwise the frames
     are discarded, and the next rest is waited for.
 
+    Returns:
+        The view, or why there is none; and how long the first rest was waited for [s].
+
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
-    reason = ""
-    for _ in range(_ROUNDS):
-        frames, reason, motion_px = _frames(cell, settled, options)
-        if not reason:
-            return _select_frame(frames, target, view, options, motion_px)
-        rest = settle(cell, options)
+    begun, settled_s, reason = cell.clock.now(), 0.0, ""
+    for attempt in range(_ROUNDS):
+        rest = _settled(cell, options)
+        if not attempt:
+            settled_s = cell.clock.now() - begun
         if isinstance(rest, Missed):
-            return rest
-        settled = rest
-    return Missed(f"something moved during every exposure: {reason}")
+            return rest, settled_s
+        first, last = rest
+        frames, motion_px, reason = [last], 0.0, ""
+        while not reason and len(frames) < (1 if options.single else options.frames):
+            frames.append(_StillFrame.of(cell))
+            reason, motion_px = first.why_moved(frames[-1], options.still)
+        if not reason:
+            return _selected(frames, target, view, options, motion_px), settled_s
+    return Missed(f"something moved during every exposure: {reason}"), settled_s
 
 
-def _frames(
-    cell: LiveCell, settled: Settled, options: CaptureOptions
-) -> tuple[list[StillFrame], str, float]:
-    """Takes the frames of a rest; none with the reason if something moved; image motion [px]."""
-    frames, motion_px = [settled.last], 0.0
-    while len(frames) < (1 if options.single else options.frames):
-        latest = _capture_still(cell)
-        reason, motion_px = _why_moving(settled.first, latest, options)
+def _settled(cell: LiveCell, options: CaptureOptions) -> tuple[_StillFrame, _StillFrame] | Missed:
+    """Waits until arm and image are still: first and latest frame of a rest that lasts."""
+    still, start = options.still, cell.clock.now()
+    first = _StillFrame.of(cell)
+    if options.single:
+        return first, first
+    while True:
+        latest = _StillFrame.of(cell)
+        reason, _ = first.why_moved(latest, still)
         if reason:
-            return [], reason, motion_px
-        frames.append(latest)
-    return frames, "", motion_px
+            first = latest
+        elif latest.after.stamp_s - first.before.stamp_s >= still.quiet_s:
+            return first, latest
+        if cell.clock.now() - start > still.patience_s:
+            return Missed(f"nothing came to rest in {still.patience_s:g} s: {reason or 'too slow'}")
 
 
-def _select_frame(
-    frames: Sequence[StillFrame],
+def _selected(
+    frames: Sequence[_StillFrame],
     target: Target,
     view: int,
     options: CaptureOptions,
     motion_px: float,
 ) -> TakenView | Missed:
+    """The view of the sharpest frame, or of the mean of all."""
+
+    def detected(still: _StillFrame) -> TakenView | Missed:
+        corners, _ = find_corners(_grey(still.frame.image), target, view)
+        if isinstance(corners, Rejection):
+            return Missed(corners.reason)
+        # The state nearer to the middle of the exposure.
+        nearer = min(
+            (still.before, still.after), key=lambda end: abs(end.stamp_s - still.frame.stamp_s)
+        )
+        return TakenView(still.frame, nearer, corners, motion_px)
+
     if options.keep == "mean":
-        return _detect(_mean_frame(frames), target, view, motion_px)
-    first = _detect(frames[0], target, view, motion_px)
+        # With the arm's state at the middle one.
+        middle = frames[len(frames) // 2]
+        images = np.stack([frame.frame.image for frame in frames]).astype(np.float32)
+        mean: Image = np.asarray(np.rint(images.mean(axis=0)), dtype=np.uint8)
+        stamp_s = float(np.mean([frame.frame.stamp_s for frame in frames]))
+        return detected(replace(middle, frame=replace(middle.frame, image=mean, stamp_s=stamp_s)))
+    first = detected(frames[0])
     if isinstance(first, Missed):
         return first
     # Image and arm are still: the corners of one frame hold for all.
-    corners = first.corners
-    blurs = [blur_of(grey(frame.frame.image), target, corners.ids, corners.px) for frame in frames]
+    ids, px = first.corners.ids, first.corners.px
+    blurs = [blur_of(_grey(frame.frame.image), target, ids, px) for frame in frames]
     sharpest = int(np.argmin(blurs))
-    return first if sharpest == 0 else _detect(frames[sharpest], target, view, motion_px)
+    return first if sharpest == 0 else detected(frames[sharpest])
 
 
-def _detect(still: StillFrame, target: Target, view: int, motion_px: float) -> TakenView | Missed:
-    corners, _ = find_corners(grey(still.frame.image), target, view)
-    if isinstance(corners, Rejection):
-        return Missed(corners.reason)
-    return TakenView(still.frame, still.state, corners, motion_px)
+def _grey(image: Image) -> Image:
+    """Grey image (h, w) of an image that may be coloured."""
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def _mean_frame(frames: Sequence[StillFrame]) -> StillFrame:
-    """Mean of all frames, with the arm's state at the middle one."""
-    middle = frames[len(frames) // 2]
-    images = np.stack([frame.frame.image for frame in frames]).astype(np.float32)
-    image: Image = np.asarray(np.rint(images.mean(axis=0)), dtype=np.uint8)
-    stamp = float(np.mean([frame.frame.stamp_s for frame in frames]))
-    return replace(middle, frame=replace(middle.frame, image=image, stamp_s=stamp))
+def why_arm_moves(first: ArmState, latest: ArmState, still: Stillness) -> str:
+    """Describes how an arm moved between two states, or moves now; empty where it is still."""
+    for state in (first, latest):
+        speed = 0.0 if state.dq is None else float(np.abs(state.dq).max())
+        if speed > still.joint_speed:
+            return f"a joint turns at {speed:.3g} rad/s (limit {still.joint_speed:g})"
+    if first.q is not None and latest.q is not None:
+        turned = float(np.abs(latest.q - first.q).max())
+        if turned > still.joint_rad:
+            return f"a joint turned by {figure(turned)} rad (limit {still.joint_rad:g})"
+    motion = invert(first.base_from_flange) @ latest.base_from_flange
+    shift, angle = float(np.linalg.norm(motion[:3, 3])), float(rotation_angle(motion))
+    if shift > still.flange_m:
+        return f"the flange moved by {figure(1e3 * shift)} mm (limit {1e3 * still.flange_m:g})"
+    if angle > still.flange_rad:
+        return f"the flange turned by {figure(angle)} rad (limit {still.flange_rad:g})"
+    return ""
+
+
+def image_motion_px(first: Image, latest: Image) -> float:
+    """Median motion of feature points between grey images (h, w) [px] (Lucas and Kanade 1981).
+
+    It is zero without features, and infinite where most points are lost.
+    """
+    low, high = np.percentile(first[::4, ::4], [1, 99])
+    if high - low < _CONTRAST:
+        return 0.0
+    points = cv2.goodFeaturesToTrack(first, _POINTS, 0.05, _WINDOW_PX)
+    if points is None or len(points) < _FEWEST:
+        return 0.0
+    moved, status, error = cv2.calcOpticalFlowPyrLK(
+        first, latest, points, np.empty_like(points), winSize=(_WINDOW_PX, _WINDOW_PX)
+    )
+    matched = (status[:, 0] == 1) & (error[:, 0] < _GREY_DIFFERENCE)
+    if matched.mean() < _FOUND_SHARE:
+        return float("inf")
+    shifts: FloatArray = np.asarray((moved - points)[matched, 0], dtype=float)
+    return float(np.median(np.linalg.norm(shifts, axis=1)))

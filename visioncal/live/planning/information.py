@@ -147,6 +147,11 @@ class World:
         bias = fitted @ (self.gradient + gram(taken, self.unestimated[rows]))
         return np.asarray(fitted + bias @ bias.T)
 
+    def variances(self, covariance: FloatArray) -> tuple[float, float]:
+        """Variances of the reported position [m^2] and rotation [rad^2] with a covariance."""
+        place, turn = (np.sum(square * covariance) for square in (self.position, self.rotation))
+        return float(place), float(turn)
+
 
 def predict_worlds(
     cells: Sequence[PlanCell],

@@ -1,22 +1,14 @@
 """A plan of stops, or of motions, in words."""
 
-from visioncal.core.number_format import counted, figure, mm_and_deg, percent, some_of
+from visioncal.core.number_format import counted, figure, percent, some_of
 from visioncal.dynamics.limits import MotionExtremes
 from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.dynamics.sweeps import Sweeps
-from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.pick_probability import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
 
 # The board's size limits a plan if knowing it exactly would reduce the error by this factor.
 _LIMITED = 1.5
-
-
-def accuracy_words(accuracy: Accuracy) -> str:
-    """States an accuracy: `0.12 mm and 0.02 deg`."""
-    if accuracy.is_open:
-        return "not determined"
-    return mm_and_deg(accuracy.mm, accuracy.deg)
 
 
 def need_words(prediction: NeedPlanned) -> str:
@@ -30,11 +22,11 @@ def summary_of(plan: Plan) -> str:
     stops = counted(count, "stop")
     wanted = f"{plan.request.purpose.errors}, predicted sigma"
     if plan.start is None:
-        accuracy = accuracy_words(design.predicted)
+        accuracy = design.predicted.words
         return f"{stops} from {plan.candidate_count} possible ones; {wanted}: {accuracy}"
     return (
         f"{stops} to add, from {plan.candidate_count} possible ones; {wanted}: "
-        f"{accuracy_words(design.before)} before, {accuracy_words(design.predicted)} after"
+        f"{design.before.words} before, {design.predicted.words} after"
     )
 
 

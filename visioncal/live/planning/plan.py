@@ -13,10 +13,16 @@ from visioncal.core.number_format import figure, mm_and_deg, percent, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.estimation.armmodel import block_size
-from visioncal.live.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.live.planning.candidates import Candidates, candidates
 from visioncal.live.planning.cell import Box, PlanCell
-from visioncal.live.planning.design import Design, choose_stops, shortfall
+from visioncal.live.planning.design import (
+    OPEN_SIGMA,
+    Accuracy,
+    Design,
+    Wish,
+    choose_stops,
+    shortfall,
+)
 from visioncal.live.planning.information import WORLDS, World, predict_worlds
 from visioncal.live.planning.path import Route, order_stops
 from visioncal.live.planning.pick_probability import (

@@ -4,7 +4,7 @@ import numpy as np
 
 from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.plan_files import MotionPlan
-from visioncal.live.planning.messages import accuracy_words, looks_note, plan_words, summary_of
+from visioncal.live.planning.messages import looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
 from visioncal.present.recording.preview import MotionPart, MotionPreview, Preview, PreviewStop
@@ -63,9 +63,7 @@ def _plan_note(plan: Plan, name: str) -> str:
         "",
     ]
     ranked = sorted(plan.stops, key=lambda stop: stop.rank)
-    lines += [
-        f"- **view {stop.view}** ({accuracy_words(stop.after)}): {stop.words}" for stop in ranked
-    ]
+    lines += [f"- **view {stop.view}** ({stop.after.words}): {stop.words}" for stop in ranked]
     return "\n".join(lines)
 
 

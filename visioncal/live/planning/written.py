@@ -15,8 +15,8 @@ from visioncal.core.files import one_line, sha256
 from visioncal.core.types import FloatArray, Need
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
-from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.cell import Box, PlanCell
+from visioncal.live.planning.design import Accuracy, Wish
 from visioncal.live.planning.plan import Plan, PlannedStop, PlanRequest
 from visioncal.robot import has_ur_axes
 from visioncal.session.columns import POSE

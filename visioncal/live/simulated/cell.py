@@ -1,15 +1,30 @@
-"""A simulated cell to record live: the truth, and what its user would know of it."""
+"""A simulated cell to record live: the truth, what its user would know of it, and its devices."""
 
-from dataclasses import dataclass, replace
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
+from visioncal.core.choices import Faults
+from visioncal.core.errors import DriverError
 from visioncal.core.transforms import exp
+from visioncal.core.types import Camera, FloatArray
+from visioncal.live.capture.cell import Clock, HostClock, LiveCell
+from visioncal.live.capture.recording import CaptureEvent
+from visioncal.live.capture.take import TakenView
+from visioncal.live.drivers.protocols import Frame
+from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.cell import TYPICAL_NOISE, TYPICAL_PX, Limits, PlanCell
-from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.controller import ControllerOptions, TrueState, spawn
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import ArmErrors
+from visioncal.simulation.live import LiveView
 
 # Errors of the user's guesses of both edges, as measured by ruler and by eye [m, rad].
 GUESS_M, GUESS_RAD = 0.02, float(np.deg2rad(5.0))
@@ -20,39 +35,194 @@ _WORN = ArmErrors(offset_sigma_rad=3e-4)
 _FLOOR_DEPTH_M = 0.1
 # Seed of the guesses, distinct from those of the cell and the controller.
 _GUESSES = 101
+# An OAK's rate [1/s].
+_RATE_HZ = 30.0
+# Joint speeds above which the arm counts as moving, and below which as stopped [rad/s].
+_MOVING_SPEED, _STOPPED_SPEED = 0.05, 1e-3
+# Polling interval, delay of a fault after the start of a motion, and more than any motion between
+# two stops takes, even on a busy computer [s].
+_POLL_S, _INTO_MOTION_S, _PATIENCE_S = 0.02, 0.2, 60.0
+# Moments of an exposure at which the arm's joints are read, start and end included.
+_MOMENTS = 5
+# Dark, as the inside of a lens cap [grey level].
+_DARK = 12
+
+CameraFault = Literal["none", "unplugged", "covered"]
 
 
-@dataclass(frozen=True, eq=False)
-class LiveSimulation:
-    """A simulated cell."""
+class SimulatedCamera:
+    """Camera device that observes a simulated cell with the arm's true joints.
 
-    truth: SimulatedCell  # The true arm, edges, lens and board.
-    controller: ControllerOptions  # The same arm for the simulated controller.
-    known: PlanCell  # The user's prior knowledge: rough guesses and the factory's lens.
+    It free-runs as a real camera does: exposures start at regular times, whether or not requested.
+
+    Args:
+        cell: The cell: its true arm, edges and lens, its board and its noise. Its true arm must be
+            the one whose joints are given.
+        true_joints: Returns the arm's true joints, (k, n) [rad], at k past moments of the monotonic
+            clock, (k,) [s]. After its DriverError the last known joints are used: a camera goes on
+            working when a controller dies.
+        rate_hz: Pictures per second.
+        exposure_s: Exposure time [s].
+        clock: The clock.
+    """
+
+    name = "simulated camera"
+
+    def __init__(
+        self,
+        cell: SimulatedCell,
+        true_joints: Callable[[FloatArray], FloatArray],
+        *,
+        rate_hz: float = 15.0,
+        exposure_s: float = 0.008,
+        clock: Clock | None = None,
+    ) -> None:
+        self._view, self._true_joints = LiveView(cell), true_joints
+        self._clock: Clock = clock or HostClock()
+        self._rate_hz, self._exposure_s = rate_hz, exposure_s
+        self._start = self._clock.now()
+        self._last: FloatArray | None = None
+        self.fault: CameraFault = "none"
+        self.resolution = cell.camera().camera.resolution
+        # The cell's stated intrinsics.
+        self.factory: Camera | None = cell.stated[""] if cell.camera().state_intrinsics else None
+        settings: dict[str, str | float] = {"exposure_us": 1e6 * exposure_s, "rate_hz": rate_hz}
+        self.settings: Mapping[str, str | float] = MappingProxyType(settings)
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns a picture whose exposure began after the call.
+
+        Raises:
+            DriverError: It is unplugged, or the next exposure ends after the timeout.
+        """
+        requested_at = self._clock.now()
+        exposure_s, rate_hz = self._exposure_s, self._rate_hz
+        start = self._start + np.ceil((requested_at - self._start) * rate_hz) / rate_hz
+        is_late = start + exposure_s > requested_at + timeout_s
+        if is_late or self.fault == "unplugged":
+            self._clock.sleep(timeout_s)
+            raise DriverError(
+                f"The {self.name} gave no picture within {timeout_s:g} s.",
+                culprits=[self.name],
+                next_step="Look at its cable and its power, then go on with --resume.",
+            )
+        self._clock.sleep(max(start + exposure_s - requested_at, 0.0))
+        middle_s = start + 0.5 * exposure_s
+        if self.fault == "covered":
+            dark = np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
+            return Frame(dark, middle_s, exposure_s)
+        try:
+            joints = self._true_joints(np.linspace(start, start + exposure_s, _MOMENTS))
+        except DriverError:
+            if self._last is None:
+                raise
+            joints = self._last
+        self._last = joints[-1:]
+        return Frame(self._view.picture(joints), middle_s, exposure_s)
+
+    def close(self) -> None:
+        """Holds no resources."""
 
 
-def live_simulation(seed: int) -> LiveSimulation:
-    """Builds a cell with a camera on the flange of a UR; the same seed gives the same cell."""
-    options = CellOptions(robot=_ROBOT, views=1, cut_views=0.0, seed=seed)
-    controller = ControllerOptions(robot=_ROBOT, seed=seed, errors=_WORN)
-    cell = simulate(options)
-    truth = replace(cell, robots={"": replace(cell.robot, true_arm=controller.true_arm)})
-    draws = np.random.default_rng([seed, _GUESSES]).standard_normal((2, 2, 3))
-    directions = draws / np.linalg.norm(draws, axis=2, keepdims=True)
-    errors = exp((directions * np.array([[GUESS_RAD], [GUESS_M]])).reshape(2, 6))
-    x, z = truth.transforms.values()
-    per_axis = float(np.sqrt(3.0))
-    known = PlanCell(
-        options.mount,
-        load_robot(_ROBOT),
-        truth.stated[""],
-        options.target,
-        x @ errors[0],
-        z @ errors[1],
-        GUESS_RAD / per_axis,
-        GUESS_M / per_axis,
-        TYPICAL_NOISE,
-        TYPICAL_PX,
-        Limits(floor_m=min(0.0, float(z[2, 3])) - _FLOOR_DEPTH_M),
-    )
-    return LiveSimulation(truth, controller, known)
+class Bench:
+    """A simulated cell with a camera on the flange of a UR; the same seed gives the same cell.
+
+    Once started, its controller is another process, and its camera renders the truth. As a watcher
+    of its recording it notes the truth of each view, and lets a fault happen.
+
+    Attributes:
+        truth: The true arm, edges, lens and board.
+        known: The user's prior knowledge: rough guesses and the factory's lens.
+        views: The arm's true state in the middle of each view's exposure, with the view.
+    """
+
+    def __init__(self, seed: int, fault: Faults | None = None, after: int = 0) -> None:
+        """Builds the cell; `fault` happens after a number of stops."""
+        options = CellOptions(robot=_ROBOT, views=1, cut_views=0.0, seed=seed)
+        self._options = ControllerOptions(robot=_ROBOT, seed=seed, errors=_WORN)
+        cell = simulate(options)
+        true_arm = replace(cell.robot, true_arm=self._options.true_arm)
+        self.truth = replace(cell, robots={"": true_arm})
+        draws = np.random.default_rng([seed, _GUESSES]).standard_normal((2, 2, 3))
+        directions = draws / np.linalg.norm(draws, axis=2, keepdims=True)
+        errors = exp((directions * np.array([[GUESS_RAD], [GUESS_M]])).reshape(2, 6))
+        x, z = self.truth.transforms.values()
+        per_axis = float(np.sqrt(3.0))
+        self.known = PlanCell(
+            options.mount,
+            load_robot(_ROBOT),
+            self.truth.stated[""],
+            options.target,
+            x @ errors[0],
+            z @ errors[1],
+            GUESS_RAD / per_axis,
+            GUESS_M / per_axis,
+            TYPICAL_NOISE,
+            TYPICAL_PX,
+            Limits(floor_m=min(0.0, float(z[2, 3])) - _FLOOR_DEPTH_M),
+        )
+        self.views: list[tuple[TakenView, TrueState]] = []
+        self._fault, self._after = fault, after
+
+    def start(self, q: FloatArray, host: str | None = None) -> None:
+        """Starts the controller, its arm at a posture [rad].
+
+        Raises:
+            DriverError: It does not start.
+        """
+        self.controller = spawn(replace(self._options, q=tuple(q.tolist())), host)
+
+    @contextmanager
+    def connected(self) -> Iterator[LiveCell]:
+        """Opens the arm as a recording does, and closes it.
+
+        Raises:
+            DriverError: It cannot be opened.
+        """
+        camera = SimulatedCamera(
+            self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=_RATE_HZ
+        )
+        with closing(UrArm(self.controller.host)) as arm:
+            self._camera = camera
+            yield LiveCell(arm, (camera,))
+
+    def close(self) -> None:
+        """Ends the controller."""
+        self.controller.close()
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Notes the truth of a view, and starts the fault once its number of stops was visited."""
+        if isinstance(step.found, TakenView):
+            state = self.controller.state([step.found.frame.stamp_s])
+            self.views.append((step.found, state))
+        if self._fault is not None and step.place == self._after:
+            threading.Thread(target=self._inject, args=(self._fault,), daemon=True).start()
+
+    def mend(self) -> None:
+        """Ends the fault, as a person would do in the cell before going on."""
+        if self._fault == "link-lost":
+            self.close()
+            self.start(self._stopped_q, self.controller.host)
+        self.controller.inject("none")
+        self._fault = None
+
+    def _inject(self, fault: Faults) -> None:
+        """Lets a fault happen: of the controller in the next motion, of the camera after it."""
+        self._wait(moving=True)
+        if fault == "unplugged" or fault == "covered":
+            self._wait(moving=False)
+            self._camera.fault = fault
+            return
+        time.sleep(_INTO_MOTION_S)
+        # Where a controller that is restarted has its arm.
+        self._stopped_q = self.controller.state([time.monotonic()]).q[0]
+        self.controller.inject(fault)
+
+    def _wait(self, *, moving: bool) -> None:
+        """Waits until the arm moves, or has stopped."""
+        ends_s = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < ends_s:
+            speed = float(np.abs(self.controller.state([time.monotonic()]).dq).max())
+            if (speed > _MOVING_SPEED) if moving else (speed < _STOPPED_SPEED):
+                return
+            time.sleep(_POLL_S)

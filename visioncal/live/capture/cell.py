@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from visioncal.core.errors import DriverError
+from visioncal.core.types import FloatArray
 from visioncal.live.drivers.protocols import Arm, ArmState, CameraDevice, MovingArm
 
 # Greatest age of a state [s].
@@ -50,11 +51,17 @@ class HostClock:
 
 
 @dataclass(frozen=True, eq=False)
-class LiveArm:
-    """An arm, and the clock by which it stamps."""
+class LiveCell:
+    """An arm, the cameras beside it, and the clock by which they stamp."""
 
     arm: Arm
+    cameras: tuple[CameraDevice, ...] = ()  # None where the arm is driven without looking.
     clock: Clock = field(default_factory=HostClock)
+
+    @property
+    def camera(self) -> CameraDevice:
+        """The camera that is recorded."""
+        return self.cameras[0]
 
     def state(self) -> ArmState:
         """Reads the arm's state.
@@ -84,6 +91,22 @@ class LiveArm:
             )
         return state
 
+    def joints(self) -> FloatArray:
+        """Present joint angles (n,) [rad].
+
+        Raises:
+            DriverError: The arm reports no state, or is stopped.
+        """
+        q = self.state().q
+        if q is None:
+            raise DriverError(
+                f"{self.arm.name}: it does not report its joint angles, and cannot be driven by "
+                "them.",
+                culprits=[self.arm.name],
+                next_step="Guide it by hand: --follow.",
+            )
+        return q
+
     @contextmanager
     def halting(self) -> Iterator[None]:
         """Runs a block, and halts the arm if it raises."""
@@ -93,25 +116,3 @@ class LiveArm:
             if isinstance(self.arm, MovingArm):
                 self.arm.halt()
             raise
-
-
-@dataclass(frozen=True, eq=False)
-class LiveCell:
-    """An arm, a camera, and the clock by which they stamp."""
-
-    arm: Arm
-    camera: CameraDevice
-    clock: Clock = field(default_factory=HostClock)
-
-    @property
-    def live(self) -> LiveArm:
-        """The arm and its clock."""
-        return LiveArm(self.arm, self.clock)
-
-    def state(self) -> ArmState:
-        """Reads the arm's state.
-
-        Raises:
-            DriverError: See `LiveArm.state`.
-        """
-        return self.live.state()

@@ -1,0 +1,223 @@
+"""What the views so far amount to: coverage, advice, predicted accuracy, joints against poses."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from visioncal.calibration.stages.pnp import measure_poses
+from visioncal.core.errors import VisioncalError
+from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
+from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.planning.design import Accuracy
+from visioncal.live.planning.information import predict_worlds
+from visioncal.live.planning.plan_file import PlanFile
+from visioncal.live.planning.recorded import calibrate_partially
+from visioncal.robot import Robot
+from visioncal.session import Session
+
+# Cells of the image in which coverage is counted.
+_ACROSS, _DOWN = 8, 5
+# Assumed corner noise for the pose of a view [px]; advice needs no better.
+_PIXEL_PX = 0.2
+# Tilts below the first count as frontal; to separate the board's distance from the focal length
+# some must exceed the second [deg].
+_STRAIGHT_DEG, _LEANING_DEG = 10.0, 20.0
+# Number of views before advice is given on tilt and distance, and for a calibration.
+_FIRST, _FEWEST = 3, 3
+# Ratio below which the greatest and the least distance count as one.
+_ONE_DISTANCE = 1.25
+_COVERED = 0.8
+_THIRDS = (("left", "middle", "right"), ("top", "middle", "bottom"))
+# Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
+_SAME_M, _SAME_RAD = 1e-2, 2e-2
+# Largest motion of joints and of a flange that count as still [rad, m].
+_STILL_RAD, _STILL_M = 1e-4, 1e-4
+
+# Accuracy predicted with some views, by their numbers; None while there is no prediction.
+Prediction: TypeAlias = Callable[[Sequence[int]], Accuracy | None]
+
+
+@dataclass(eq=False)
+class Coach:
+    """Coverage of a recording by its views."""
+
+    target: Target
+    resolution: tuple[int, int]  # (width, height) of the images [px].
+    camera: Camera | None  # Intrinsics for tilt and distance; None where they are not known.
+    _covered_cells: Mask = field(default_factory=lambda: np.zeros((_DOWN, _ACROSS), dtype=bool))
+    _normals: list[FloatArray] = field(default_factory=list)
+    _distances: list[float] = field(default_factory=list)
+    _views: int = 0
+
+    def add(self, corners: Corners) -> None:
+        """Takes a view into account."""
+        self._views += 1
+        cells = np.floor(corners.px * [_ACROSS, _DOWN] / self.resolution).astype(int)
+        columns, rows = np.clip(cells, 0, [_ACROSS - 1, _DOWN - 1]).T
+        self._covered_cells[rows, columns] = True
+        if self.camera is None:
+            return
+        try:
+            by_view = {corners.view: corners}
+            views = measure_poses(by_view, (self.target,), self.camera, _PIXEL_PX)
+        except VisioncalError:
+            return
+        for view in views:
+            # The target's z axis points into the board, away from the camera.
+            self._normals.append(-view.cam_from_target[0, :3, 2])
+            self._distances.append(float(np.linalg.norm(view.cam_from_target[0, :3, 3])))
+
+    @property
+    def _tilts(self) -> FloatArray:
+        """Angles between the optical axis and the board's normal [deg]."""
+        along = [-normal[2] for normal in self._normals]
+        return np.asarray(np.rad2deg(np.arccos(np.clip(along, -1.0, 1.0))))
+
+    def words(self) -> str:
+        """States the coverage: `coverage 45 %, tilts to 32 deg, 0.4 to 0.7 m away`."""
+        words = [f"coverage {100 * self._covered_cells.mean():.0f} %"]
+        if self._normals:
+            words.append(f"tilts to {self._tilts.max():.0f} deg")
+            words.append(f"{min(self._distances):.2f} to {max(self._distances):.2f} m away")
+        return ", ".join(words)
+
+    def advice(self) -> str:
+        """Advice for the next view, where a person chooses it; empty where nothing is missing."""
+        return next(self._advice(), "")
+
+    def _advice(self) -> Iterator[str]:
+        if self._views < _FIRST:
+            yield "another place, with the board large in the image"
+            return
+        if self._normals:
+            tilts = self._tilts
+            if tilts.max() < _LEANING_DEG:
+                yield f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
+            leaning = np.array(self._normals)[tilts > _STRAIGHT_DEG]
+            for axis, name in ((1, "x"), (0, "y")) if len(leaning) else ():
+                if np.rad2deg(np.abs(leaning[:, axis])).max() < _STRAIGHT_DEG:
+                    yield f"tilt the camera about its {name}: no view leans that way"
+            if max(self._distances) < _ONE_DISTANCE * min(self._distances):
+                yield f"another distance: all views are about {self._distances[0]:.2f} m away"
+        if self._covered_cells.mean() < _COVERED:
+            # The third of the image, across and down, with the least coverage.
+            rows = np.array_split(np.arange(_DOWN), 3)
+            columns = np.array_split(np.arange(_ACROSS), 3)
+            shares = [[self._covered_cells[np.ix_(r, c)].mean() for c in columns] for r in rows]
+            row, column = np.unravel_index(int(np.argmin(shares)), (3, 3))
+            words = [_THIRDS[1][row], _THIRDS[0][column]]
+            region = " ".join(word for word in words if word != "middle") or "middle"
+            yield f"bring the board to the {region} of the image"
+
+
+@dataclass(eq=False)
+class JointPoseCheck:
+    """Comparison of poses with the robot's model, up to a constant base or tool.
+
+    It keeps the states so far that were consistent with one another.
+    """
+
+    robot: Robot | None  # The nominal model; None where it is not known, and nothing is compared.
+    _states: list[ArmState] = field(default_factory=list)
+
+    def why_not(self, state: ArmState) -> str:
+        """States why a state's joints and pose are inconsistent; empty where they are not.
+
+        A consistent state is kept.
+        """
+        if self.robot is None or state.q is None:
+            return ""
+        if len(state.q) != self.robot.joint_count:
+            return (
+                f"the arm reports {len(state.q)} joints, and {self.robot.name} has "
+                f"{self.robot.joint_count}: check --robot"
+            )
+        q = np.array([state.q, *(other.q for other in self._states)])
+        pose = np.array([other.base_from_flange for other in (state, *self._states)])
+        shift_m, angle = _deviation(self.robot.base_from_flange(q), pose)
+        if shift_m <= _SAME_M and angle <= _SAME_RAD:
+            self._states.append(state)
+            return ""
+        cause = (
+            "one of them is of another moment, the tool was changed on the pendant, or the arm is "
+            f"no {self.robot.name}"
+        )
+        turned = float(np.abs(q[0] - q[-1]).max())
+        is_still = float(np.linalg.norm(pose[0, :3, 3] - pose[-1, :3, 3])) < _STILL_M
+        if is_still and turned > _STILL_RAD:
+            cause = "the joints turned and the pose stayed, so the pose is stale"
+        elif turned < _STILL_RAD and not is_still:
+            cause = "the pose changed and the joints stayed, so the joint angles are stale"
+        return (
+            f"joint angles and pose disagree by {1e3 * shift_m:.0f} mm and "
+            f"{np.rad2deg(angle):.1f} deg (limits {1e3 * _SAME_M:.0f} mm and "
+            f"{np.rad2deg(_SAME_RAD):.1f} deg): {cause}"
+        )
+
+
+def _deviation(model: FloatArray, pose: FloatArray) -> tuple[float, float]:
+    """Deviation of the first state from the nearest with which it shares a constant [m, rad]."""
+    found = [(0.0, 0.0)] if len(pose) == 1 else []
+    # With a tool on the flange, `invert(model) @ pose` is constant; with another base,
+    # `pose @ invert(model)` is.
+    for constant in (invert(model) @ pose, pose @ invert(model)):
+        differences = invert(constant[1:]) @ constant[0]
+        shifts = np.linalg.norm(differences[:, :3, 3], axis=1)
+        found += zip(shifts.tolist(), rotation_angle(differences).tolist(), strict=True)
+    return min(found, key=lambda pair: pair[0] / _SAME_M + pair[1] / _SAME_RAD)
+
+
+def planned_accuracy(plan: PlanFile) -> Prediction:
+    """Prediction from the information of a plan's stops; it takes a millisecond."""
+    q = np.array([stop.q for stop in plan.stops])
+    (world,) = predict_worlds((plan.cell,), plan.purpose, q)
+
+    def after(views: Sequence[int]) -> Accuracy | None:
+        rows = [row for row, stop in enumerate(plan.stops) if stop.view in set(views)]
+        return Accuracy.of(*world.variances(world.covariance(rows))) if rows else None
+
+    return after
+
+
+class RecordedAccuracy:
+    """Prediction from calibrating the session on the disk in a background thread.
+
+    It is for the views that were there when the calibration started; a new one starts when the last
+    has ended.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Prepares to calibrate a session's folder."""
+        self._folder = folder
+        self._worker = ThreadPoolExecutor(1)
+        self._pending: Future[Accuracy | None] | None = None
+        self._latest: Accuracy | None = None
+
+    def after(self, views: Sequence[int]) -> Accuracy | None:
+        """Accuracy of the newest calibration; None while there is none, or it gave no result."""
+        if self._pending is not None and self._pending.done():
+            self._latest, self._pending = self._pending.result(), None
+        if self._pending is None and len(views) >= _FEWEST:
+            self._pending = self._worker.submit(self._calibrated)
+        return self._latest
+
+    def close(self) -> None:
+        """Waits for a calibration in progress."""
+        self._worker.shutdown()
+
+    def _calibrated(self) -> Accuracy | None:
+        """Accuracy of the camera's pose from the session as it is now."""
+        try:
+            assessment = calibrate_partially(Session.load(self._folder)).known.assessment_or_none
+        except VisioncalError:
+            # Too few views yet; the reason is reported when the session is calibrated.
+            return None
+        if assessment is None:
+            return None
+        variances = np.diag(assessment.covariance)
+        return Accuracy.of(float(variances[3:6].sum()), float(variances[:3].sum()))

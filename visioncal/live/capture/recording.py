@@ -1,0 +1,415 @@
+"""Recording of views: driven to the stops of a plan, guided by hand, or on request."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from visioncal.calibration.stages.detect import find_corners
+from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import Camera, Corners, FloatArray, Target
+from visioncal.live.capture.assessment import Coach, JointPoseCheck, Prediction, planned_accuracy
+from visioncal.live.capture.cell import Clock, LiveCell
+from visioncal.live.capture.gate import Consent, Gate, JointPace, check_same_arm, clear_path
+from visioncal.live.capture.journal import Journal, state_of
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
+from visioncal.live.drivers.protocols import Arm, ArmState
+from visioncal.live.planning.design import Accuracy
+from visioncal.live.planning.plan_file import PlanFile, Stop
+from visioncal.robot import Robot
+from visioncal.vision.finders.imaging import decode_image
+
+# Typical duration of a stop besides the motion to it [s].
+_STOP_S = 1.5
+# Timeout of a picture while the arm moves, and polling interval of a guided arm [s].
+_FRAME_S, _POLL_S = 0.5, 0.05
+# Largest joint difference at which an arm counts as being at a posture [rad].
+_ARRIVED_RAD = 5e-3
+# Least distance of a new pose from all others [mm], [deg].
+_NEW_MM, _NEW_DEG = 20.0, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureEvent:
+    """Result of a stop, for watchers."""
+
+    view: int  # Number of the view.
+    place: int  # Number of the stop, from 1 on.
+    count: int  # Number of stops; 0 where it is not known.
+    found: TakenView | Missed  # The view, or why there is none.
+    covered: str  # Coverage so far, in words.
+    accuracy: Accuracy | None  # Accuracy predicted so far; None while there is no prediction.
+    advice: str  # What comes next, in words.
+    moved_s: float  # Duration of the motion to the stop [s].
+    settled_s: float  # Duration of settling there [s].
+    worked_s: float  # Duration of everything else [s].
+
+    @property
+    def line(self) -> str:
+        """A report: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
+        view, place = self.found, f"[{self.place}{f'/{self.count}' if self.count else ''}]"
+        next_words = f" -> next: {self.advice}" if self.advice else ""
+        if isinstance(view, Missed):
+            return f"{place} view {self.view}: not taken: {view.reason}{next_words}"
+        sigma = ""
+        if self.accuracy is not None:
+            is_open = self.accuracy.is_open
+            mm = ": not determined yet" if is_open else f" {figure(self.accuracy.mm)} mm"
+            sigma = f"; predicted sigma{mm}"
+        return (
+            f"{place} view {self.view}: {len(view.corners.ids)} corners, edges "
+            f"{view.corners.blur_px:.1f} px, {view.motion_px:.2f} px still; {self.covered}"
+            f"{sigma}{next_words}"
+        )
+
+    @property
+    def note(self) -> str:
+        """The same in Markdown, for the viewer."""
+        sigma = "" if self.accuracy is None else f"\n\nPredicted sigma: {self.accuracy.words}"
+        next_words = self.advice or "anything new"
+        return f"**View {self.view}**\n\n{self.covered}{sigma}\n\nNext: {next_words}"
+
+
+class Watcher(Protocol):
+    """Observer of a recording; it must be quick."""
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Handles a stored view, or a stop that gave none."""
+
+
+class Capture:
+    """A recording in progress; the views that are on the disk already count.
+
+    Args:
+        cell: The devices.
+        target: The board.
+        robot: The arm's model; None where it is not known.
+        lens: Intrinsics for tilts and distances; None where they are not known.
+        journal: Where views are stored.
+        options: Its options.
+        prediction: Predicted accuracy; None for no prediction.
+        watchers: Its observers.
+    """
+
+    def __init__(
+        self,
+        cell: LiveCell,
+        target: Target,
+        robot: Robot | None,
+        lens: Camera | None,
+        journal: Journal,
+        options: CaptureOptions,
+        prediction: Prediction | None,
+        watchers: Sequence[Watcher] = (),
+    ) -> None:
+        self.cell, self.target, self.journal, self.options = cell, target, journal, options
+        self.prediction, self.watchers = prediction, watchers
+        self.coach = Coach(target, cell.camera.resolution, lens)
+        self.steps: list[CaptureEvent] = []
+        self._check = JointPoseCheck(robot)
+        for view in journal.views:
+            image = decode_image(journal.image(view))
+            if not isinstance(image, str):
+                corners, _ = find_corners(image, target, view.number)
+                if isinstance(corners, Corners):
+                    self.coach.add(corners)
+            state = state_of(view)
+            if state is not None:
+                self._check.why_not(state)
+
+    def view(
+        self, number: int, place: int, count: int, moved_s: float, next_view: int | None = None
+    ) -> CaptureEvent:
+        """Takes a view at the arm's present pose.
+
+        Args:
+            number: Number of the view.
+            place: Number of the stop, from 1 on.
+            count: Number of stops; 0 where it is not known.
+            moved_s: Duration of the motion to the stop [s].
+            next_view: Number of the next planned one, 0 after the last; None where a person
+                chooses it.
+
+        Raises:
+            DriverError: A device fails, or the arm is stopped.
+            DataError: The view cannot be written, or too many stops in a row gave none.
+        """
+        start = self.cell.clock.now()
+        result, settled_s = take(self.cell, self.target, number, self.options)
+        if isinstance(result, TakenView):
+            disagreement = self._check.why_not(result.state)
+            if disagreement:
+                result = Missed(disagreement)
+            else:
+                self.journal.append(number, result)
+                self.coach.add(result.corners)
+        taken = [view.number for view in self.journal.views]
+        accuracy = None if self.prediction is None else self.prediction(taken)
+        worked_s = self.cell.clock.now() - start - settled_s
+        advice = f"view {next_view}" if next_view else ""
+        if next_view is None:
+            advice = self.coach.advice()
+        elif next_view and self.prediction is not None:
+            predicted = self.prediction([*taken, next_view])
+            if predicted is not None and not predicted.is_open:
+                advice += f", for {figure(predicted.mm)} mm"
+        covered = self.coach.words()
+        self.steps.append(
+            CaptureEvent(
+                *(number, place, count, result, covered, accuracy, advice),
+                *(moved_s, settled_s, worked_s),
+            )
+        )
+        for watcher in self.watchers:
+            watcher.stepped(self.steps[-1])
+        self._check_missed_in_a_row()
+        return self.steps[-1]
+
+    def _check_missed_in_a_row(self) -> None:
+        recent = self.steps[-self.options.missed_in_a_row :] if self.options.missed_in_a_row else []
+        reasons = [step.found.reason for step in recent if isinstance(step.found, Missed)]
+        if not reasons or len(reasons) < self.options.missed_in_a_row:
+            return
+        raise DataError(
+            f"no view at {len(recent)} stops in a row "
+            f"({', '.join(f'{step.view}' for step in recent)}): "
+            f"{reasons[-1]}.",
+            culprits=[f"view {step.view}" for step in recent],
+            next_step="Look at the board: does it lie where the plan has it, in the light and "
+            f"unhidden? Is it a {self.target.name}, and the lens in focus? Then go on with "
+            "--resume.",
+        )
+
+    def next_numbers(self) -> tuple[int, int]:
+        """Number and place of the next view, where there is no plan."""
+        numbers = [view.number for view in self.journal.views]
+        return 1 + max(numbers, default=0), len(numbers) + 1
+
+    @contextmanager
+    def halting(self) -> Iterator[None]:
+        """Halts the arm if a recording fails, and adds what is on the disk to the error.
+
+        Raises:
+            DriverError: A device failed, or Ctrl-C was pressed.
+            DataError: The recording failed for another reason.
+        """
+        try:
+            with self.cell.halting():
+                yield
+        except (KeyboardInterrupt, VisioncalError) as error:
+            count, folder = len(self.journal.views), self.journal.folder
+            stored = f"{count} view{'s are' if count > 1 else ' is'} safe in {folder}."
+            if not count:
+                stored = f"No view was taken; {folder} is no session yet."
+            resume = "Go on with --resume."
+            if self.options.single and count:
+                resume = "A folder begins with its first picture again: record all of it into a "
+                resume += "new session."
+            if isinstance(error, KeyboardInterrupt):
+                raise DriverError(
+                    f"stopped by Ctrl-C or a signal; the arm was halted. {stored}",
+                    culprits=["Ctrl-C"],
+                    next_step=resume,
+                ) from None
+            step = error.next_step
+            if "--resume" not in step:
+                step = f"{step} {resume}".strip()
+            message = f"{error.message} {stored}"
+            raise type(error)(message, culprits=error.culprits, next_step=step) from error
+
+
+def missed_stops(steps: Sequence[CaptureEvent]) -> dict[int, str]:
+    """Stops that gave no view, with the reasons."""
+    return {step.view: step.found.reason for step in steps if isinstance(step.found, Missed)}
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSummary:
+    """Summary of a recording before anything moves."""
+
+    stops: tuple[Stop, ...]  # Stops that have no view yet.
+    # Postures (n,) to the first stop, its own last; empty where no stop is left.
+    first: tuple[FloatArray, ...] = ()
+    turn_rad: float = 0.0  # Largest joint travel on that path [rad].
+    duration_s: float = 0.0  # Approximate duration of the recording [s].
+
+
+def motion_summary(
+    cell: LiveCell, plan: PlanFile, done: Sequence[int], options: CaptureOptions
+) -> MotionSummary:
+    """Checks and summarises what is to be driven, without the views `done`; nothing moves.
+
+    Raises:
+        DriverError: The arm does not report its joints, or is stopped.
+        DataError: The plan is for another arm, or no safe path to the first stop was found.
+    """
+    here = cell.joints()
+    check_same_arm(cell, plan.cell.robot, here)
+    stops = tuple(stop for stop in plan.stops if stop.view not in done)
+    if not stops:
+        return MotionSummary(())
+    first = checked_path(plan, stops[0], here)
+    postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
+    turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
+    duration_s = JointPace.of(options).path_duration_s(postures) + _STOP_S * len(stops)
+    return MotionSummary(stops, first, float(turns.max()), duration_s)
+
+
+def record(
+    cell: LiveCell,
+    plan: PlanFile,
+    journal: Journal,
+    options: CaptureOptions,
+    consent: Consent,
+    watchers: Sequence[Watcher] = (),
+) -> list[CaptureEvent]:
+    """Records the stops of a plan that have no view yet, and returns their results.
+
+    However it ends, the arm is halted and every reported view is on the disk. Without the
+    intrinsics of the camera, those of the plan are good enough for tilts and distances.
+
+    Raises:
+        DriverError: A device failed, the arm was stopped, or Ctrl-C was pressed.
+        DataError: A view cannot be written, no safe path leads to a stop, consent is refused, or
+            three stops in a row gave no view.
+    """
+    planned, lens = plan.cell, cell.camera.factory or plan.cell.camera
+    capture = Capture(
+        *(cell, planned.target, planned.robot, lens, journal, options),
+        *(planned_accuracy(plan), watchers),
+    )
+    done = {view.number for view in journal.views}
+    remaining = [stop for stop in plan.stops if stop.view not in done]
+    gate = Gate(cell, planned.robot, consent, JointPace.of(options))
+
+    def look() -> None:
+        # A failure is reported now, not at the end of a long motion.
+        cell.camera.frame(timeout_s=_FRAME_S)
+        journal.check_room()
+
+    with capture.halting():
+        for index, stop in enumerate(remaining):
+            path = checked_path(plan, stop, cell.joints())
+            moved_s = gate.move(path, f"to view {stop.view}", look)
+            place = len(plan.stops) - len(remaining) + index + 1
+            next_view = remaining[index + 1].view if index + 1 < len(remaining) else 0
+            capture.view(stop.view, place, len(plan.stops), moved_s, next_view)
+    return capture.steps
+
+
+def checked_path(plan: PlanFile, stop: Stop, q: FloatArray) -> tuple[FloatArray, ...]:
+    """Collision-checked postures (n,) from joints (n,) to a stop: the plan's, or new ones [rad].
+
+    Raises:
+        DataError: No path clear of everything declared was found, or the arm is too near to
+            something.
+    """
+
+    def is_at(posture: FloatArray) -> bool:
+        return q.shape == posture.shape and bool(np.abs(q - posture).max() < _ARRIVED_RAD)
+
+    if is_at(stop.q):
+        return (stop.q,)
+    index = plan.stops.index(stop)
+    planned = plan.stops[index - 1].q if index else plan.start_q
+    if planned is not None and is_at(planned):
+        return (*stop.via, stop.q)
+    return clear_path(plan.cell, q, stop.q, f"view {stop.view}")
+
+
+def follow(capture: Capture, count: int) -> list[CaptureEvent]:
+    """Takes `count` views (0: until Ctrl-C), one whenever a guided arm rests at a new pose.
+
+    Raises:
+        DriverError: A device failed, or the arm is stopped.
+        DataError: A view cannot be written, or too many rests in a row gave none.
+    """
+    cell, still, views = capture.cell, capture.options.still, capture.journal.views
+    poses = [view.base_from_flange() for view in views]
+    visited = [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
+
+    def is_new(state: ArmState) -> bool:
+        apart = (pose_difference(pose, state.base_from_flange) for pose in visited)
+        return all(mm >= _NEW_MM or deg >= _NEW_DEG for mm, deg in apart)
+
+    with capture.halting():
+        try:
+            while not count or len(capture.journal.views) < count:
+                start, first = cell.clock.now(), cell.state()
+                while True:
+                    cell.clock.sleep(_POLL_S)
+                    state = cell.state()
+                    if why_arm_moves(first, state, still):
+                        first = state
+                    elif state.stamp_s - first.stamp_s >= still.quiet_s and is_new(state):
+                        break
+                visited.append(state.base_from_flange)
+                moved_s = cell.clock.now() - start
+                step = capture.view(*capture.next_numbers(), count, moved_s)
+                if isinstance(step.found, TakenView):
+                    # The arm may have been moved on while the rest was waited for.
+                    visited.append(step.found.state.base_from_flange)
+        except KeyboardInterrupt:
+            # Ctrl-C is the regular end of a recording without a number of views.
+            if not capture.journal.views:
+                raise DriverError(
+                    "ended by Ctrl-C before the first view.",
+                    next_step="Guide the arm to where the camera sees the board, and let it rest.",
+                ) from None
+    return capture.steps
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldArm:
+    """An arm that stays at a given pose."""
+
+    name: str
+    reported: ArmState  # Its state when it was read.
+    clock: Clock  # Clock of the state's stamps.
+
+    def state(self) -> ArmState:
+        """The state, stamped now."""
+        return replace(self.reported, stamp_s=self.clock.now())
+
+    def close(self) -> None:
+        """Holds no resources."""
+
+
+def ask_and_take(
+    capture: Capture, arm: Arm, count: int, ask: Callable[[str], str] | None
+) -> list[CaptureEvent]:
+    """Takes a view whenever a person requests it, and asks for its pose.
+
+    Args:
+        capture: The recording.
+        arm: The arm that asks for the pose.
+        count: Number of views; 0 until `q`.
+        ask: Asks a question and returns the line that was typed; None where the poses are read from
+            a file.
+
+    Raises:
+        DriverError: The camera failed, or Ctrl-C was pressed.
+        DataError: A view cannot be written, or too many in a row gave none.
+    """
+    cell = capture.cell
+    with capture.halting():
+        while not count or len(capture.journal.views) < count:
+            number, place = capture.next_numbers()
+            wish = capture.coach.advice()
+            hint = f" ({wish})" if wish else ""
+            try:
+                question = f"View {number}{hint}: Enter takes it, q ends: "
+                if ask is not None and ask(question).strip().lower() == "q":
+                    break
+                held = _HeldArm(arm.name, arm.state(), cell.clock)
+            except EOFError:
+                # End of a file of answers, or of poses.
+                break
+            capture.cell = replace(cell, arm=held)
+            capture.view(number, place, count, 0.0)
+    return capture.steps
