@@ -32,12 +32,10 @@ from visioncal.robot import (
     pseudo_inertias,
     read_robot_document,
     robot_names,
-    small_urdf,
     torque_regressor,
-    urdf_with_inertias,
-    with_inertias,
 )
 from visioncal.robot.torques import model_with_inertias
+from visioncal.robot.writing import small_urdf, urdf_with_inertias, with_inertias
 
 # Sums of some hundred products of numbers about 1 to 100 [N m].
 ROUNDING = 1e-10

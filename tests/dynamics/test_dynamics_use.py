@@ -29,7 +29,8 @@ from visioncal.dynamics.reading import read_recorded
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.present.recording.paths import MOTION_TIMELINE
-from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
+from visioncal.robot import Inertias, Loads, Robot, load_robot
+from visioncal.robot.writing import small_urdf
 from visioncal.session import Session
 from visioncal.simulation.dynamics import LinkBody, drive_torques, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record, slow_sweep

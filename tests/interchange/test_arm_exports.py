@@ -29,7 +29,8 @@ from visioncal.results.arm import (
     Sag,
     WorkspaceSigma,
 )
-from visioncal.robot import Robot, load_robot, without_functions
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.writing import without_functions
 from visioncal.session import Session
 
 SAMPLE = made_up(5).calibration

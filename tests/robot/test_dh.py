@@ -19,11 +19,11 @@ from visioncal.robot import (
     other_convention,
     parallel_axes,
     robot_names,
-    small_urdf,
     table_document,
     table_from_document,
     table_of,
 )
+from visioncal.robot.writing import small_urdf
 
 NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base", "flange")
 KEYS = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")

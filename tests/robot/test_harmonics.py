@@ -9,7 +9,8 @@ from support.urdf_arm import of_urdf, some_changes, some_joints
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.exports.arm import joint_function_error_mm
-from visioncal.robot import Robot, load_robot, unexportable_functions
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.writing import unexportable_functions
 
 
 def some_harmonics(robot: Robot, orders: int = 5) -> np.ndarray:

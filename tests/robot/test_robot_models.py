@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from support.urdf_arm import of_urdf, some_changes, some_joints
 
-from visioncal.core.documents import read_yaml
+from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
-from visioncal.robot import (
-    Robot,
+from visioncal.robot import Robot, load_robot, robot_file, robot_names
+from visioncal.robot.writing import (
     corrected_urdf,
-    load_robot,
-    robot_file,
-    robot_names,
     small_urdf,
     unexportable_functions,
     ur_kinematics_yaml,

@@ -9,14 +9,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import Friction
-from visioncal.robot import (
-    Inertias,
-    Robot,
-    joint_torques,
-    momenta,
-    parameter_transform,
-    with_inertias,
-)
+from visioncal.robot import Inertias, Robot, joint_torques, momenta, parameter_transform
+from visioncal.robot.writing import with_inertias
 
 
 @dataclass(frozen=True, eq=False)

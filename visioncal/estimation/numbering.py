@@ -11,7 +11,6 @@ from itertools import combinations, permutations
 from math import perm
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import apply
@@ -147,6 +146,8 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
 
 def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> IntArray:
     """Assigns each measured point a distinct drawn one, near the aligned drawing."""
+    from scipy.optimize import linear_sum_assignment
+
     for _ in range(2):
         order = linear_sum_assignment(_squares(measured, placed))[1]
         # Realigned by all points, which is more accurate than by a triangle.

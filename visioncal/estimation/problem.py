@@ -17,8 +17,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -377,6 +375,9 @@ class Problem:
         pairs = pairs.reshape(-1, 2)
         units, of_key = len(used), np.arange(len(used))
         if np.any(pairs[:, 0] != pairs[:, 1]):  # some paths contain several robots
+            from scipy.sparse import coo_array
+            from scipy.sparse.csgraph import connected_components
+
             links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
             units, of_key = connected_components(links, directed=False)
         order = np.lexsort((used % count, of_key))

@@ -13,7 +13,6 @@ of freedom, r^2 / d is F of (d, n).
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import fdtr, ndtri
 
 from visioncal.core.types import FloatArray
@@ -65,6 +64,9 @@ def radius_within(
 
     Other arguments are those of `chance_within`.
     """
+    # Imported late: scipy.optimize takes a tenth of the time that a calibration needs to start.
+    from scipy.optimize import brentq
+
     errors, known = (part[:, 3:] for part in _errors(spreads, offsets))
     guess = float(np.linalg.norm(errors, axis=1).max() + np.linalg.norm(known, axis=1).max())
     if not guess > 0.0:

@@ -1,6 +1,7 @@
 """Robot models: kinematics and their derivatives, from a DH table, a URDF or a calibration.
 
-Only this package uses Pinocchio, which it imports where a model is built.
+Only this package uses Pinocchio, which it imports where a model is built. `visioncal.robot.writing`
+writes models as files.
 """
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
@@ -36,19 +37,6 @@ from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
 from visioncal.robot.weights import WeightFunctions
-from visioncal.robot.writing import (
-    corrected_tip,
-    corrected_urdf,
-    fit_links,
-    small_urdf,
-    table_toml,
-    unexportable_functions,
-    ur_flange,
-    ur_kinematics_yaml,
-    urdf_with_inertias,
-    with_inertias,
-    without_functions,
-)
 
 __all__ = [
     "FUNCTION_NAMES",
@@ -66,10 +54,7 @@ __all__ = [
     "WeightFunctions",
     "body_regressor",
     "convert_table",
-    "corrected_tip",
-    "corrected_urdf",
     "deflected_joints",
-    "fit_links",
     "has_ur_axes",
     "joint_deflections",
     "joint_torques",
@@ -83,20 +68,12 @@ __all__ = [
     "read_robot_document",
     "robot_file",
     "robot_names",
-    "small_urdf",
     "symmetric_entries",
     "symmetric_matrices",
     "table_document",
     "table_from_document",
     "table_of",
-    "table_toml",
     "torque_regressor",
-    "unexportable_functions",
-    "ur_flange",
-    "ur_kinematics_yaml",
-    "urdf_with_inertias",
     "with_base",
-    "with_inertias",
     "with_joint_offsets",
-    "without_functions",
 ]

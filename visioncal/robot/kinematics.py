@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from visioncal.core.documents import parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
@@ -180,6 +179,8 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
             culprits=[table.label],
             next_step="Leave the robot alone in it.",
         )
+    from visioncal.core.documents.xmls import parse_xml
+
     # Pinocchio's reader forgives what the readers of bodies and inertias do not.
     parse_xml(text.encode("utf-8"), f"{table.label}: the URDF")
     try:

@@ -24,7 +24,6 @@ from typing import Self
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.finders import find_target
@@ -194,16 +193,16 @@ class _Fit:
         below, across = self.texture[j + 1, i], self.texture[j + 1, i + 1]
         drawn = (1 - y) * ((1 - x) * near + x * right) + y * ((1 - x) * below + x * across) - 1.0
         height, width = drawn.shape
-        wu = 2 * np.pi * fft.rfftfreq(width)
-        wv = 2 * np.pi * fft.fftfreq(height)[:, None]
+        wu = 2 * np.pi * np.fft.rfftfreq(width)
+        wv = 2 * np.pi * np.fft.fftfreq(height)[:, None]
         square, half = wu**2 + wv**2, 0.5 * (wu * values[10] + wv * values[11])
         gauss, line = np.exp(-0.5 * square * values[9] ** 2), np.sinc(half / np.pi)
-        spectrum = fft.rfft2(drawn) * gauss
+        spectrum = np.fft.rfft2(drawn) * gauss
         if not slopes:
-            return np.asarray(fft.irfft2(spectrum * line, s=drawn.shape) + 1.0)
+            return np.asarray(np.fft.irfft2(spectrum * line, s=drawn.shape) + 1.0)
         by_x = _TEXELS * ((1 - y) * (right - near) + y * (across - below))
         by_y = _TEXELS * ((1 - x) * (below - near) + x * (across - right))
-        moved = fft.rfft2(by_x * by_place[..., 0] + by_y * by_place[..., 1]) * gauss * line
+        moved = np.fft.rfft2(by_x * by_place[..., 0] + by_y * by_place[..., 1]) * gauss * line
         safe = np.where(np.abs(half) < 1e-4, 1.0, half)
         by_half = np.where(np.abs(half) < 1e-4, -half / 3, (np.cos(half) - line) / safe)
         others = np.stack([
@@ -211,7 +210,7 @@ class _Fit:
             1j * wu * line, 1j * wv * line,
         ])  # fmt: skip
         parts = np.concatenate([(spectrum * line)[None], moved, spectrum * others])
-        images = fft.irfft2(parts, s=drawn.shape)
+        images = np.fft.irfft2(parts, s=drawn.shape)
         images[0] += 1.0
         return np.asarray(images)
 

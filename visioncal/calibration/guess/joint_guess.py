@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from visioncal.calibration.guess.fit import Fit, distances, is_about_one_axis, robust_fit
 from visioncal.calibration.guess.joint_readings import (
@@ -163,6 +162,8 @@ def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
 
 def _with_zeros(start: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
+    from scipy.optimize import minimize_scalar
+
     declared = start.reading
     revolute = ~declared.robot.chain.prismatic
     largest = 2.0 * _STEP_RAD if start.score < _MODEL_DEVIATION else _FARTHEST_RAD

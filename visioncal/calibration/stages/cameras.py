@@ -23,8 +23,6 @@ from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
-from visioncal.vision.dense import KINDS as DENSE_KINDS
-from visioncal.vision.dense import DenseCorners, find_densely
 from visioncal.vision.finders.template import refine
 from visioncal.vision.targets import first_corners
 
@@ -84,13 +82,15 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
 
 def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple[T, Detections]:
     """Brings in views whose images the template refuses, by all pixels of their boards."""
+    from visioncal.vision.dense import KINDS, DenseCorners, find_densely
+
     session, rows = seen.session, {view.number: view for view in views}
     refused = [
         view
         for view in (rows[rejection.view] for rejection in detections.rejections)
         if not view.has_corners
         and view.number not in detections.other_sizes
-        and session.boards[session.board_of(view)].kind in DENSE_KINDS
+        and session.boards[session.board_of(view)].kind in KINDS
     ]
 
     found: dict[int, DenseCorners] = {}

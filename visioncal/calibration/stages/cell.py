@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.priors import priors_of
@@ -85,30 +83,22 @@ class Cell:
 
     def connected_frames(self) -> tuple[str, ...]:
         """The frames that observations connect to the reference, in the tree's order."""
-        names = [_CELL, *self.tree.branches]
-        index = {name: at for at, name in enumerate(names)}
-        pairs = [
-            (index[name], index[branch.parent])
+        pairs = {
+            (name, branch.parent)
             for name, branch in self.tree.branches.items()
             if branch.known is not None
-        ]
-        pairs += [
-            (index[prior.first], index[prior.second])
-            for prior in self.priors
-            if prior.matrix is not None
-        ]
+        }
+        pairs |= {(prior.first, prior.second) for prior in self.priors if prior.matrix is not None}
         for seer, seen in {(row.seer, row.seen) for row in self.rows}:
             ends = [seer, seen]
             for step in self.tree.path(seer, seen):
                 if step.robot:
                     ends += [step.frame, self.tree.branches[step.frame].parent]
-            pairs += [(index[seer], index[end]) for end in ends]
-        links = coo_array(
-            (np.ones(len(pairs)), np.array(pairs, dtype=np.int64).reshape(-1, 2).T),
-            shape=(len(names), len(names)),
-        )
-        part = connected_components(links, directed=False)[1]
-        return tuple(branch for branch in self.tree.branches if part[index[branch]] == part[0])
+            pairs |= {(seer, end) for end in ends}
+        connected = {_CELL}
+        while beside := {end for pair in pairs if connected & {*pair} for end in pair} - connected:
+            connected |= beside
+        return tuple(branch for branch in self.tree.branches if branch in connected)
 
     def with_reference(self, reference: str) -> "Cell":
         """Returns the cell with a frame as its reference."""

@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from visioncal.calibration.stages.clock_sweep import ClockedViews, ClockPair
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -21,8 +21,10 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
 from visioncal.session.images import FolderImages
-from visioncal.vision.dense import DenseCorners
 from visioncal.vision.finders.identify import DESCRIBE_IT
+
+if TYPE_CHECKING:
+    from visioncal.vision.dense import DenseCorners
 
 # Views of one reason that are listed.
 _LISTED = 40
@@ -62,7 +64,7 @@ class Observed:
     notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
     # Corners by all pixels of images that the template refuses, by view; None where these are not
     # asked for.
-    dense: Mapping[int, DenseCorners] | None = None
+    dense: "Mapping[int, DenseCorners] | None" = None
     # Whether robots' poses are clearly misread, so that they determine nothing of lenses and
     # boards.
     is_misread: bool = False

@@ -20,16 +20,12 @@ from visioncal.interchange.exports.content import Format, Selection
 from visioncal.interchange.exports.sources import Source
 from visioncal.results import Calibration
 from visioncal.results.arm import JointRange
-from visioncal.robot import (
-    DHTable,
-    Robot,
+from visioncal.robot import DHTable, Robot, parallel_axes, table_from_document, table_of
+from visioncal.robot.writing import (
     corrected_tip,
     corrected_urdf,
     fit_links,
-    parallel_axes,
     small_urdf,
-    table_from_document,
-    table_of,
     table_toml,
     unexportable_functions,
     ur_flange,

@@ -7,15 +7,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from visioncal.core.documents import (
-    as_numbers,
-    is_number,
-    mapping,
-    number,
-    read_npz,
-    read_opencv,
-    read_xml,
-)
+from visioncal.core.documents import as_numbers, is_number, mapping, number
+from visioncal.core.documents.arrays import read_npz
+from visioncal.core.documents.opencv import read_opencv
+from visioncal.core.documents.xmls import read_xml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 

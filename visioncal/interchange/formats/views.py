@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.documents import is_number, read_npy, read_npz, read_table
+from visioncal.core.documents import is_number, read_table
+from visioncal.core.documents.arrays import read_npy, read_npz
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
