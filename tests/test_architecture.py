@@ -121,7 +121,7 @@ def test_heavy_libraries_enter_in_one_place():
             | {"xml.sax", "urllib.request", "scipy.optimize", "scipy.fft", "scipy.sparse.csgraph"}
             | {"scipy.stats", "scipy.ndimage", "scipy.signal", "scipy.interpolate"}
             | {"visioncal.robot.writing", "visioncal.vision.dense"}
-            | {"visioncal.core.documents.yamls"},
+            | {"visioncal.core.documents.structured"},
         ),
         # Calibrating a session drives no robot, and simulates none.
         (

@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 from visioncal.core.documents import as_numbers, parse_stored, read_json, read_table
 from visioncal.core.documents.arrays import read_npy, read_npz
 from visioncal.core.documents.jsons import parse_json
-from visioncal.core.documents.opencv import read_opencv
-from visioncal.core.documents.xmls import read_xml
-from visioncal.core.documents.yamls import parse_yaml, read_yaml
+from visioncal.core.documents.structured import parse_yaml, read_opencv, read_xml, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 

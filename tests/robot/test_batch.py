@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from visioncal.robot import load_robot, robot_names
-from visioncal.robot.batch import chain_frames
-from visioncal.robot.inverse import Inverse
+from visioncal.robot.inverse import Inverse, chain_frames
 
 ARMS = [name for name in robot_names() if load_robot(name).joint_count >= 6]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.urdf_arm import of_urdf, some_changes, some_joints
 
-from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import Robot, load_robot, robot_file, robot_names

@@ -17,8 +17,7 @@ from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
-from visioncal.vision.finders.headers import claimed_size
-from visioncal.vision.finders.imaging import blur_at_corners, decode_image
+from visioncal.vision.finders.imaging import blur_at_corners, claimed_size, decode_image
 from visioncal.vision.targets import charuco_board, corner_positions
 
 

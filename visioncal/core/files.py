@@ -1,20 +1,22 @@
-"""Reading and writing of files, and of the small TOML tables that describe boards and robots."""
+"""Reading and writing of files, temporary ones, and small TOML tables on boards and robots."""
 
 import hashlib
 import json
 import math
 import os
 import re
+import shutil
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.temporary_files import temporary_file
 
 
 def sha256(data: bytes) -> str:
@@ -424,3 +426,108 @@ class DocumentTable:
         if value not in choices:
             raise self.refuse(key, value, needed, did_you_mean(str(value), choices))
         return str(value)
+
+
+if sys.platform != "win32":
+    import fcntl
+
+# Lock file of a folder.
+LOCK = "lock"
+_NAME = re.compile(r"\.[0-9a-f]{32}\.tmp")
+
+
+def free_name(folder: Path) -> Path:
+    """An unused name in a folder; short, to leave room for long names within."""
+    return folder / f".{uuid4().hex}.tmp"
+
+
+@contextmanager
+def temporary_file(folder: Path) -> Iterator[Path]:
+    """Yields an empty temporary file, which is removed at the end if it still exists."""
+    with _temporary(folder, is_folder=False) as (path, _):
+        yield path
+
+
+@contextmanager
+def temporary_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
+    """Yields a temporary folder, which is removed at the end if it still exists.
+
+    Yields:
+        Its path, and whether it is locked, which needs a file system with locks.
+    """
+    with _temporary(folder, is_folder=True) as made:
+        yield made
+
+
+@contextmanager
+def _temporary(folder: Path, *, is_folder: bool) -> Iterator[tuple[Path, bool]]:
+    """Yields a file or folder `.HEX.tmp` under a lock (flock) that ends with its process.
+
+    An unlocked one is abandoned, and the next writer in the same folder removes it. Without such
+    locks (Windows, some network drives) they stay.
+    """
+    remove_abandoned(folder)
+    while True:
+        path = free_name(folder)
+        if is_folder:
+            path.mkdir()
+        else:
+            path.touch(exist_ok=False)
+        with locked(path / LOCK if is_folder else path, wait=True) as held:
+            # Another writer may have removed it as abandoned before it was locked.
+            if held is not False:
+                try:
+                    yield path, bool(held)
+                finally:
+                    _remove(path, is_folder=is_folder)
+                return
+
+
+def _remove(path: Path, *, is_folder: bool) -> None:
+    if is_folder:
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(path: Path, *, wait: bool) -> Iterator[bool | None]:
+    """Locks a file, which is created if needed.
+
+    Yields:
+        Whether the lock is held: not if another process has it (and `wait` is false), or the file
+        was moved or removed meanwhile. None where there are no locks.
+    """
+    if sys.platform == "win32":
+        path.touch()
+        yield None
+        return
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except FileNotFoundError:
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # A moved or removed file is another one.
+            is_locked: bool | None = os.path.samestat(os.fstat(descriptor), path.lstat())
+        except (BlockingIOError, FileNotFoundError):
+            is_locked = False
+        except OSError:
+            is_locked = None
+        yield is_locked
+    finally:
+        os.close(descriptor)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Removes the temporary files of killed processes from a folder, as far as possible."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        temporary = [entry for entry in entries if _NAME.fullmatch(entry.name)]
+        for entry in temporary:
+            path, is_folder = Path(entry.path), entry.is_dir(follow_symlinks=False)
+            with suppress(OSError), locked(path / LOCK if is_folder else path, wait=False) as held:
+                if held:
+                    _remove(path, is_folder=is_folder)

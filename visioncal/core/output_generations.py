@@ -21,8 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import flush_folder
-from visioncal.core.temporary_files import LOCK, free_name, locked, temporary_folder
+from visioncal.core.files import LOCK, flush_folder, free_name, locked, temporary_folder
 
 _SWITCH = ".visioncal-switch"
 _OLD, _NEW, _CURRENT = "old", "new", "current"

@@ -14,7 +14,6 @@ from visioncal.robot.conversion import (
     with_base,
     with_joint_offsets,
 )
-from visioncal.robot.drive_limits import DriveLimits
 from visioncal.robot.files import (
     ROBOT_SUFFIXES,
     load_robot,
@@ -32,11 +31,17 @@ from visioncal.robot.inertia import (
     symmetric_entries,
     symmetric_matrices,
 )
-from visioncal.robot.loads import Loads, Masses, deflected_joints, joint_deflections
+from visioncal.robot.loads import (
+    DriveLimits,
+    Loads,
+    Masses,
+    WeightFunctions,
+    deflected_joints,
+    joint_deflections,
+)
 from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
-from visioncal.robot.weights import WeightFunctions
 
 __all__ = [
     "FUNCTION_NAMES",

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.lapack import dposv
+from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.robot.batch import reached_from
+from visioncal.robot.chain import Chain
 from visioncal.robot.model import Robot
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ _ROTATION_WEIGHT = 1e-4
 # sixteen solutions, and half of the starts find one.
 _STARTS = 40
 _STEPS = 80
+# Newton steps of a batch: of poses in reach half converge, most of them within twenty.
+_BATCH_STEPS = 40
 # Relative gain in the sum of squares at which a search ends, and the final search from the nearest
 # posture.
 _SEARCH, _POLISH = 1e-3, 1e-9
@@ -117,7 +121,10 @@ class Inverse:
         self._model = robot.pinocchio_model
         self._data: pin.Data = self._model.createData()
         self._frame: int = self._model.getFrameId(robot.tip)
-        self._bounds = _Bounds(*_effective_limits(robot), ~chain.prismatic)
+        limits = np.array([chain.lower, chain.upper])
+        known = np.isfinite(limits)
+        limits = np.where(known, chain.effective(np.where(known, limits, 0.0)), limits)
+        self._bounds = _Bounds(limits[0], limits[1], ~chain.prismatic)
 
     def solve(
         self, base_from_flange: FloatArray, wanted: FloatArray, *, widest_rad: float = np.inf
@@ -296,9 +303,82 @@ def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray
     return np.asarray(solved @ jacobian if long else solved)
 
 
-def _effective_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper limits (n,) of the effective positions."""
-    limits = np.array([robot.lower_rad, robot.upper_rad])
-    known = np.isfinite(limits)
-    effective = np.where(known, robot.chain.effective(np.where(known, limits, 0.0)), limits)
-    return effective[0], effective[1]
+def chain_frames(chain: Chain, positions: FloatArray) -> FloatArray:
+    """Frames of the joints, after their motion, and of the tip, in the base.
+
+    Returns:
+        (m, n + 1, 4, 4) at (m, n) effective positions [m].
+    """
+    frames = np.zeros((len(positions), len(chain) + 1, 4, 4))
+    frames[..., 3, 3] = 1.0
+    rotation = np.broadcast_to(np.eye(3), (len(positions), 3, 3))
+    position = np.zeros((len(positions), 3))
+    for joint, placement in enumerate(chain.placements):
+        position = position + rotation @ placement[:3, 3]
+        rotation = rotation @ placement[:3, :3]
+        if joint < len(chain):
+            motion = positions[:, joint, None]
+            if chain.prismatic[joint]:
+                position = position + motion * (rotation @ chain.axes[joint])
+            else:
+                # Rodrigues' formula.
+                crossed = rotation @ skew(chain.axes[joint])
+                crossed_twice = crossed @ skew(chain.axes[joint])
+                motion = motion[:, :, None]
+                rotation = (
+                    rotation + np.sin(motion) * crossed + (1.0 - np.cos(motion)) * crossed_twice
+                )
+        frames[:, joint, :3, :3], frames[:, joint, :3, 3] = rotation, position
+    return frames
+
+
+def reached_from(
+    chain: Chain,
+    base_from_tip: FloatArray,
+    starts: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    good: float,
+) -> tuple[FloatArray, Mask]:
+    """Inverse kinematics by damped Newton steps from given postures.
+
+    The damping vanishes with the error (Sugihara 2011); an arm with more than six joints takes the
+    shortest step. Postures that do not converge in a few steps are given up.
+
+    Args:
+        chain: The arm, with six joints or more.
+        base_from_tip: (m, 4, 4) the poses [m].
+        starts: (m, n) effective positions to start from [rad or m].
+        bounds: (n,) least and greatest effective positions.
+        good: Greatest error of a reached pose [m and rad].
+
+    Returns:
+        (m, n) positions, and whether the pose was reached there (m,).
+    """
+    positions = np.clip(starts, *bounds)
+    active = np.arange(len(positions))
+    for step in range(_BATCH_STEPS + 1):
+        frames = chain_frames(chain, positions[active])
+        tip, wanted = frames[:, -1], base_from_tip[active]
+        turn = wanted[:, :3, :3] @ np.swapaxes(tip[:, :3, :3], 1, 2)
+        offset = wanted[:, :3, 3] - tip[:, :3, 3]
+        # (m, 6) rotation [rad] and translation [m], along the base's axes.
+        error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), offset], axis=1)
+        unreached = np.linalg.norm(error.reshape(-1, 2, 3), axis=2).max(axis=1) >= good
+        active, frames, error = active[unreached], frames[unreached], error[unreached]
+        if step == _BATCH_STEPS or not len(active):
+            break
+        joints = frames[:, :-1]
+        axes = (joints[..., :3, :3] @ chain.axes[:, :, None])[..., 0]
+        arms = np.cross(axes, frames[:, -1, None, :3, 3] - joints[..., :3, 3])
+        slides = chain.prismatic[:, None]
+        moves = [np.where(slides, 0.0, axes), np.where(slides, axes, arms)]
+        jacobian = np.swapaxes(np.concatenate(moves, axis=2), 1, 2)
+        gram = jacobian @ np.swapaxes(jacobian, 1, 2)
+        damping = np.sum(error**2, axis=1) + _FLOOR
+        gram += damping[:, None, None] * np.eye(6)
+        solved = np.linalg.solve(gram, error[:, :, None])
+        moved = positions[active] + (np.swapaxes(jacobian, 1, 2) @ solved)[:, :, 0]
+        positions[active] = np.clip(moved, *bounds)
+    reached = np.ones(len(positions), dtype=bool)
+    reached[active] = False
+    return positions, reached

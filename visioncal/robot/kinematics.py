@@ -10,9 +10,8 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
-from visioncal.robot.drive_limits import DriveLimits
 from visioncal.robot.inertia import Inertias
-from visioncal.robot.loads import Masses
+from visioncal.robot.loads import DriveLimits, Masses
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -179,7 +178,7 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
             culprits=[table.label],
             next_step="Leave the robot alone in it.",
         )
-    from visioncal.core.documents.xmls import parse_xml
+    from visioncal.core.documents.structured import parse_xml
 
     # Pinocchio's reader forgives what the readers of bodies and inertias do not.
     parse_xml(text.encode("utf-8"), f"{table.label}: the URDF")

@@ -21,10 +21,14 @@ if TYPE_CHECKING:
 
 # Keys of a link's mass in a joint's table.
 MASS_KEYS = ("mass_kg", "com_m")
+# Keys of the limits in a joint's table.
+RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 # Fixed-point iterations of the deflection: a deflection changes torques by about as large a share,
 # so that the remaining error is below its cube.
 _ITERATIONS = 3
+# Number of random postures, and relative singular value below which functions are dependent.
+_POSTURES, _RANK = 200, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,3 +220,84 @@ def joint_deflections(
     if moments is None:
         return np.asarray(deflections)
     return np.asarray(deflections + np.einsum("mjk,jk->mj", robot.weight_jacobian(q), moments))
+
+
+@dataclass(frozen=True, eq=False)
+class WeightFunctions:
+    """Independent gravity torque functions of each joint, for links of unknown masses.
+
+    The torque on a joint is linear in mass and first moments of all that moves with it (Khalil and
+    Dombre 2002, chapter 9); the independent combinations of these are functions of the posture.
+    """
+
+    # For each joint (4 n, r), the combinations of masses and first moments of its r functions,
+    # whose root mean square over postures is 1.
+    parts: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(cls, robot: "Robot") -> "WeightFunctions":
+        """Finds the functions of an arm, over random postures."""
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
+        jacobian = np.moveaxis(robot.weight_jacobian(q), 1, 0)
+        parts = []
+        for derivatives in jacobian:
+            _, sizes, vectors = np.linalg.svd(derivatives, full_matrices=False)
+            kept = sizes > _RANK * max(float(sizes.max(initial=0.0)), 1.0)
+            parts.append(np.sqrt(len(q)) * vectors[kept].T / sizes[kept])
+        return cls(tuple(parts))
+
+    @property
+    def size(self) -> int:
+        """Total number of functions."""
+        return sum(part.shape[1] for part in self.parts)
+
+    def values(self, robot: "Robot", q: FloatArray) -> FloatArray:
+        """Values (m, n, size) of the functions at (m, n) joint angles, zero for other joints."""
+        jacobian = robot.weight_jacobian(q)
+        values, at = np.zeros((*q.shape, self.size)), 0
+        for joint, part in enumerate(self.parts):
+            values[:, joint, at : at + part.shape[1]] = jacobian[:, joint] @ part
+            at += part.shape[1]
+        return values
+
+    def moments(self, values: Sequence[float] | FloatArray) -> FloatArray:
+        """Compliances times masses and moments, (n, 4 n), of (size,) coefficients."""
+        rows, at = [], 0
+        for part in self.parts:
+            rows.append(part @ np.asarray(values)[at : at + part.shape[1]])
+            at += part.shape[1]
+        return np.array(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveLimits:
+    """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints."""
+
+    velocity: FloatArray  # (n,) greatest speeds [rad/s].
+    acceleration: FloatArray  # (n,) greatest accelerations [rad/s^2].
+    torque: FloatArray  # (n,) greatest torques [N m].
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[DocumentTable]) -> "DriveLimits":
+        """Reads the limits from a table of joints.
+
+        Raises:
+            DataError: One is not positive.
+        """
+        limits = [
+            [row.number(key, positive=True) if key in row.content else np.inf for key in RATE_KEYS]
+            for row in rows
+        ]
+        return cls(*np.array(limits).T)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Entries of the joints' tables."""
+        columns = np.stack([self.velocity, self.acceleration, self.torque], axis=1)
+        return [
+            {
+                key: float(value)
+                for key, value in zip(RATE_KEYS, row, strict=True)
+                if np.isfinite(value)
+            }
+            for row in columns
+        ]

@@ -15,7 +15,6 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
-from visioncal.robot.drive_limits import RATE_KEYS, DriveLimits
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
 from visioncal.robot.kinematics import (
     arm_of_urdf,
@@ -26,7 +25,16 @@ from visioncal.robot.kinematics import (
     placement_derivatives,
     weight_jacobian,
 )
-from visioncal.robot.loads import MASS_KEYS, Loads, Masses, gravity_of, load_torques, masses_of_rows
+from visioncal.robot.loads import (
+    MASS_KEYS,
+    RATE_KEYS,
+    DriveLimits,
+    Loads,
+    Masses,
+    gravity_of,
+    load_torques,
+    masses_of_rows,
+)
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
-from visioncal.core.documents.xmls import parse_xml
+from visioncal.core.documents.structured import parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.transforms import compose, invert, log

@@ -9,8 +9,7 @@ from typing import Any
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import sha256, write_atomically
-from visioncal.core.temporary_files import temporary_folder
+from visioncal.core.files import sha256, temporary_folder, write_atomically
 from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES, robot_file
 from visioncal.session.corners import CornerTable
 from visioncal.session.document import Declaration

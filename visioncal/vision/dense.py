@@ -28,7 +28,7 @@ import numpy as np
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.finders import find_target
 from visioncal.vision.finders.result import DetectedCorners
-from visioncal.vision.print_shapes import dark_cells
+from visioncal.vision.printing.pattern import dark_cells
 from visioncal.vision.targets import corner_positions
 
 KINDS = ("charuco", "checkerboard")

@@ -31,9 +31,14 @@ from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fit
 from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.checkerboard import miscounted
-from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.imaging import blur_at_corners, decode_image, poor_image_reason
+from visioncal.vision.finders.imaging import (
+    MOST_PIXELS,
+    blur_at_corners,
+    claimed_size,
+    decode_image,
+    poor_image_reason,
+)
 from visioncal.vision.targets import corner_positions, point_numbers
 
 # Fewest corners of corners.csv: a homography takes four points.

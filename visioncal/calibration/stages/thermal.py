@@ -38,8 +38,7 @@ from visioncal.results.arm import (
     ViewDrift,
 )
 from visioncal.robot import Robot
-from visioncal.robot.thermal import Inputs, ThermalModel
-from visioncal.robot.thermal.heating import Kind
+from visioncal.robot.thermal import Inputs, Kind, ThermalModel
 from visioncal.session import Session
 from visioncal.session.kinds import name_of
 from visioncal.session.selecting import streams_of

@@ -30,8 +30,7 @@ from visioncal.estimation.solve import (
     robot_levels,
 )
 from visioncal.robot import Robot
-from visioncal.robot.thermal.heating import Heating, Inputs, Kind
-from visioncal.robot.thermal.model import ThermalModel
+from visioncal.robot.thermal import Heating, Inputs, Kind, ThermalModel
 
 # Relative growth per kelvin: 12e-6 of steel, 23e-6 of aluminium.
 _GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.types import Target

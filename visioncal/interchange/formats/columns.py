@@ -12,8 +12,7 @@ from visioncal.calibration.stages.motion import slow_and_new
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents import read_json, read_table
 from visioncal.core.documents.arrays import read_npy, read_npz
-from visioncal.core.documents.opencv import read_opencv
-from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.documents.structured import read_opencv, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray

@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, mapping, number
-from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.file_search import (

@@ -9,8 +9,7 @@ import numpy as np
 
 from visioncal.core.documents import as_numbers, is_number, mapping, number
 from visioncal.core.documents.arrays import read_npz
-from visioncal.core.documents.opencv import read_opencv
-from visioncal.core.documents.xmls import read_xml
+from visioncal.core.documents.structured import read_opencv, read_xml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import mapping, number, read_json
-from visioncal.core.documents.yamls import read_yaml
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats.file_search import head
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions

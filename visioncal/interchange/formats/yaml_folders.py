@@ -9,8 +9,8 @@ import numpy as np
 
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, mapping
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import read_plain_text
-from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, FloatArray
 from visioncal.interchange.formats.file_search import files_in, head, images_beside, number_in

@@ -14,8 +14,14 @@ import numpy as np
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import flush_folder, named_errors, read_bytes, read_toml, write_atomically
-from visioncal.core.temporary_files import remove_abandoned
+from visioncal.core.files import (
+    flush_folder,
+    named_errors,
+    read_bytes,
+    read_toml,
+    remove_abandoned,
+    write_atomically,
+)
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.core.version import __version__
 from visioncal.live.capture.take import TakenView

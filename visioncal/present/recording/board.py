@@ -6,7 +6,7 @@ import rerun as rr
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.present.recording import colours
-from visioncal.vision.print_shapes import dark_cells, dark_discs
+from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import corner_positions, extent_m
 
 # Resolution that shows the markers' bits, and the limit for a large board's pattern.

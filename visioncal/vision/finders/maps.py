@@ -149,34 +149,3 @@ def _terms(at: FloatArray) -> FloatArray:
     x, y = at[..., 0], at[..., 1]
     ones, xx, xy, yy = np.ones_like(x), x * x, x * y, y * y
     return np.stack([ones, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
-
-
-def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """One map from image coordinates to the whole board: a homography and a cubic polynomial.
-
-    Args:
-        board: (n, 2) corners on the board [squares].
-        places: (n, 2) their positions, in any two coordinates of a plane.
-
-    Returns:
-        Function that maps positions (..., 2) to the board.
-
-    Raises:
-        numpy.linalg.LinAlgError: The corners do not form a board.
-    """
-    flattened = _homography(places, board)
-    centre, size = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
-
-    def flat(at: FloatArray) -> FloatArray:
-        return np.asarray((flattened(at) - centre) / size)
-
-    offsets = (board - centre) / size - flat(places)
-    terms = _terms(flat(places))
-    ridge = len(board) * _RIDGE
-    coefficients = np.linalg.solve(terms.T @ terms + ridge, terms.T @ offsets)
-
-    def on_board(at: FloatArray) -> FloatArray:
-        flattened_at = flat(at)
-        return np.asarray(centre + size * (flattened_at + _terms(flattened_at) @ coefficients))
-
-    return on_board

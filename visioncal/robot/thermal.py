@@ -1,0 +1,434 @@
+"""Thermal drift of an arm: heating of its links, their growth, and online compensation.
+
+A link is one RC element: `tau ds/dt = rest - s`, with its steady-state temperature `rest`. Where
+temperatures of the joints are measured, that is the joint's, and tau is the link's lag behind its
+sensor; where only motor currents are recorded, it is the air's plus a gain times the squared
+current. From one sample to the next it is constant, at the mean, for which the step is exact.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray
+from visioncal.robot import Robot
+
+_MINUTES = 60.0
+# Horizon and step of the predicted drift rate [s].
+_AHEAD_S, _EVERY_S = 10 * 3600.0, 30.0
+# Time span over which rates of noisy measured temperatures are taken [s].
+_SPAN_S = 600.0
+# Greatest time constant of the warm-up [s], for rates that do not decrease visibly, and least
+# factor of the rate from one span to the next.
+_SLOWEST_S, _LEAST_SHARE = 3600.0, 1e-3
+
+
+Kind: TypeAlias = Literal["temperatures", "currents"]
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Recorded signals that heat an arm with n joints, at t samples."""
+
+    kind: Kind  # Whether joint temperatures or motor currents were recorded.
+    stamps_s: FloatArray  # (t,) ascending [s].
+    signal: FloatArray  # (t, n) joint temperatures [deg C], or squared motor currents [A^2].
+    # (t,) air temperature [deg C]; zero where not recorded: others are then relative.
+    ambient_c: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Heating:
+    """Heating model of n links."""
+
+    kind: Kind  # The recorded signal.
+    tau_s: FloatArray  # (n,) time constants [s].
+    # (n,) steady-state rise over the air per squared current [K/A^2]; ones for temperatures.
+    gain_k_per_a2: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of parameters: logarithms of the time constants, and of the gains."""
+        return len(self.tau_s) * (1 if self.kind == "temperatures" else 2)
+
+    def changed(self, steps: FloatArray) -> Self:
+        """The model after a step (size,) of its parameters."""
+        count = len(self.tau_s)
+        gain = self.gain_k_per_a2
+        if self.kind == "currents":
+            gain = gain * np.exp(steps[count:])
+        return replace(self, tau_s=self.tau_s * np.exp(steps[:count]), gain_k_per_a2=gain)
+
+    def rest(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
+        """Steady-state temperatures (t, n) of the links [deg C]."""
+        if self.kind == "temperatures":
+            return signal
+        return np.asarray(ambient_c[:, None] + self.gain_k_per_a2 * signal)
+
+    def cold(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
+        """(n,) link temperatures at the first sample, in equilibrium [deg C]."""
+        return signal[0] if self.kind == "temperatures" else np.full_like(signal[0], ambient_c[0])
+
+    def after(
+        self,
+        before: FloatArray,
+        jacobian: FloatArray,
+        rest: FloatArray,
+        driven: FloatArray,
+        seconds: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Link temperatures after a time at constant steady state, and their derivatives.
+
+        Args:
+            before: (n,) temperatures before it [deg C].
+            jacobian: (n, s) their derivatives over the parameters, in the order of `jacobian`.
+            rest: (n,) steady state [deg C].
+            driven: (n,) its part by motor currents [K].
+            seconds: Duration [s].
+
+        Returns:
+            (n,) temperatures [deg C], and (n, s) derivatives.
+        """
+        share = seconds / self.tau_s
+        kept = np.exp(-share)
+        after = kept[:, None] * jacobian
+        after[:, 0] += kept * share * (before - rest)
+        if self.kind == "currents":
+            after[:, 1] += (1.0 - kept) * driven
+        return rest + kept * (before - rest), after
+
+    def links_c(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
+        """Link temperatures (m, n) at (m,) times [deg C]."""
+        return self._at(inputs, at_s, self._course(inputs)[0])
+
+    def jacobian(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
+        """Derivatives of the link temperatures over the parameters.
+
+        Returns:
+            (m, n, s) over the parameters of the link's own joint: the logarithms of tau and, for
+            currents, of the gain.
+        """
+        states, rests, kept = self._course(inputs)
+        shares = np.diff(inputs.stamps_s)[:, None] / self.tau_s
+        by_tau = _scanned(np.zeros_like(states[:1]), kept, kept * shares * (states[:-1] - rests))
+        parts = [by_tau]
+        if self.kind == "currents":
+            # The states are linear in the steady state, of which the air's part does not depend on
+            # gains.
+            without_air = replace(inputs, ambient_c=np.zeros_like(inputs.ambient_c))
+            parts.append(self._course(without_air)[0])
+        return np.stack([self._at(inputs, at_s, part) for part in parts], axis=2)
+
+    def _course(self, inputs: Inputs) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """States (t, n) at the samples; steady states and decay factors (t - 1, n) between them."""
+        rest = self.rest(inputs.signal, inputs.ambient_c)
+        rests = 0.5 * (rest[:-1] + rest[1:])
+        kept = np.exp(-np.diff(inputs.stamps_s)[:, None] / self.tau_s)
+        first = self.cold(inputs.signal, inputs.ambient_c)[None]
+        return _scanned(first, kept, (1.0 - kept) * rests), rests, kept
+
+    def _at(self, inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
+        return np.stack([np.interp(at_s, inputs.stamps_s, column) for column in states.T], axis=1)
+
+
+def _scanned(first: FloatArray, kept: FloatArray, added: FloatArray) -> FloatArray:
+    """Solves `x[k + 1] = kept[k] x[k] + added[k]`, (t, n), by doubling (Hillis, Steele 1986)."""
+    kept = np.concatenate([np.ones_like(first), kept])
+    added = np.concatenate([first, added])
+    shift = 1
+    while shift < len(added):
+        added[shift:] = added[shift:] + kept[shift:] * added[:-shift]
+        kept[shift:] = kept[shift:] * kept[:-shift]
+        shift *= 2
+    return added
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalModel:
+    """An arm whose n joints each heat the link after them.
+
+    A link's lengths, a and d of its joint table, grow in proportion to the rise of its temperature,
+    and the joint's zero drifts with it.
+    """
+
+    robot: Robot  # The arm at the reference temperatures.
+    heating: Heating  # Heating model of the links.
+    reference_c: FloatArray  # (n,) reference temperatures of the links [deg C].
+    growth_per_k: FloatArray  # (n,) relative growth of links [1/K].
+    drift_rad_per_k: FloatArray  # (n,) drift of the joints' zeros [rad/K].
+    covariance: FloatArray  # (2 n + h, 2 n + h) of growth, drift and the heating's h parameters.
+    # (n + 1, 3) growing vectors from each joint's frame to the next, in the former [m].
+    lengths: FloatArray
+
+    @property
+    def joint_count(self) -> int:
+        """The number n of joints."""
+        return self.robot.joint_count
+
+    def columns(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Right perturbations (m, 6, n) of the flange for growth of links and rotation of joints.
+
+        Returns:
+            For a relative growth of 1 of each link, and for 1 rad of each joint, at (m, n) joint
+            angles [rad].
+        """
+        count = self.joint_count
+        placements = self.robot.placement_jacobian(q).reshape(len(q), 6, count + 1, 6)[:, :, 1:, 3:]
+        grown = np.einsum("mikj,kj->mik", placements, self._growing)
+        turned = self.robot.function_jacobian(q).reshape(len(q), 6, count, 4)[..., 0]
+        return np.asarray(grown), np.asarray(turned)
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        """Jacobian (m, 6, n) of the flange over the link temperatures [rad/K and m/K]."""
+        grown, turned = self.columns(q)
+        return np.asarray(grown * self.growth_per_k + turned * self.drift_rad_per_k)
+
+    def motion(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
+        """Displacement (m, 4, 4) of the flange from the reference, in its own frame."""
+        rises = self.rises(links_c)
+        return exp(np.einsum("mij,mj->mi", self.jacobian(q), np.broadcast_to(rises, q.shape)))
+
+    def base_from_flange(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
+        """Flange poses (m, 4, 4) [m] at joint angles (m, n) [rad] and temperatures (m, n) or (n,).
+
+        Raises:
+            DataError: The shapes do not match.
+        """
+        return np.asarray(self.robot.base_from_flange(q) @ self.motion(q, links_c))
+
+    def robot_at(self, links_c: FloatArray) -> Robot:
+        """The arm with its links at (n,) temperatures [deg C]."""
+        rises = self.rises(links_c)
+        placements, functions = np.zeros((self.joint_count + 1, 6)), np.zeros((len(rises), 4))
+        placements[1:, 3:] = self._growing * (self.growth_per_k * rises)[:, None]
+        functions[:, 0] = self.drift_rad_per_k * rises
+        return self.robot.corrected(placements, functions)
+
+    def basis(self, q: FloatArray, links_c: FloatArray, heated: FloatArray) -> FloatArray:
+        """Jacobian (m, 6, p) of the flange over all parameters, in the order of their covariance.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            links_c: (m, n) temperatures of the links [deg C].
+            heated: (m, n, k) their derivatives over the k kinds of heating parameters
+                (`Heating.jacobian`).
+        """
+        grown, turned = self.columns(q)
+        rises, jacobian = self.rises(links_c)[:, None, :], self.jacobian(q)
+        parts = [jacobian * heated[:, None, :, at] for at in range(heated.shape[2])]
+        return np.concatenate([grown * rises, turned * rises, *parts], axis=2)
+
+    def sigma_m(
+        self, q: FloatArray, links_c: FloatArray, heated: FloatArray | None = None
+    ) -> FloatArray:
+        """Predicted sigma (m,) of the flange's drift: root of the trace of its covariance [m].
+
+        Args:
+            q: (m, n) joint angles [rad].
+            links_c: (m, n) temperatures of the links, or (n,) for all [deg C].
+            heated: (m, n, k) as in `basis`; None leaves out the uncertainty of the heating.
+        """
+        links_c = np.broadcast_to(links_c, q.shape)
+        none = np.zeros((*q.shape, 0))
+        jacobian = self.basis(q, links_c, none if heated is None else heated)[:, 3:]
+        size = jacobian.shape[2]
+        covariance = jacobian @ self.covariance[:size, :size] @ np.swapaxes(jacobian, 1, 2)
+        return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
+
+    def rises(self, links_c: FloatArray) -> FloatArray:
+        """Rise of link temperatures over the reference [K].
+
+        Raises:
+            DataError: The number of temperatures differs from that of the joints.
+        """
+        links_c = np.asarray(links_c, dtype=float)
+        if not links_c.ndim or links_c.shape[-1] != self.joint_count:
+            raise DataError(
+                f"robot {self.robot.name}: temperatures of shape {links_c.shape} do not go with "
+                f"its {self.joint_count} joints; one for each joint is needed."
+            )
+        return np.asarray(links_c - self.reference_c)
+
+    @cached_property
+    def _growing(self) -> FloatArray:
+        """(n, 3) growing vectors of the links in the frames after them [m]."""
+        rotations = self.robot.chain.placements[1:, :3, :3]
+        return np.asarray(np.einsum("kji,kj->ki", rotations, self.lengths[1:]))
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Current drift rate of the flange, and time until it is below a limit."""
+
+    rate_um_min: float | None  # Drift rate of the flange now [um/min]; None after too few samples.
+    limit_um_min: float  # Its limit [um/min].
+    # Time until it is below the limit if work continues [s]; zero where it is already, None where
+    # it takes more than ten hours or after too few samples.
+    wait_s: float | None
+
+    @property
+    def words(self) -> str:
+        """The advice in a sentence."""
+        if self.rate_um_min is None:
+            return "Too few temperatures were given to say how fast the arm drifts."
+        now = f"The flange drifts by {self.rate_um_min:.2g} um/min"
+        if self.wait_s is None:
+            return f"{now} and does not come under {self.limit_um_min:g} within ten hours."
+        if self.wait_s <= 0.0:
+            return f"{now}, under the limit of {self.limit_um_min:g}: the arm is warm."
+        minutes = self.wait_s / _MINUTES
+        return f"{now}: go on warming up for {minutes:.0f} min to come under {self.limit_um_min:g}."
+
+
+class OnlineCompensator:
+    """Tracks the link temperatures of an arm, and gives its current model.
+
+    Feed it every measured sample. The links start in equilibrium: at the temperatures of their
+    joints at the first sample or, fed with currents, of the air.
+    """
+
+    def __init__(self, model: ThermalModel) -> None:
+        """Prepares a compensator without samples."""
+        self._model = model
+        self._stamps_s: list[float] = []
+        self._links: list[FloatArray] = []
+        none = np.zeros(model.joint_count)
+        # Steady state (n,) [deg C] at the last sample, its part by motor currents [K], and the
+        # derivatives (n, s) of the links' temperatures over the heating's parameters.
+        self._rest, self._driven = none, none
+        self._jacobian = np.zeros((len(none), model.heating.size // len(none)))
+
+    def feed(
+        self,
+        stamp_s: float,
+        *,
+        temperatures_c: FloatArray | None = None,
+        currents_a: FloatArray | None = None,
+        ambient_c: float | None = None,
+    ) -> None:
+        """Adds a sample.
+
+        Args:
+            stamp_s: Time, later than the sample before [s].
+            temperatures_c: (n,) of the joints, for a model of temperatures [deg C].
+            currents_a: (n,) of the motors, for a model of currents [A].
+            ambient_c: Of the air, with currents; that of the reference by default [deg C].
+
+        Raises:
+            DataError: Times do not ascend, the wrong signal was given, or numbers are missing.
+        """
+        heating, count = self._model.heating, self._model.joint_count
+        given = temperatures_c if heating.kind == "temperatures" else currents_a
+        signal = np.asarray([] if given is None else given, dtype=float)
+        if signal.shape != (count,) or not np.isfinite(signal).all():
+            raise DataError(
+                f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
+                f"sample, not {signal.tolist()}."
+            )
+        if self._stamps_s and stamp_s <= self._stamps_s[-1]:
+            raise DataError(
+                f"thermal: a sample at {stamp_s:g} s does not come after the one before, at "
+                f"{self._stamps_s[-1]:g} s."
+            )
+        signal = signal if heating.kind == "temperatures" else signal**2
+        air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
+        ambient = np.array([air])
+        rest = heating.rest(signal[None], ambient)[0]
+        driven = rest - air if heating.kind == "currents" else np.zeros(count)
+        links = heating.cold(signal[None], ambient)
+        if self._stamps_s:
+            links, self._jacobian = heating.after(
+                self._links[-1],
+                self._jacobian,
+                0.5 * (rest + self._rest),
+                0.5 * (driven + self._driven),
+                stamp_s - self._stamps_s[-1],
+            )
+        self._rest, self._driven = rest, driven
+        self._stamps_s.append(stamp_s)
+        self._links.append(links)
+        # Samples that are too old for the rates.
+        while len(self._stamps_s) > 2 and self._stamps_s[1] < stamp_s - 2.1 * _SPAN_S:
+            self._stamps_s.pop(0)
+            self._links.pop(0)
+
+    @property
+    def links_c(self) -> FloatArray:
+        """(n,) temperatures of the links now [deg C].
+
+        Raises:
+            DataError: There is no sample yet.
+        """
+        if not self._links:
+            raise DataError("thermal: the compensator was fed with no sample yet.")
+        return self._links[-1]
+
+    @property
+    def robot(self) -> Robot:
+        """Current model of the arm."""
+        return self._model.robot_at(self.links_c)
+
+    def base_from_flange(self, q: FloatArray) -> FloatArray:
+        """Current flange poses (m, 4, 4) at (m, n) joint angles [rad]."""
+        return self._model.base_from_flange(q, self.links_c)
+
+    def sigma_m(self, q: FloatArray) -> FloatArray:
+        """(m,) predicted sigma of the drift at (m, n) joint angles [m]; see `ThermalModel`.
+
+        Raises:
+            DataError: There is no sample yet.
+        """
+        jacobian = np.broadcast_to(self._jacobian, (len(q), *self._jacobian.shape))
+        return self._model.sigma_m(q, self.links_c, jacobian)
+
+    def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
+        """Tells whether the arm is warm enough for work, and otherwise how long to wait.
+
+        Args:
+            q: (n,) the posture at work [rad].
+            limit_um_min: Acceptable drift rate of the flange [um/min].
+
+        Raises:
+            DataError: The limit is not positive.
+        """
+        if not limit_um_min > 0.0:
+            raise DataError(f"thermal: a limit of {limit_um_min:g} um/min is not above zero.")
+        settling = self._settling()
+        if settling is None:
+            return Advice(None, limit_um_min, None)
+        speeds, tau_s = settling
+        jacobian = 1e6 * _MINUTES * self._model.jacobian(q[None])[0, 3:]
+        ahead = np.arange(0.0, _AHEAD_S, _EVERY_S)
+        speeds = speeds * np.exp(-ahead[:, None] / tau_s)
+        rates = np.linalg.norm(speeds @ jacobian.T, axis=1)
+        over = np.flatnonzero(rates >= limit_um_min)
+        if not len(over):
+            wait = 0.0
+        elif over[-1] + 1 < len(ahead):
+            wait = float(ahead[over[-1] + 1])
+        else:
+            wait = None
+        return Advice(float(rates[0]), limit_um_min, wait)
+
+    def _settling(self) -> tuple[FloatArray, FloatArray] | None:
+        """Warm-up rates (n,) [K/s] and time constants (n,) [s]; None after too few samples."""
+        heating = self._model.heating
+        if heating.kind == "currents":
+            if not self._links:
+                return None
+            return (self._rest - self._links[-1]) / heating.tau_s, heating.tau_s
+        stamps = np.array(self._stamps_s)
+        if not len(stamps) or stamps[-1] - stamps[0] < 2.0 * _SPAN_S:
+            return None
+        then = stamps[-1] - _SPAN_S * np.arange(3)
+        links = [np.interp(then, stamps, column) for column in np.array(self._links).T]
+        latest, earlier = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
+        # One factor for all joints: those of single joints would follow each work cycle.
+        decay = float(latest @ earlier) / max(float(earlier @ earlier), 1e-12)
+        decay = min(max(decay, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
+        tau_s = np.full_like(latest, -_SPAN_S / np.log(decay))
+        return latest, np.maximum(tau_s, heating.tau_s)
