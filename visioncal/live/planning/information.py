@@ -115,6 +115,10 @@ class World:
     gradient: FloatArray
     held: int
 
+    def of_candidates(self, rows: IntArray) -> "World":
+        """Returns the same world with some of the candidates."""
+        return replace(self, factors=self.factors[rows], unestimated=self.unestimated[rows])
+
     def with_known_lens_board(self) -> "World":
         """Returns the same world with lens and board known exactly."""
         kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.shared_count))

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
@@ -25,6 +26,22 @@ from visioncal.vision.targets import corner_positions
 _LOOKS = 40
 # Stops that together add less to the probability are not worth taking.
 _NEARLY = 0.01
+# Possible limits, each with its remedy.
+_REMEDIES = {
+    "looks": (
+        "the uncertainty of the board's size and the lens",
+        "measure the print over many squares, and state its square_sigma_m",
+    ),
+    "arm": (
+        "errors of the arm that go with its posture",
+        "record joint angles (q1_rad ...) with all views, and they are calibrated",
+    ),
+    "noise": (
+        "the robot's own noise at look and pick",
+        "let it come to rest, look from nearer, or state its noise if it is less (--noise-mm, "
+        "--noise-deg)",
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +73,12 @@ class Picking:
             chances.append(chance_within(covariances, turn_rad, shift_m))
         return float(np.mean(chances))
 
-    def fewest(self, rows: IntArray) -> int:
-        """Least number of the first candidates that are enough, or nearly as good as all."""
-        share = self.share_of(rows)
+    def fewest(self, rows: IntArray) -> tuple[int, float]:
+        """Least number of the first candidates that are enough, and the probability to reach.
+
+        That is the required one, or nearly that of all of them.
+        """
+        share = min(NeedLimits.probability[0], self.chance(rows) - _NEARLY)
         # The probability rises with each stop: bisection.
         least, most = 0, len(rows)
         while least < most:
@@ -67,11 +87,7 @@ class Picking:
                 most = middle
             else:
                 least = middle + 1
-        return least
-
-    def share_of(self, rows: IntArray) -> float:
-        """Probability to reach: the required one, or nearly that of some candidates."""
-        return min(NeedLimits.probability[0], self.chance(rows) - _NEARLY)
+        return least, share
 
 
 @dataclass(frozen=True)
@@ -98,10 +114,19 @@ def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
     if probability < least:
         stops = f"{len(rows)} stops predict that {percent(probability)} of picks land within "
         words = f"{stops}{words_of(picking.need)}; {percent(least)} are needed. "
-        if best >= least:
-            words += f"More than {count} stops are needed: all candidates give {percent(best)}."
-        else:
-            words += f"All candidates together give {percent(best)}. {_main_limit(picking, every)}"
+    if words and best >= least:
+        words += f"More than {count} stops are needed: all candidates give {percent(best)}."
+    elif words:
+        without = {name: picking.chance(every, without=name) for name in _REMEDIES}
+        most = max(without, key=lambda name: without[name])
+        cause, advice = _REMEDIES[most]
+        is_all = without[most] >= least
+        words += (
+            f"All candidates together give {percent(best)}. "
+            f"{'In the way' if is_all else 'The most of what is in the way'} is {cause} "
+            f"({percent(without[most])} without it): {advice}."
+            f"{'' if is_all else ' A larger board or a nearer camera helps, too.'}"
+        )
     return NeedPlanned(picking.need, picking.chance(rows[:0]), probability, best, words)
 
 
@@ -145,49 +170,16 @@ def _pick_covariances(
     middle = corner_positions(cell.target).mean(axis=0)
     points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]
-    jacobian = _point_jacobians(points)
-    jacobian[:, :3], jacobian[:, 3:] = (
-        turn @ jacobian[:, :3],
-        turn @ jacobian[:, 3:],
-    )
+
+    def by_frame(points: FloatArray) -> FloatArray:
+        """Jacobians (k, 6, 6) of poses at (k, 3) points in the pose of the frame they are in."""
+        jacobians = np.tile(np.eye(6), (len(points), 1, 1))
+        jacobians[:, 3:, :3] = -skew(points)
+        return jacobians
+
+    jacobian = block_diag(turn, turn) @ by_frame(points)
     covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
     if cell.mount == "eye-in-hand":
-        flange_jacobian = _point_jacobians(points @ turn.T + cell.x[:3, 3])
-        covariances = covariances + (flange_jacobian * noise) @ np.swapaxes(flange_jacobian, 1, 2)
+        by_flange = by_frame(points @ turn.T + cell.x[:3, 3])
+        covariances = covariances + (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
     return np.asarray(covariances)
-
-
-def _point_jacobians(points: FloatArray) -> FloatArray:
-    """Jacobians (k, 6, 6) of poses at (k, 3) points in the pose of the frame that carries them."""
-    jacobians = np.tile(np.eye(6), (len(points), 1, 1))
-    jacobians[:, 3:, :3] = -skew(points)
-    return jacobians
-
-
-# Possible limits, each with its remedy.
-_REMEDIES = {
-    "looks": (
-        "the uncertainty of the board's size and the lens",
-        "measure the print over many squares, and state its square_sigma_m",
-    ),
-    "arm": (
-        "errors of the arm that go with its posture",
-        "record joint angles (q1_rad ...) with all views, and they are calibrated",
-    ),
-    "noise": (
-        "the robot's own noise at look and pick",
-        "let it come to rest, look from nearer, or state its noise if it is less (--noise-mm, "
-        "--noise-deg)",
-    ),
-}
-
-
-def _main_limit(picking: Picking, every: IntArray) -> str:
-    """States the most important limit, and whether removing it would be enough."""
-    without = {name: picking.chance(every, without=name) for name in _REMEDIES}
-    most = max(without, key=lambda index: without[index])
-    cause, advice = _REMEDIES[most]
-    words = f"is {cause} ({percent(without[most])} without it): {advice}."
-    if without[most] >= NeedLimits.probability[0]:
-        return f"In the way {words}"
-    return f"The most of what is in the way {words} A larger board or a nearer camera helps, too."

@@ -34,7 +34,6 @@ from visioncal.live.planning.pick_probability import (
 )
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import SessionStart
-from visioncal.robot import Robot
 
 # Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
 # to six for 8 to 30 stops.
@@ -172,11 +171,6 @@ class _Planning:
     worlds: tuple[World, ...]  # Their information in each of the cells.
     begun: SessionStart | None  # Session to which the stops are added; None for none.
 
-    @property
-    def recorded(self) -> int:
-        """Number of stops that were recorded already."""
-        return 0 if self.begun is None else len(self.begun.views)
-
     def drivable_design(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
         """Chooses stops that a safe path connects.
 
@@ -197,7 +191,12 @@ class _Planning:
             reached = np.setdiff1d(design.rows, unreachable)
             if attempt and len(reached):
                 # Otherwise each would be replaced by another in the same part of the workspace.
-                unreachable = self._nearer_to_lost(remaining, unreachable, reached)
+                q = self.found.q
+                to_lost, to_reached = (
+                    np.linalg.norm(q[remaining][:, None] - q[rows], axis=2).min(axis=1)
+                    for rows in (unreachable, reached)
+                )
+                unreachable = remaining[to_lost < to_reached]
             remaining = np.setdiff1d(remaining, unreachable)
         obstacles = tuple(dict.fromkeys(blockers))
         raise DataError(
@@ -207,42 +206,38 @@ class _Planning:
             next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
         )
 
-    def _nearer_to_lost(self, remaining: IntArray, lost: IntArray, reached: IntArray) -> IntArray:
-        """Remaining candidates whose joints are nearer to lost stops than to any reached one."""
-        q = self.found.q
-        to_lost, to_reached = (
-            np.linalg.norm(q[remaining][:, None] - q[rows], axis=2).min(axis=1)
-            for rows in (lost, reached)
-        )
-        return np.asarray(remaining[to_lost < to_reached])
-
     def _smallest_design(self, rows: IntArray) -> Design:
         """Design with the fewest stops that meet wish and need, or as many as are allowed."""
-        request, needed_stops = self.request, CalibrationLimits.stops[0]
-        worlds = tuple(
-            replace(world, factors=world.factors[rows], unestimated=world.unestimated[rows])
-            for world in self.worlds
-        )
-
-        def design_of(count: int) -> Design:
-            return choose_stops(worlds, count, wish=request.wish)
-
-        design = design_of(request.count)
+        request, recorded = self.request, () if self.begun is None else self.begun.views
+        needed_stops = CalibrationLimits.stops[0] - len(recorded)
+        worlds = tuple(world.of_candidates(rows) for world in self.worlds)
+        design = choose_stops(worlds, request.count, wish=request.wish)
         if not len(design.rows):
-            raise _wish_met_error(design)
+            before = design.before
+            raise DataError(
+                "plan: the wish is met by what was recorded, which predicts "
+                f"{mm_and_deg(before.mm, before.deg)}; no stop needs to be added.",
+                next_step="Wish for more, or leave the wish out to see what further stops would "
+                "give.",
+            )
         if request.need is not None:
             picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
-            fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
-            if fewest == 0 and self.recorded >= needed_stops:
-                raise _need_met_error(request.need, picking.chance(design.rows[:0]))
+            fewest, share = picking.fewest(design.rows)
+            if fewest == 0 and needed_stops <= 0:
+                before = percent(picking.chance(design.rows[:0]))
+                raise DataError(
+                    f"plan: by what was recorded, {before} of picks land within "
+                    f"{words_of(request.need)}; no stop needs to be added.",
+                    next_step="Need less than that, or leave the need out to see what stops would "
+                    "give.",
+                )
             # Fewer stops may be informative enough, but would not reveal an outlier among them.
-            fewest = max(fewest, needed_stops - self.recorded)
+            fewest = max(fewest, needed_stops)
             # The first stops of a large design are not the best small design, which may need one
             # stop less.
             for count in range(max(fewest - 1, 1), len(design.rows)):
-                smaller = design_of(count)
-                enough = count >= needed_stops - self.recorded
-                if enough and picking.chance(smaller.rows) >= share:
+                smaller = choose_stops(worlds, count, wish=request.wish)
+                if count >= needed_stops and picking.chance(smaller.rows) >= share:
                     design = smaller
                     break
         return replace(design, rows=rows[design.rows])
@@ -278,23 +273,6 @@ class _Planning:
             )
             for row, via in zip(route.order, segments, strict=True)
         )
-
-
-def _need_met_error(need: Need, before: float) -> DataError:
-    return DataError(
-        f"plan: by what was recorded, {percent(before)} of picks land within {words_of(need)}; "
-        "no stop needs to be added.",
-        next_step="Need less than that, or leave the need out to see what stops would give.",
-    )
-
-
-def _wish_met_error(design: Design) -> DataError:
-    before = design.before
-    return DataError(
-        "plan: the wish is met by what was recorded, which predicts "
-        f"{mm_and_deg(before.mm, before.deg)}; no stop needs to be added.",
-        next_step="Wish for more, or leave the wish out to see what further stops would give.",
-    )
 
 
 def stop_contributions(
@@ -348,7 +326,10 @@ def _motion_words(
     if abs(axis @ flange_from_cam[:3, 2]) > _NEARLY_AXIS:
         return f"turn about the optical axis {degrees}"
     verb = "turn" if abs(axis[2]) > np.linalg.norm(axis[:2]) else "tilt"
-    return f"{verb} about the tool's {_axis_words(axis)} {degrees}"
+    # One axis, or the two that it lies between.
+    first, second = np.argsort(-np.abs(axis))[:2].tolist()
+    names = "xyz"[first] + (f" and {'xyz'[second]}" if abs(axis[second]) > _ASIDE else "")
+    return f"{verb} about the tool's {names} {degrees}"
 
 
 def _effect_words(
@@ -359,36 +340,27 @@ def _effect_words(
     history: Sequence[Accuracy],
 ) -> str:
     """Describes a stop's effect; `history` is the accuracy without it and with it."""
+    drops = np.diag(before - after)
     if purpose.judged == "sight":
-        return _edge_effect_words(before, after)
-    sigma_before, sigma_after = (1e-3 * accuracy.mm for accuracy in history)
-    joint = _joint_determined(cell.robot, purpose, np.diag(before - after))
-    change = _change_words(
-        "the error over the workspace", sigma_before, sigma_after, is_rotation=False
-    )
-    return f"{change}; most information on {joint}"
-
-
-def _joint_determined(robot: Robot, purpose: Purpose, drops: FloatArray) -> str:
-    """Joint whose errors' variances drop most, from the (p,) drops of all unknowns."""
-    count = robot.joint_count
+        # The component of x that improves most, along or about the camera's axes.
+        component = int(np.argmax(drops[:6] * np.repeat([_LEVER_M**2, 1.0], 3)))
+        axis = ("the image's x", "the image's y", "the optical axis")[component % 3]
+        is_rotation = component < 3
+        sigmas = (float(np.sqrt(array[component, component])) for array in (before, after))
+        words = f"the error {'about' if is_rotation else 'along'} {axis}"
+        return _change_words(words, *sigmas, is_rotation=is_rotation)
+    # The joint whose errors' variances drop most.
+    count = cell.robot.joint_count
     by_joint, remaining = np.zeros(count), drops
     for name in reversed(tuple(purpose.blocks)):
         remaining, block = np.split(remaining, [len(remaining) - block_size(name, count)])
         # Values of links are grouped by joint, six each; other blocks are grouped by function.
         values = block.reshape(count, -1) if name == "links" else block.reshape(-1, count).T
         by_joint += values.sum(axis=1)
-    return robot.joint_names[int(np.argmax(by_joint))]
-
-
-def _edge_effect_words(before: FloatArray, after: FloatArray) -> str:
-    """Describes the component of x that improves most, along or about the camera's axes."""
-    drops = np.diag(before - after)[:6] * np.repeat([_LEVER_M**2, 1.0], 3)
-    component = int(np.argmax(drops))
-    axis = ("the image's x", "the image's y", "the optical axis")[component % 3]
-    words = f"the error {'about' if component < 3 else 'along'} {axis}"
-    sigma_was, sigma_is = (float(np.sqrt(array[component, component])) for array in (before, after))
-    return _change_words(words, sigma_was, sigma_is, is_rotation=component < 3)
+    sigmas = (1e-3 * accuracy.mm for accuracy in history)
+    change = _change_words("the error over the workspace", *sigmas, is_rotation=False)
+    joint = cell.robot.joint_names[int(np.argmax(by_joint))]
+    return f"{change}; most information on {joint}"
 
 
 def _change_words(what: str, before: float, after: float, *, is_rotation: bool) -> str:
@@ -413,9 +385,3 @@ def _change_words(what: str, before: float, after: float, *, is_rotation: bool) 
         if share > least:
             return f"{verb.format(what)} {figures}"
     return f"cuts {what} {1 / share:.0f}-fold {figures}"
-
-
-def _axis_words(axis: FloatArray) -> str:
-    """Names a unit vector after one axis, or the two that it lies between."""
-    first, second = np.argsort(-np.abs(axis))[:2].tolist()
-    return "xyz"[first] + (f" and {'xyz'[second]}" if abs(axis[second]) > _ASIDE else "")
