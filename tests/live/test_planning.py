@@ -19,7 +19,7 @@ from visioncal.live.planning.information import predict_worlds, stop_factors
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import RoughEdges, start_from_session
-from visioncal.live.planning.visibility import board_views
+from visioncal.live.planning.visibility import BoardViews
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, Second, fine_camera, simulate
 from visioncal.vision.targets import extent_m
@@ -203,8 +203,8 @@ def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
     # The fit places camera and board to a tenth of a millimetre.
     assert found.observed_distances_m == pytest.approx((away.min(), away.max()), abs=1e-3)
     # Farther off than where the board fills the image, as a camera at the cell's edge looks.
-    near, far = board_views(replace(found, observed_distances_m=None), 0).distance_m
-    wider = board_views(replace(found, observed_distances_m=(3.0 * near, 3.0 * far)), 0).distance_m
+    near, far = BoardViews(replace(found, observed_distances_m=None), 0).distance_m
+    wider = BoardViews(replace(found, observed_distances_m=(3.0 * near, 3.0 * far)), 0).distance_m
     assert wider[0] == near
     assert wider[1] > 3.0 * far
 

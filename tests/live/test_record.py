@@ -26,9 +26,8 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
 from visioncal.live.capture.cell import HostClock
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import PlanFile, read_plan
+from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.written import plan_document
 from visioncal.present.recording import paths
 from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
 from visioncal.present.viewer import live as viewer

@@ -27,8 +27,8 @@ from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.messages import summary_of
 from visioncal.live.planning.plan import PlanRequest, make_plan
+from visioncal.live.planning.plan_file import plan_document
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.written import plan_document
 from visioncal.live.simulated.cell import Bench
 from visioncal.simulation.arms import forward
 from visioncal.simulation.truth import truth_of, write_truth

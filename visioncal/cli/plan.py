@@ -50,7 +50,7 @@ def plan_command(
     """
     from visioncal.cli.planned_cell import chosen_part, find_source
     from visioncal.live.planning.plan import make_plan
-    from visioncal.live.planning.written import plan_document
+    from visioncal.live.planning.plan_file import plan_document
 
     limits, boxes = sight.limits(kept), kept.bodies
     purpose_of(wanted.purpose, "--for")

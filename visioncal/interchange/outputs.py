@@ -158,7 +158,7 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
         preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
         write_preview(path, preview, plan_blueprint(preview))
 
-    from visioncal.live.planning.written import program_of, stops_table
+    from visioncal.live.planning.plan_file import program_of, stops_table
 
     texts = {PLAN: json_text(document), STOPS: stops_table(plan)}
     if program := program_of(plan):

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collision_model
-from visioncal.live.planning.visibility import Occlusion, board_views
+from visioncal.live.planning.visibility import BoardViews, Occlusion
 from visioncal.robot import Robot
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
@@ -123,8 +123,8 @@ class _CandidateSearch:
         self._least_share, self._distances_narrowed = _SHARES[0], False
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
-        self._sight = board_views(cell, seed)
-        self._shade = Occlusion.of(cell, np.vstack([self._sight.outline, self._sight.centre]))
+        self._sight = BoardViews(cell, seed)
+        self._shade = Occlusion(cell, np.vstack([self._sight.outline, self._sight.centre]))
         self.collisions = collision_model(cell)
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []

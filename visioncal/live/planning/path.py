@@ -24,11 +24,42 @@ _MOST_FAILED = 60
 _ASIDE_RAD = 1.5
 
 
-class Detours:
+class _Tree:
+    """Tree of postures that can be reached from its root."""
+
+    def __init__(self, root: FloatArray) -> None:
+        self.postures, self.parents = [root], [0]
+
+    def grow(self, goal: FloatArray, steps: int, collisions: Collisions) -> int | None:
+        """Grows towards a posture until it is blocked; returns its last new node."""
+        place, new = int(np.linalg.norm(np.array(self.postures) - goal, axis=1).argmin()), None
+        for _ in range(steps):
+            difference = goal - self.postures[place]
+            distance = float(np.linalg.norm(difference))
+            if distance == 0.0:
+                return place
+            posture = goal
+            if distance > _STEP_RAD:
+                posture = self.postures[place] + difference * (_STEP_RAD / distance)
+            if collisions.path_contact(self.postures[place], posture) >= 0:
+                break
+            self.postures.append(posture)
+            self.parents.append(place)
+            place = new = len(self.postures) - 1
+        return new
+
+    def to_root(self, place: int) -> list[FloatArray]:
+        """Postures from a node to the root."""
+        path = [place]
+        while path[-1]:
+            path.append(self.parents[path[-1]])
+        return [self.postures[index] for index in path]
+
+
+class _Detours:
     """Planner of collision-free paths between postures."""
 
     def __init__(self, cell: PlanCell, collisions: Collisions, seed: int) -> None:
-        """Prepares the search for a cell."""
         margin = cell.limits.joint_margin_rad
         self._lower = cell.robot.lower_rad + margin
         self._upper = cell.robot.upper_rad - margin
@@ -50,85 +81,35 @@ class Detours:
         if detour is None:
             self._failed_searches += 1
             return blocked
-        return self._shortcut(detour)[1:-1]
+        # Postures that a straight path can skip are removed.
+        kept, last = [], 0
+        while last < len(detour) - 1:
+            ahead = range(len(detour) - 1, last + 1, -1)
+            contact = self._collisions.path_contact
+            clear = (index for index in ahead if contact(detour[last], detour[index]) < 0)
+            last = next(clear, last + 1)
+            kept.append(detour[last])
+        return np.array(kept[:-1]).reshape(-1, len(start))
 
-    def _rrt_connect(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
+    def _rrt_connect(self, start: FloatArray, end: FloatArray) -> list[FloatArray] | None:
         """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000).
 
         Returns:
-            (j, n) postures from start to end; None where the trees did not meet.
+            Postures (n,) from start to end; None where the trees did not meet.
         """
         low = np.maximum(np.minimum(start, end) - _ASIDE_RAD, self._lower)
         high = np.minimum(np.maximum(start, end) + _ASIDE_RAD, self._upper)
-        trees = (_PostureTree(start), _PostureTree(end))
+        trees = (_Tree(start), _Tree(end))
         for draw in range(_DRAWS):
             near, far = trees if draw % 2 == 0 else trees[::-1]
-            grown = self._grow(near, self._rng.uniform(low, high), steps=1)
+            grown = near.grow(self._rng.uniform(low, high), 1, self._collisions)
             if grown is None:
                 continue
-            met = self._grow(far, near.postures[grown], steps=_DRAWS)
+            met = far.grow(near.postures[grown], _DRAWS, self._collisions)
             if met is not None and np.array_equal(far.postures[met], near.postures[grown]):
-                halves = [near.to_root(grown)[::-1], far.to_root(met)[1:]]
-                path = np.vstack(halves)
+                path = near.to_root(grown)[::-1] + far.to_root(met)[1:]
                 return path if near is trees[0] else path[::-1]
         return None
-
-    def _grow(self, tree: "_PostureTree", goal: FloatArray, steps: int) -> int | None:
-        """Grows a tree towards a posture until it is blocked; returns its last new node."""
-        place, new = tree.nearest(goal), None
-        for _ in range(steps):
-            difference = goal - tree.postures[place]
-            distance = float(np.linalg.norm(difference))
-            if distance == 0.0:
-                return place
-            posture = (
-                goal
-                if distance <= _STEP_RAD
-                else tree.postures[place] + difference * (_STEP_RAD / distance)
-            )
-            if self._collisions.path_contact(tree.postures[place], posture) >= 0:
-                break
-            place = new = tree.add(posture, place)
-        return new
-
-    def _shortcut(self, path: FloatArray) -> FloatArray:
-        """Removes postures that a straight path can skip."""
-        kept, last = [0], 0
-        while last < len(path) - 1:
-            ahead = range(len(path) - 1, last + 1, -1)
-            clear = (
-                index
-                for index in ahead
-                if self._collisions.path_contact(path[last], path[index]) < 0
-            )
-            last = next(clear, last + 1)
-            kept.append(last)
-        return np.asarray(path[kept])
-
-
-class _PostureTree:
-    """Tree of postures that can be reached from its root."""
-
-    def __init__(self, root: FloatArray) -> None:
-        self.postures = [root]
-        self._parents = [0]
-
-    def add(self, posture: FloatArray, parent: int) -> int:
-        """Adds a posture after its parent, and returns its index."""
-        self.postures.append(posture)
-        self._parents.append(parent)
-        return len(self.postures) - 1
-
-    def nearest(self, goal: FloatArray) -> int:
-        """Index of the posture nearest to a goal."""
-        return int(np.linalg.norm(np.array(self.postures) - goal, axis=1).argmin())
-
-    def to_root(self, place: int) -> FloatArray:
-        """Postures (j, n) from a node to the root."""
-        path = [place]
-        while path[-1]:
-            path.append(self._parents[path[-1]])
-        return np.array([self.postures[index] for index in path])
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,44 +152,34 @@ def order_stops(
         DataError: The start violates the clearance.
     """
     collisions = collisions or collision_model(cell)
-    if start_q is not None:
-        _check_start(cell, collisions, start_q)
-    detours = Detours(cell, collisions, seed)
-    best: _Tour | None = None
+    if start_q is not None and (contact := int(collisions.first_contact(start_q[None])[0])) >= 0:
+        first_body, second_body = collisions.names[contact]
+        apart_m, needed_m = collisions.distances(start_q)[contact], collisions.needed_m()[contact]
+        raise DataError(
+            f"plan: where the arm starts, {first_body} and {second_body} are {1e3 * apart_m:.0f} "
+            f"mm apart; {1e3 * needed_m:.0f} mm and a little more are needed.",
+            culprits=[first_body, second_body],
+            next_step="Drive the arm clear by hand, or begin the plan at its first stop. The "
+            f"clearance is {1e3 * cell.limits.clearance_m:.0f} mm.",
+        )
+    detours = _Detours(cell, collisions, seed)
+    best = _Tour(detours, start_q, q)
     first = int(np.linalg.norm(q - np.median(q, axis=0), axis=1).argmax()) if len(q) else 0
     for _ in range(1 if start_q is not None else _STARTS):
         order = _short_order(start_q, q, first)
         tour = _Tour(detours, start_q, q)
         tour.walk(order)
-        if best is None or len(tour.order) > len(best.order):
-            best = tour
+        best = max(best, tour, key=lambda one: len(one.order))
         if len(best.order) > _MOST * len(q):
             break
         first = next((row for row in order if row not in best.order), first)
-    if best is None:
-        return Route((), (), 0.0, {})
     return best.route(collisions)
-
-
-def _check_start(cell: PlanCell, collisions: Collisions, start_q: FloatArray) -> None:
-    contact = int(collisions.first_contact(start_q[None])[0])
-    if contact >= 0:
-        first, second = collisions.names[contact]
-        apart = float(collisions.distances(start_q)[contact])
-        needed = float(collisions.needed_m()[contact])
-        raise DataError(
-            f"plan: where the arm starts, {first} and {second} are {1e3 * apart:.0f} mm apart; "
-            f"{1e3 * needed:.0f} mm and a little more are needed.",
-            culprits=[first, second],
-            next_step="Drive the arm clear by hand, or begin the plan at its first stop. The "
-            f"clearance is {1e3 * cell.limits.clearance_m:.0f} mm.",
-        )
 
 
 class _Tour:
     """Path that is extended stop by stop."""
 
-    def __init__(self, detours: Detours, start_q: FloatArray | None, q: FloatArray) -> None:
+    def __init__(self, detours: _Detours, start_q: FloatArray | None, q: FloatArray) -> None:
         self.order: list[int] = []
         self._detours, self._start, self._q = detours, start_q, q
         # Path to each stop of the order; None for the first where there is no start.
@@ -276,22 +247,17 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
         remaining.remove(order[-1])
     tour = np.array(order)
     for _ in range(_ROUNDS):
-        if not _improve_by_reversals(tour, distance):
+        gained = False
+        for i in range(1, len(tour) - 1):
+            # Reversing i..j changes the segments into i and out of j; there is none out of the end.
+            ends = tour[i + 1 :]
+            after = np.append(tour[i + 2 :], -1)
+            onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
+            gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
+            j = int(gain.argmax())
+            if gain[j] > _GAIN_RAD:
+                tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()
+                gained = True
+        if not gained:
             break
     return [int(row) for row in tour if row < len(q)]
-
-
-def _improve_by_reversals(tour: FloatArray, distance: FloatArray) -> bool:
-    """Reverses parts of an open tour in place (2-opt) where that shortens it; its start stays."""
-    gained = False
-    for i in range(1, len(tour) - 1):
-        # Reversing i..j changes the segments into i and out of j; there is none out of the end.
-        ends = tour[i + 1 :]
-        after = np.append(tour[i + 2 :], -1)
-        onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
-        gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
-        j = int(gain.argmax())
-        if gain[j] > _GAIN_RAD:
-            tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()
-            gained = True
-    return gained

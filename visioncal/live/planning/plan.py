@@ -224,9 +224,9 @@ class _Planning:
             picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
             fewest, share = picking.fewest(design.rows)
             if fewest == 0 and needed_stops <= 0:
-                before = percent(picking.chance(design.rows[:0]))
+                chance = percent(picking.chance(design.rows[:0]))
                 raise DataError(
-                    f"plan: by what was recorded, {before} of picks land within "
+                    f"plan: by what was recorded, {chance} of picks land within "
                     f"{words_of(request.need)}; no stop needs to be added.",
                     next_step="Need less than that, or leave the need out to see what stops would "
                     "give.",

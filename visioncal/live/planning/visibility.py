@@ -1,15 +1,15 @@
 """Views of a board: sampling, the camera's field of view, uncertain guesses and occlusion."""
 
-from dataclasses import dataclass, replace
+from copy import copy
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, compose, invert
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
-from visioncal.robot.bodies import Body, arm_bodies
+from visioncal.robot.bodies import arm_bodies
 from visioncal.robot.inverse import chain_frames
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m
@@ -32,8 +32,8 @@ _GUESSES, _CHECKED, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
 _BORDER_RAYS = 9
 # Least half width of the field of view at unit distance.
 _NARROWEST = 1e-4
-# Rays along each side of the image, and the relative margin of the planes for what lies between.
-_RAYS, _PLANE_MARGIN = 33, 2e-3
+# Rays along each side of the image, and the relative margin of the bounds for what lies between.
+_RAYS, _BOUND_MARGIN = 33, 2e-3
 
 # A line of sight may end on a box, such as the table under a board: only this share must be free.
 _FREE_SHARE, _TINY = 0.99, 1e-12
@@ -42,34 +42,46 @@ _FREE_SHARE, _TINY = 0.99, 1e-12
 class FieldOfView:
     """Field of view of a camera.
 
-    A lens bends the image's sides. Points within four inner planes are in the image, points beyond
-    four outer planes are not; only points in between need be projected.
+    A lens bends the image's sides. Points within inner bounds of x / z and y / z are in the image,
+    points beyond outer bounds are not; only points in between need be projected.
     """
 
     def __init__(self, camera: Camera, edge_px: float) -> None:
-        """Prepares the planes for points that stay `edge_px` from the image's edge [px]."""
+        """Prepares the bounds for points that stay `edge_px` from the image's edge [px]."""
         self._camera, self._edge_px = camera, edge_px
         border = _border_tangents(camera, 0.0, _RAYS)
         # Beyond these tangents a lens model may fold back into the image.
         self._largest_tangent = float(np.nanmax(np.linalg.norm(border, axis=-1))) * (1.0 + 1e-6)
-        self._inner, self._outer = _planes(_border_tangents(camera, edge_px, _RAYS))
+        tangents = _border_tangents(camera, edge_px, _RAYS)
+        margin = _BOUND_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
+        upper, lower, left, right = tangents
+        low = np.column_stack([left[:, 0], upper[:, 1]])
+        high = np.column_stack([right[:, 0], lower[:, 1]])
+        # Of a lens without rays to its corners no point is surely inside, any in front may be.
+        self._inner = low.max(axis=0) + margin, high.min(axis=0) - margin
+        self._outer = (
+            np.nan_to_num(low.min(axis=0) - margin, nan=-np.inf),
+            np.nan_to_num(high.max(axis=0) + margin, nan=np.inf),
+        )
 
     def holds(self, points_cam: FloatArray) -> Mask:
         """Whether all of (..., p, 3) points in the camera frame are in the image (...)."""
-        inside = _between(self._inner, points_cam)
-        doubtful = ~inside & _between(self._outer, points_cam)
+        depth = points_cam[..., 2:]
+        tangents = points_cam[..., :2] / np.where(depth > 0.0, depth, np.nan)
+        inside, possible = (
+            ((tangents >= low) & (tangents <= high)).all(axis=(-1, -2))
+            for low, high in (self._inner, self._outer)
+        )
+        doubtful = ~inside & possible
         if doubtful.any():
-            inside[doubtful] = self._projected(points_cam[doubtful])
-        return inside
-
-    def _projected(self, points_cam: FloatArray) -> Mask:
-        flat = points_cam.reshape(-1, 3)
-        valid = np.linalg.norm(flat[:, :2], axis=1) < self._largest_tangent * flat[:, 2]
-        px = np.full((len(flat), 2), -np.inf)
-        px[valid] = project_with_jacobian(self._camera, flat[valid], lens=False).px
-        high = np.array(self._camera.resolution) - 1.0 - self._edge_px
-        good = ((px >= self._edge_px) & (px <= high)).all(axis=1)
-        return np.asarray(good.reshape(points_cam.shape[:-1]).all(axis=-1))
+            flat = points_cam[doubtful].reshape(-1, 3)
+            valid = np.linalg.norm(flat[:, :2], axis=1) < self._largest_tangent * flat[:, 2]
+            px = np.full((len(flat), 2), -np.inf)
+            px[valid] = project_with_jacobian(self._camera, flat[valid], lens=False).px
+            high_px = np.array(self._camera.resolution) - 1.0 - self._edge_px
+            good = ((px >= self._edge_px) & (px <= high_px)).all(axis=1)
+            inside[doubtful] = good.reshape(-1, points_cam.shape[-2]).all(axis=-1)
+        return np.asarray(inside)
 
 
 def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
@@ -83,45 +95,60 @@ def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
     return normalise(camera, half + unit * (half - edge_px)).reshape(4, rays, 2)
 
 
-def _planes(tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normals (4, 3) of the inner and of the outer planes; points between have no negative sign."""
-    if np.isnan(tangents).any():
-        # A lens without rays to its corners: no point is surely inside, any in front may be.
-        ahead, aside = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-        return np.array([ahead, -ahead, aside, -aside]), np.array([ahead] * 4)
-    top, bottom, left, right = tangents
-    margin = _PLANE_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
-    inner = [left[:, 0].max(), right[:, 0].min(), top[:, 1].max(), bottom[:, 1].min()]
-    outer = [left[:, 0].min(), right[:, 0].max(), top[:, 1].min(), bottom[:, 1].max()]
-    inward = np.array([margin[0], -margin[0], margin[1], -margin[1]])
-    return _normals(np.array(inner) + inward), _normals(np.array(outer) - inward)
-
-
-def _normals(bounds: FloatArray) -> FloatArray:
-    """(4, 3) normals of the planes at least and greatest x / z and y / z."""
-    left, right, top, bottom = bounds.tolist()
-    return np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]])
-
-
-def _between(normals: FloatArray, points: FloatArray) -> Mask:
-    """Whether all of (..., p, 3) points are between planes."""
-    sides = points.reshape(-1, 3) @ normals.T
-    return np.asarray((sides >= 0.0).reshape(*points.shape[:-1], 4).all(axis=(-1, -2)))
-
-
-@dataclass(frozen=True, eq=False)
 class BoardViews:
-    """Views of a board by a camera."""
+    """Views of a board by a camera, with draws from the uncertainty of a cell's guesses.
 
-    cell: PlanCell
-    # Least and greatest distance between camera and board centre [m].
-    distance_m: tuple[float, float]
-    # (p, 3) points around the print, its corners first, in the target frame [m].
-    outline: FloatArray
-    centre: FloatArray  # (3,) centre of the print [m].
-    window: FieldOfView  # Field of view.
-    x: FloatArray  # (g, 4, 4) draws of the uncertain edge x.
-    z: FloatArray  # (g, 4, 4) draws of the uncertain edge z.
+    Attributes:
+        distance_m: Least and greatest distance between camera and board centre [m].
+        outline: (p, 3) points around the print, its corners first, in the target frame [m].
+        centre: (3,) centre of the print [m].
+
+    Raises:
+        DataError: The lens has no field of view, or next to none.
+    """
+
+    def __init__(self, cell: PlanCell, seed: int) -> None:
+        border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+        tangents = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
+        if not len(tangents) or tangents.min() < _NARROWEST:
+            raise DataError(
+                "camera: no ray of this lens reaches the border of its image, or all are parallel: "
+                f"matrix is {cell.camera.matrix.tolist()}, distortion "
+                f"{cell.camera.distortion.tolist()}.",
+                culprits=["camera"],
+                next_step="Look at the intrinsics that were given.",
+            )
+        drawn = cell.guesses(_GUESSES, seed)
+        self._cell, self._window = cell, FieldOfView(cell.camera, cell.limits.edge_px)
+        # (g, 4, 4) draws of the uncertain edges.
+        self._x, self._z = (np.array([getattr(one, edge) for one in drawn]) for edge in "xz")
+        self._low, self._high = low, high = extent_m(cell.target)
+        self.centre = np.append(0.5 * (low + high), 0.0)
+        knots = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
+        points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
+        self.outline = np.pad(points.reshape(-1, 2), ((0, 0), (0, 1)))
+        self.distance_m = cell.limits.distance_m or self._filling_m(float(np.nanmin(tangents)))
+
+    def _filling_m(self, half: float) -> tuple[float, float]:
+        """Distances at which the board fills the image of that half width, or has been observed.
+
+        It stays in the image if the guesses are off [m].
+        """
+        # At a distance d the board is off by the errors of both positions, by d times the error of
+        # the camera's rotation, and by half its own size times the error of its own rotation.
+        cell, radius = self._cell, 0.5 * board_size_m(self._cell.target)
+        full = radius / half
+        near, far = _NEAREST * full, _NEVER_BEYOND * full
+        for d in np.linspace(full, far, 60):
+            turned = cell.sigma_rad * np.hypot(d, radius)
+            if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
+                far = max(_FARTHEST * full, 1.15 * float(d))
+                break
+        if cell.observed_distances_m is None:
+            return near, far
+        least, most = cell.observed_distances_m
+        return min(near, least / _WIDER), max(far, _WIDER * most)
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws views of the board.
@@ -132,46 +159,41 @@ class BoardViews:
         Returns:
             (count, 4, 4) `cam_from_target` [m].
         """
-        camera, limits = self.cell.camera, self.cell.limits
+        cell, camera, limits = self._cell, self._cell.camera, self._cell.limits
         tilt = np.arccos(rng.uniform(np.cos(limits.tilt_rad), 1.0, count))
         azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
         distance = rng.uniform(*self.distance_m, size=(count, 1))
         middle = 0.5 * (np.array(camera.resolution) - 1.0)
-        room = np.maximum(middle - limits.edge_px - self._occupied_px(distance), 0.0)
+        # Least half size of the board in the image, with a margin for uncertainty. A drawn view
+        # need not show the board; this only avoids drawing many that cannot.
+        across = _FORESHORTENED * 0.5 * float((self._high - self._low).min())
+        doubt = _MARGIN_SIGMAS * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance, cell.sigma_rad)
+        occupied_px = camera.matrix[:2].mean() * (across / distance + doubt)
+        room = np.maximum(middle - limits.edge_px - occupied_px, 0.0)
         aim = middle + rng.uniform(-1.0, 1.0, (count, 2)) * room
         plane = np.nan_to_num(normalise(camera, aim))
         ray = np.column_stack([plane, np.ones(count)])
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         # The target's z points away from the camera. The rotation that takes z to the ray is last.
         spun = Rotation.from_euler("ZXZ", np.column_stack([roll, tilt, azimuth]))
-        across = np.cross([0.0, 0.0, 1.0], ray)
-        sine = np.linalg.norm(across, axis=1, keepdims=True)
+        across_ray = np.cross([0.0, 0.0, 1.0], ray)
+        sine = np.linalg.norm(across_ray, axis=1, keepdims=True)
         angle = np.arctan2(sine, ray[:, 2:])
-        turn = Rotation.from_rotvec(across * angle / np.maximum(sine, 1e-12))
+        turn = Rotation.from_rotvec(across_ray * angle / np.maximum(sine, 1e-12))
         rotation = np.asarray((turn * spun).as_matrix())
         return compose(rotation, distance * ray - rotation @ self.centre)
 
-    def _occupied_px(self, distance_m: FloatArray) -> FloatArray:
-        """Least half size (k, 1) of the board in the image, with a margin for uncertainty [px].
-
-        A drawn view need not show the board; this only avoids drawing many that cannot.
-        """
-        cell = self.cell
-        low, high = extent_m(cell.target)
-        across = _FORESHORTENED * 0.5 * float((high - low).min())
-        doubt = _MARGIN_SIGMAS * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
-        return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
-
     def nearer_to(self, cam_from_target: FloatArray) -> "BoardViews":
         """Restricts the distances to those of (k, 4, 4) good views."""
-        distance = self.distances_m(cam_from_target)
+        distance, nearer = self.distances_m(cam_from_target), copy(self)
         low, high = self.distance_m
         least, most = float(distance.min()) / _WIDER, float(distance.max()) * _WIDER
-        return replace(self, distance_m=(max(low, least), min(high, most)))
+        nearer.distance_m = max(low, least), min(high, most)
+        return nearer
 
     def shows(self, cam_from_target: FloatArray) -> Mask:
         """Whether the whole print is in the image (k,) of views (k, 4, 4)."""
-        return self.window.holds(apply(cam_from_target, self.outline))
+        return self._window.holds(apply(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
         """Share (k,) of the uncertain cell's draws that show the whole print at poses (k, 4, 4).
@@ -179,27 +201,23 @@ class BoardViews:
         Poses that cannot reach the wanted share any more are not evaluated further: theirs is a
         lower bound.
         """
-        counts = np.zeros(len(base_from_flange))
-        checked, possible = 0, np.arange(len(base_from_flange))
+        in_hand = self._cell.mount == "eye-in-hand"
+        flange = invert(base_from_flange) if in_hand else base_from_flange
+        counts = np.zeros(len(flange))
+        checked, possible = 0, np.arange(len(flange))
         for upto in _CHECKED:
-            shows = self._drawn_shows(base_from_flange[possible], slice(checked, upto))
-            counts[possible] += shows.sum(axis=1)
+            # The corners are enough for a share: the sides between them are nearly straight.
+            outlines = apply(self._z[checked:upto], self.outline[:_CORNERS])
+            points = apply(flange[possible], outlines.reshape(-1, 3))
+            points = points.reshape(len(possible), *outlines.shape)
+            counts[possible] += self._window.holds(
+                apply(invert(self._x[checked:upto]), points)
+            ).sum(axis=1)
             checked = upto
             possible = possible[(_GUESSES - upto + counts[possible]) / _GUESSES >= wanted]
         share = np.minimum(counts / _GUESSES, np.nextafter(wanted, 0.0))
         share[possible] = counts[possible] / _GUESSES
         return share
-
-    def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
-        in_hand = self.cell.mount == "eye-in-hand"
-        flange = invert(base_from_flange) if in_hand else base_from_flange
-        # The corners are enough for a share: the sides between them are nearly straight.
-        outlines = apply(self.z[which], self.outline[:_CORNERS])
-        points = apply(flange, outlines.reshape(-1, 3))
-        cam_from_fixed = invert(self.x[which])
-        return self.window.holds(
-            apply(cam_from_fixed, points.reshape(len(flange), *outlines.shape))
-        )
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
@@ -214,92 +232,24 @@ class BoardViews:
 
     def sharp(self, cam_from_target: FloatArray) -> Mask:
         """Whether the whole print (k,) lies within the depths at which the image is sharp."""
-        span = self.cell.limits.focus_m
-        if span is None:
-            return np.ones(len(cam_from_target), dtype=bool)
+        near, far = self._cell.limits.focus_m or (-np.inf, np.inf)
         depth = cam_from_target[:, 2, :3] @ self.outline.T + cam_from_target[:, 2, 3, None]
-        return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
+        return np.asarray(((depth >= near) & (depth <= far)).all(axis=1))
 
 
-def board_views(cell: PlanCell, seed: int) -> BoardViews:
-    """Prepares the views of a cell, with draws from the uncertainty of its guesses.
-
-    Raises:
-        DataError: The lens has no field of view, or next to none.
-    """
-    border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
-    tangents = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
-    if not len(tangents) or tangents.min() < _NARROWEST:
-        raise DataError(
-            "camera: no ray of this lens reaches the border of its image, or all are parallel: "
-            f"matrix is {cell.camera.matrix.tolist()}, distortion "
-            f"{cell.camera.distortion.tolist()}.",
-            culprits=["camera"],
-            next_step="Look at the intrinsics that were given.",
-        )
-    drawn = cell.guesses(_GUESSES, seed)
-    low, high = extent_m(cell.target)
-    return BoardViews(
-        cell,
-        cell.limits.distance_m or _distance_m(cell),
-        _outline(cell.target),
-        np.append(0.5 * (low + high), 0.0),
-        FieldOfView(cell.camera, cell.limits.edge_px),
-        np.array([plan_cell.x for plan_cell in drawn]),
-        np.array([plan_cell.z for plan_cell in drawn]),
-    )
-
-
-def _distance_m(cell: PlanCell) -> tuple[float, float]:
-    """Distances at which the board fills the image, or has been observed already [m]."""
-    near, far = _filling_m(cell)
-    if cell.observed_distances_m is None:
-        return near, far
-    return min(near, cell.observed_distances_m[0] / _WIDER), max(
-        far, _WIDER * cell.observed_distances_m[1]
-    )
-
-
-def _filling_m(cell: PlanCell) -> tuple[float, float]:
-    """Distances at which the board fills the image, and stays in it if the guesses are off [m]."""
-    # At a distance d the board is off by the errors of both positions, by d times the error of the
-    # camera's rotation, and by half its own size times the error of its own rotation.
-    border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
-    half = float(np.nanmin(np.abs(border).max(axis=-1)))
-    radius = 0.5 * board_size_m(cell.target)
-    full = radius / half
-    farthest = _FARTHEST * full
-    for d in np.linspace(full, _NEVER_BEYOND * full, 60):
-        turned = cell.sigma_rad * np.hypot(d, radius)
-        if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
-            return _NEAREST * full, max(farthest, 1.15 * float(d))
-    return _NEAREST * full, _NEVER_BEYOND * full
-
-
-def _outline(target: Target) -> FloatArray:
-    """(p, 3) points around the print [m]."""
-    low, high = extent_m(target)
-    knots = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
-    points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
-    return np.pad(points.reshape(-1, 2), ((0, 0), (0, 1)))
-
-
-@dataclass(frozen=True, eq=False)
 class Occlusion:
-    """Occlusion of the lines of sight from the camera to points of the print."""
+    """Occlusion of the lines of sight from the camera to points of the print.
 
-    cell: PlanCell
-    points: FloatArray  # (p, 3) the points of the print, in the target frame [m].
-    # The arm's bodies, without those on the last link: they carry camera or board, and do not move
-    # relative to it.
-    parts: tuple[Body, ...]
+    Args:
+        cell: The cell.
+        points: (p, 3) the points of the print, in the target frame [m].
+    """
 
-    @classmethod
-    def of(cls, cell: PlanCell, points: FloatArray) -> "Occlusion":
-        """Prepares the bodies of a cell."""
-        parts = (body for body in arm_bodies(cell.robot) if body.link < cell.robot.joint_count)
-        return cls(cell, points, tuple(parts))
+    def __init__(self, cell: PlanCell, points: FloatArray) -> None:
+        self.cell, self.points = cell, points
+        # Those on the last link carry camera or board, and do not move relative to it.
+        hand = cell.robot.joint_count
+        self.parts = tuple(body for body in arm_bodies(cell.robot) if body.link < hand)
 
     def behind_boxes(self, base_from_flange: FloatArray) -> IntArray:
         """Index (k,) of a box that hides part of the print at flange poses (k, 4, 4); else -1."""
@@ -319,11 +269,8 @@ class Occlusion:
             body = part.link_from_body[None]
             if part.link:
                 body = frames[:, part.link - 1] @ body
-            if part.shape == "box":
-                hidden = _box_blocks(starts, ends, body, part.size_m)
-            else:
-                hidden = _capsule_blocks(starts, ends, body, part.size_m)
-            blocking[hidden] = index
+            blocks = _box_blocks if part.shape == "box" else _capsule_blocks
+            blocking[blocks(starts, ends, body, part.size_m)] = index
         return blocking
 
     def _sight_lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
