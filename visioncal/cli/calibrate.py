@@ -113,6 +113,7 @@ def calibrate_command(
         convention=convention,
         threads=work.threads,
         dense=dense,
+        pictures=work.images == "thumbnail" and not work.no_recording,
     )
     left = frames_to_keep(out)
     with with_run_paths(session, out), shown_progress(quiet=as_json) as progress:

@@ -111,15 +111,16 @@ class WorkOptions:
         bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
     ] = False
     no_recording: Annotated[
-        bool, typer.Option("--no-recording", help=f"Leave {RECORDING} out, which holds all images.")
+        bool,
+        typer.Option("--no-recording", help=f"Leave {RECORDING} out, for the viewer."),
     ] = False
     images: Annotated[
         ImagesKept,
         typer.Option(
-            help=f"What {RECORDING} keeps of them: full, so that it is the whole session; faint "
-            "copies to look at; or none. Their digests are kept in any case."
+            help=f"What {RECORDING} keeps of them: faint copies to look at, all of them, or none. "
+            "The corners found in them are kept in any case, and give the same result again."
         ),
-    ] = "full"
+    ] = "thumbnail"
 
     @property
     def left_out(self) -> tuple[str, ...]:

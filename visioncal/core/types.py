@@ -120,3 +120,13 @@ class Rejection:
 
     view: int
     reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """Result of searching one image for one target."""
+
+    found: Corners | Rejection  # The corners, or why there are none.
+    size: tuple[int, int] | None  # (width, height) of the image [px]; None where it cannot be read.
+    misfit: bool = False  # Whether markers were seen whose layout is not the target's.
+    faint_jpeg: bytes | None = None  # A copy to look at; None where none was asked for.

@@ -59,7 +59,7 @@ def write_outputs(
     note: str = "",
     *,
     without: Collection[str] = (),
-    images: "ImagesKept" = "full",
+    images: "ImagesKept" = "thumbnail",
 ) -> Written:
     """Writes the files of a result into a folder, atomically even if it is killed.
 
@@ -72,7 +72,8 @@ def write_outputs(
         note: A note on the report itself.
         without: Files to leave out, `REPORT` or `RECORDING`; those of an earlier result are
             removed.
-        images: How the recording keeps the images, besides their digests.
+        images: How the recording keeps the images, besides their digests and what was found in
+            them; whole where the run does not say that.
 
     Returns:
         The files that were written: the result even where drawing the report or recording failed.
@@ -98,7 +99,9 @@ def write_outputs(
             from visioncal.present.viewer import blueprint
 
             layout = blueprint(session, run.calibration)
-            write_recording(path, session, run.calibration, run.evidence, layout, images)
+            write_recording(
+                path, session, run.calibration, run.evidence, layout, images, run.searches
+            )
 
         drawings[RECORDING] = record
     results: dict[str, _Writer] = {CALIBRATION: run.calibration.save}

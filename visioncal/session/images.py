@@ -4,11 +4,12 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
+from visioncal.core.types import Searched
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
@@ -36,6 +37,21 @@ class ImageStore(ABC):
         """Digest of an image file, also of one whose bytes are elsewhere; empty where unknown."""
         return sha256(self.read(path)) if self.exists(path) else ""
 
+    def search_of(self, path: str, board: str) -> Searched | None:
+        """What was found of a board in an image that is elsewhere; None where it is to be searched.
+
+        Args:
+            path: The image's.
+            board: The board's name in the session's `boards`.
+        """
+        del path, board
+        return None
+
+    def shown(self, path: str) -> bytes | None:
+        """A faint copy of an image that is elsewhere, as JPEG; None where there is none."""
+        del path
+        return None
+
 
 @dataclass(frozen=True)
 class FolderImages(ImageStore):
@@ -45,6 +61,14 @@ class FolderImages(ImageStore):
     """
 
     folder: Path
+    # Digests by path: images are large, and a result and its recording both need them.
+    _digests: dict[str, str] = field(default_factory=dict, compare=False, repr=False)
+
+    def sha256(self, path: str) -> str:
+        """Digest of an image file; empty where there is none."""
+        if path not in self._digests:
+            self._digests[path] = super().sha256(path)
+        return self._digests[path]
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file."""

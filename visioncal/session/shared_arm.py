@@ -13,6 +13,7 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
+from visioncal.core.types import Searched
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
 from visioncal.session.kinds import COLUMN as TARGET
@@ -46,6 +47,17 @@ class JoinedImages(ImageStore):
         """Why there is no such image; empty where there is one."""
         store, name = self._locate(path)
         return store.absence(name)
+
+    def search_of(self, path: str, board: str) -> Searched | None:
+        """What was found in an image that is elsewhere, of the only board of its session."""
+        del board
+        store, name = self._locate(path)
+        return store.search_of(name, "")
+
+    def shown(self, path: str) -> bytes | None:
+        """A faint copy of an image that is elsewhere; None where there is none."""
+        store, name = self._locate(path)
+        return store.shown(name)
 
     def _locate(self, path: str) -> tuple[ImageStore, str]:
         first, _, rest = path.partition("/")

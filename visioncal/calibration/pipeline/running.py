@@ -28,7 +28,7 @@ from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Corners, FloatArray, Progress
+from visioncal.core.types import Corners, FloatArray, Progress, Searched
 from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
@@ -50,6 +50,9 @@ class Run:
     evidence: tuple[ViewEvidence, ...]  # One entry for each view of the session.
     # Residual of each view, by a fit without its stop [m], [px].
     left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    # What was found in each image, by view, from which alone the run can be repeated; empty where
+    # more of the images was used.
+    searches: Mapping[int, Searched] = field(default_factory=dict)
 
     def with_paths(self, session: Path | str, out: Path | str) -> "Run":
         """Fills the paths of session and output into the verdict's commands."""
@@ -58,7 +61,10 @@ class Run:
 
 
 class CalibrationOptions(TypedDict, total=False):
-    """Options of `calibrate`, by name; the defaults are its own."""
+    """Options of `calibrate`, by name; the defaults are its own.
+
+    With `pictures`, faint copies of the images are kept in `Run.searches`.
+    """
 
     solver: SolverName
     level: str
@@ -66,6 +72,7 @@ class CalibrationOptions(TypedDict, total=False):
     progress: Progress | None
     threads: int | None
     dense: bool
+    pictures: bool
 
 
 def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
@@ -74,7 +81,8 @@ def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> R
     held_out = state.assessment.held_out
     residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
-    return Run(result_of(state), view_evidence(state), left_out)
+    searches = state.searches if state.dense is None else {}
+    return Run(result_of(state), view_evidence(state), left_out, searches)
 
 
 def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
@@ -90,6 +98,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
         asked.get("progress"),
         threads or 0,
         dense={} if asked.get("dense") else None,
+        pictures=asked.get("pictures", False),
         solver=solver,
         level=level,
         convention=convention,

@@ -70,7 +70,9 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                     seen.progress,
                     among=views,
                     threads=seen.threads,
+                    pictures=seen.pictures,
                 )
+            seen = replace(seen, searches={**seen.searches, **detections.searches})
             if seen.dense is not None:
                 seen, detections = _with_dense(seen, views, detections)
             corners, resolution = detections.corners, detections.resolution

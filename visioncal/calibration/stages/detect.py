@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Condition
 
 import cv2
@@ -23,7 +23,7 @@ from visioncal.calibration.stages.image_size import other_size_step
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
-from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Target
+from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, Searched, Target
 from visioncal.estimation.poses import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
@@ -37,6 +37,7 @@ from visioncal.vision.finders.imaging import (
     blur_at_corners,
     claimed_size,
     decode_image,
+    faint_jpeg,
     poor_image_reason,
 )
 from visioncal.vision.targets import corner_positions, point_numbers
@@ -61,15 +62,7 @@ class Detections:
     resolution: tuple[int, int]  # The camera's (width, height) [px].
     # The (width, height) of images of another size, by view [px].
     other_sizes: Mapping[int, tuple[int, int]]
-
-
-@dataclass(frozen=True, eq=False)
-class Searched:
-    """Result of searching one image."""
-
-    found: Corners | Rejection  # The corners, or why there are none.
-    size: tuple[int, int] | None  # (width, height) of the image [px]; None where it cannot be read.
-    misfit: bool = False  # Whether markers were seen whose layout is not the target's.
+    searches: Mapping[int, Searched]  # What was found in each image, by view.
 
 
 class _MemoryBudget:
@@ -101,6 +94,7 @@ def detect(
     *,
     among: Sequence[View] | None = None,
     threads: int = 0,
+    pictures: bool = False,
 ) -> Detections:
     """Finds the declared target in each image of a session.
 
@@ -109,6 +103,7 @@ def detect(
         progress: Called after each image.
         among: The views to search; None for all.
         threads: Number of parallel images; 0 for one a core.
+        pictures: Whether faint copies of the images are kept, to look at.
 
     Returns:
         The corners and the rejected views.
@@ -130,12 +125,13 @@ def detect(
 
         def search_view(view: View) -> Searched:
             quick = session.board_of(view) in others
-            return _search(session, view, stated, budget, quick=quick)
+            return _search(session, view, stated, budget, quick=quick, picture=pictures)
 
         for search in pool.map(search_view, views):
             searches.append(search)
             if progress is not None:
                 progress("detect", len(searches), len(views))
+    found = {view.number: search for view, search in zip(views, searches, strict=True)}
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, searches, given, stated)
     sizes = {view.number: search.size for view, search in zip(views, searches, strict=True)}
@@ -169,6 +165,7 @@ def detect(
         tuple(corners for corners in results if isinstance(corners, Rejection)),
         resolution,
         {view: size for view, size in sizes.items() if size not in (None, resolution)},
+        found,
     )
 
 
@@ -235,12 +232,17 @@ def _search(
     budget: _MemoryBudget,
     *,
     quick: bool,
+    picture: bool,
 ) -> Searched:
-    """Searches the image of one view."""
+    """Searches the image of one view, or takes what was found in it before."""
+    name = session.board_of(view)
+    earlier = session.images.search_of(view.image, name)
+    if earlier is not None:
+        # Views are renumbered where sessions are joined.
+        return replace(earlier, found=replace(earlier.found, view=view.number))
     absence = session.images.absence(view.image)
     if absence:
         return Searched(Rejection(view.number, f"{view.image} {absence}"), None)
-    name = session.board_of(view)
     target = session.boards[name]
     data = session.images.read(view.image)
     size = claimed_size(data) or (0, 0)
@@ -254,7 +256,8 @@ def _search(
         if isinstance(image, Rejection):
             return Searched(image, None)
         found, misfit = find_corners(image, target, view.number, quick=quick, name=name)
-    return Searched(found, (image.shape[1], image.shape[0]), misfit)
+        faint = faint_jpeg(image) if picture else None
+    return Searched(found, (image.shape[1], image.shape[0]), misfit, faint)
 
 
 def find_corners(

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import Corners, FloatArray, Progress, Rejection
+from visioncal.core.types import Corners, FloatArray, Progress, Rejection, Searched
 from visioncal.core.verdict import Finding
 from visioncal.estimation.scene import Scene
 from visioncal.results import HELD_BACK, CameraResult
@@ -65,6 +65,8 @@ class Observed:
     # Corners by all pixels of images that the template refuses, by view; None where these are not
     # asked for.
     dense: "Mapping[int, DenseCorners] | None" = None
+    pictures: bool = False  # Whether faint copies of the images are kept.
+    searches: Mapping[int, Searched] = field(default_factory=dict)  # Of each image, by view.
     # Whether robots' poses are clearly misread, so that they determine nothing of lenses and
     # boards.
     is_misread: bool = False

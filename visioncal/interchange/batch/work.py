@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.version import __version__
-from visioncal.interchange.outputs import CALIBRATION, REPORT, Written, write_outputs
+from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
 from visioncal.results.fleet import FleetRow, row_of
 from visioncal.session import Session
@@ -178,7 +178,8 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     from visioncal.calibration.stages.detect import ONE_OPENCV_THREAD
 
     with ONE_OPENCV_THREAD.held():
-        result = run(session, level=job.options.level, threads=1)
+        pictures = RECORDING not in job.options.without
+        result = run(session, level=job.options.level, threads=1, pictures=pictures)
     result = result.with_paths(job.session, job.folder)
     written = write_outputs(job.folder, session, result, without=job.options.without)
     return result.calibration, written

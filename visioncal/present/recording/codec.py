@@ -20,6 +20,7 @@ import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
+from visioncal.core.types import Corners, Rejection, Searched
 from visioncal.core.version import __version__
 from visioncal.present.recording import paths
 from visioncal.session import Session, Stream, View
@@ -33,7 +34,8 @@ UNKNOWN = -1
 
 _BLOB = "EncodedImage:blob"
 _HEADER, _ROW, _END = "visioncal.Session", "visioncal.Row", "visioncal.End"
-_STREAM, _CORNERS = "visioncal.Stream", "visioncal.Corners"
+_STREAM, _CORNERS, _SEARCHES = "visioncal.Stream", "visioncal.Corners", "visioncal.Searches"
+_NONE = np.zeros(0, dtype=np.int64)
 _MEDIA_TYPES = {
     ".png": "image/png",
     ".jpg": "image/jpeg",
@@ -192,6 +194,66 @@ def log_corners(recording: rr.RecordingStream, corners: CornerTable) -> None:
         "sigmas_px": pa.array(sigmas, pa.float64()),
     }
     recording.log(paths.CORNERS, rr.DynamicArchetype(_CORNERS, components=components), static=True)
+
+
+def log_searches(
+    recording: rr.RecordingStream, searches: Mapping[tuple[str, str], Searched]
+) -> None:
+    """Logs what was found in images, by their names and those of their boards."""
+    found = [search.found for search in searches.values()]
+    seen = [corners for corners in found if isinstance(corners, Corners)]
+    sizes = [(0, 0) if search.size is None else search.size for search in searches.values()]
+    weights = [np.zeros(0) if corners.weights is None else corners.weights for corners in seen]
+    components = {
+        "images": pa.array([image for image, _ in searches], pa.string()),
+        "boards": pa.array([board for _, board in searches], pa.string()),
+        # Empty where corners were found.
+        "reasons": pa.array([getattr(entry, "reason", "") for entry in found], pa.string()),
+        "sizes": pa.array(np.ravel(sizes), pa.int64()),
+        "misfits": pa.array([int(search.misfit) for search in searches.values()], pa.int64()),
+        "counts": pa.array([len(corners.ids) for corners in seen], pa.int64()),
+        "ids": pa.array(np.concatenate([_NONE, *(at.ids for at in seen)]), pa.int64()),
+        "px": pa.array(np.concatenate([_NONE, *(at.px.ravel() for at in seen)]), pa.float64()),
+        "blur_px": pa.array([corners.blur_px for corners in seen], pa.float64()),
+        "weighted": pa.array([len(values) for values in weights], pa.int64()),
+        "weights": pa.array(np.concatenate([_NONE, *weights]), pa.float64()),
+    }
+    seal = sha256(json.dumps([values.to_pylist() for values in components.values()]).encode())
+    components["seal"] = pa.array([seal], pa.string())
+    archetype = rr.DynamicArchetype(_SEARCHES, components=components)
+    recording.log(paths.SEARCHES, archetype, static=True)
+
+
+def read_searches(batch: pa.RecordBatch) -> dict[tuple[str, str], Searched]:
+    """Reads what was found in images, by their names and those of their boards.
+
+    Raises:
+        ValueError: It was changed after it was written.
+    """
+    names = ("images", "boards", "reasons", "sizes", "misfits", "counts", "ids", "px", "blur_px")
+    stored = values_of(batch, _SEARCHES)
+    columns = [stored.get(name) or [] for name in (*names, "weighted", "weights")]
+    if sha256(json.dumps(columns).encode()) != stored["seal"][0]:
+        raise ValueError("what was found in images was changed after it was written")
+    images, boards, reasons, sizes, misfits, counts, ids, px, blur_px, weighted, weights = columns
+    ends, weight_ends = np.cumsum(counts)[:-1], np.cumsum(weighted)[:-1]
+    corners = zip(
+        np.split(np.array(ids, dtype=np.int64), ends),
+        np.split(np.array(px, dtype=float).reshape(-1, 2), ends),
+        blur_px,
+        np.split(np.array(weights, dtype=float), weight_ends),
+        strict=False,
+    )
+    found: dict[tuple[str, str], Searched] = {}
+    for at, reason in enumerate(reasons):
+        entry: Corners | Rejection = Rejection(0, reason)
+        if not reason:
+            own_ids, own_px, blur, own_weights = next(corners)
+            entry = Corners(0, own_ids, own_px, blur, own_weights if len(own_weights) else None)
+        width, height = sizes[2 * at : 2 * at + 2]
+        size = (width, height) if width else None
+        found[images[at], boards[at]] = Searched(entry, size, bool(misfits[at]))
+    return found
 
 
 def log_end(stream: rr.RecordingStream, rows: int) -> None:

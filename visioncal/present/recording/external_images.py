@@ -1,18 +1,13 @@
-"""Images of a recording that stores only their digests, or low-quality copies for display."""
+"""Images of a recording that stores what was found in them, and faint copies to look at."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-
 from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
+from visioncal.core.types import Searched
 from visioncal.session.images import ImageStore
-from visioncal.vision.finders.imaging import decode_image
-
-# At full size, so that overlaid corners fit: a twentieth of the bytes.
-_FAINT_QUALITY = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +17,9 @@ class ExternalImages(ImageStore):
     path: Path  # The recording.
     kept: ImagesKept  # What the recording stores of them: `thumbnail` or `none`.
     digests: Mapping[str, str]  # SHA-256 of the images' bytes, by name.
-    pictures: Mapping[str, Callable[[], bytes]]  # Readers of the low-quality copies, by image name.
+    pictures: Mapping[str, Callable[[], bytes]]  # Readers of the faint copies, by image name.
+    # What was found in each image, by its name and that of the board in the session's `boards`.
+    searches: Mapping[tuple[str, str], Searched]
 
     def read(self, path: str) -> bytes:
         """Raises an error: the image is not in the recording.
@@ -33,7 +30,8 @@ class ExternalImages(ImageStore):
         raise DataError(
             f"{path} {self.absence(path)}.",
             culprits=[path],
-            next_step="Take the session's folder, which has its images.",
+            next_step="Take the session's folder, which has its images; calibrate --images full "
+            "writes recordings with all of them.",
         )
 
     def sha256(self, path: str) -> str:
@@ -41,19 +39,15 @@ class ExternalImages(ImageStore):
         return self.digests.get(path, "")
 
     def shown(self, path: str) -> bytes | None:
-        """Low-quality copy of an image; None if there is none."""
+        """A faint copy of an image; None if there is none."""
         return self.pictures[path]() if path in self.pictures else None
+
+    def search_of(self, path: str, board: str) -> Searched | None:
+        """What was found of a board in an image; None where it was not searched."""
+        return self.searches.get((path, board))
 
     def absence(self, path: str) -> str:
         """Why the image cannot be read, in words."""
         if path not in self.digests:
             return "is missing"
         return f"is not in {self.path.name}, which was written with --images {self.kept}"
-
-
-def low_quality_jpeg(image: bytes) -> bytes | None:
-    """Low-quality JPEG at an image's size; None if the bytes are no image."""
-    pixels = decode_image(image, colour=True)
-    if isinstance(pixels, str):
-        return None
-    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _FAINT_QUALITY])[1])

@@ -14,6 +14,7 @@ SESSION = "/session"
 ROWS = "/session/rows"
 STREAMS = "/session/streams"
 CORNERS = "/session/corners"
+SEARCHES = "/session/searches"
 END = "/session/end"
 IMAGE = "/camera/image"
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
+from visioncal.core.types import Searched
 from visioncal.present.recording import codec, paths
 from visioncal.present.recording.external_images import ExternalImages
 from visioncal.present.recording.rrd_messages import (
@@ -89,9 +90,8 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
         return images
     digests = {records.image_name(index): records.rows[index].image_sha256 for index in complete}
     pictures = {name: partial(images.read, name) for name in images.places}
-    return ExternalImages(
-        path, kept, {k: digest for k, digest in digests.items() if digest}, pictures
-    )
+    digests = {name: digest for name, digest in digests.items() if digest}
+    return ExternalImages(path, kept, digests, pictures, records.searches or {})
 
 
 @dataclass(frozen=True)
@@ -152,6 +152,8 @@ class _Records:
     images: Mapping[int, _Image]  # Images by row number.
     streams: Mapping[str, Stream]  # Streams by name.
     corners: CornerTable | None  # Corners of an external detector; None if there are none.
+    # What was found in images, by their names and those of their boards; None where they are there.
+    searches: Mapping[tuple[str, str], Searched] | None
     closed: int | None  # Number of rows by the end mark; None without the mark.
     damaged: int  # Number of chunks that could not be read.
 
@@ -197,7 +199,9 @@ def _read_records(scanned: Scan) -> _Records:
     corners: CornerTable | None = None
     damaged: list[MessageFrame] = []
     closed: int | None = None
-    entities = (paths.SESSION, paths.STREAMS, paths.CORNERS, paths.ROWS, paths.IMAGE, paths.END)
+    searches: dict[tuple[str, str], Searched] | None = None
+    entities = {paths.SESSION, paths.STREAMS, paths.CORNERS, paths.SEARCHES, paths.ROWS}
+    entities |= {paths.IMAGE, paths.END}
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:
@@ -206,6 +210,8 @@ def _read_records(scanned: Scan) -> _Records:
                 streams |= codec.read_samples(batch)
             elif entity == paths.CORNERS:
                 corners = codec.read_corners(batch)
+            elif entity == paths.SEARCHES:
+                searches = codec.read_searches(batch)
             elif entity == paths.ROWS:
                 # Of two rows with one number, the later one has a damaged number.
                 rows = codec.read_rows(batch) | rows
@@ -220,7 +226,7 @@ def _read_records(scanned: Scan) -> _Records:
             damaged.append(frame)
     if header is None:
         raise _no_header(scanned, damaged)
-    return _Records(header, rows, images, streams, corners, closed, len(damaged))
+    return _Records(header, rows, images, streams, corners, searches, closed, len(damaged))
 
 
 def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
@@ -272,7 +278,7 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
 def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
     """Sentences about what was lost from the recording."""
     name, announced = scanned.path.name, records.header.rows
-    if records.header.images:
+    if records.header.images and not records.searches:
         yield f"{name}: the images are elsewhere, and only their digests are kept."
     if records.closed is not None:
         if scanned.cut:

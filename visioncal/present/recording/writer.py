@@ -1,6 +1,6 @@
 """Writes recordings of sessions: view by view during capture, or as a whole."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -10,8 +10,9 @@ from visioncal.core.choices import ImagesKept
 from visioncal.core.documents.tables import TextTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, replacing_file, sha256
+from visioncal.core.types import Searched
 from visioncal.present.recording import codec
-from visioncal.present.recording.external_images import ExternalImages, low_quality_jpeg
+from visioncal.present.recording.external_images import ExternalImages
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
 from visioncal.results import Calibration
@@ -19,6 +20,7 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.kinds import check_images_can_be_used
 from visioncal.session.table import View, read_views
+from visioncal.vision.finders.imaging import decode_image, faint_jpeg
 
 
 class RecordingWriter:
@@ -40,6 +42,7 @@ class RecordingWriter:
         blueprint: BlueprintLike | None = None,
         label: Path | None = None,
         images: ImagesKept = "full",
+        searches: Mapping[tuple[str, str], Searched] | None = None,
     ) -> None:
         """Starts the file.
 
@@ -49,8 +52,9 @@ class RecordingWriter:
             announced: Number of views to come, by which readers can state how many were lost.
             blueprint: Viewer layout of the recording.
             label: Final path that messages name, where `path` is a temporary one.
-            images: What is stored of the images beside their digests; ignored for a session whose
-                images are stored elsewhere.
+            images: What is stored of the images beside their digests.
+            searches: What was found in each image, by its name and that of its board in the
+                session's `boards`: the session can be calibrated again without its images.
 
         Raises:
             DataError: The file exists or cannot be written.
@@ -59,8 +63,8 @@ class RecordingWriter:
         self._session = session
         self._numbers: set[int] = set()
         self._images: dict[str, str] = {}
-        store = session.images
-        self._kept = store.kept if isinstance(store, ExternalImages) else images
+        self._kept = images
+        self._searches = searches or {}
         with named_errors(self._label):
             if label is None:
                 path.open("xb").close()
@@ -74,6 +78,8 @@ class RecordingWriter:
                 codec.log_samples(self._recorder.stream, name, samples)
             if session.corner_table is not None:
                 codec.log_corners(self._recorder.stream, session.corner_table)
+            if self._searches:
+                codec.log_searches(self._recorder.stream, self._searches)
             self._recorder.keep()
             self._recorder.lay_out(blueprint)
 
@@ -90,11 +96,7 @@ class RecordingWriter:
                 remain.
         """
         view = self._checked(cells)
-        digest = "" if image is None else self._digest_of(view, image)
-        shown = image
-        if image is not None and self._kept != "full":
-            shown = low_quality_jpeg(image) if self._kept == "thumbnail" else None
-        self._log(view, digest, shown)
+        self._log(view, "" if image is None else self._checked_digest(view, sha256(image)), image)
 
     def _log(self, view: View, image_sha256: str, shown: bytes | None) -> None:
         row, recorder = len(self._numbers), self._recorder
@@ -133,12 +135,19 @@ class RecordingWriter:
         images = session.images
         for view in session.views:
             cells = [view.cell(column) for column in session.columns]
-            if isinstance(images, ExternalImages):
-                checked = self._checked(cells)
-                self._log(checked, images.sha256(view.image), images.shown(view.image))
-            else:
-                has_image = bool(view.image) and images.exists(view.image)
+            has_image = bool(view.image) and images.exists(view.image)
+            if self._kept == "full":
                 self.add_view(cells, images.read(view.image) if has_image else None)
+                continue
+            row, shown = self._checked(cells), None
+            if view.image and self._kept == "thumbnail":
+                found = self._searches.get((view.image, session.board_of(view)))
+                shown = (found and found.faint_jpeg) or images.shown(view.image)
+                if shown is None and has_image:
+                    pixels = decode_image(images.read(view.image), colour=True)
+                    shown = None if isinstance(pixels, str) else faint_jpeg(pixels)
+            digest = images.sha256(view.image) if view.image else ""
+            self._log(row, digest and self._checked_digest(row, digest), shown)
 
     def draw(self, log: Callable[[Recorder], None]) -> None:
         """Adds a drawing that belongs to no view.
@@ -168,12 +177,11 @@ class RecordingWriter:
             )
         return view
 
-    def _digest_of(self, view: View, image: bytes) -> str:
-        """SHA-256 of a view's image, which must have a name of its own."""
+    def _checked_digest(self, view: View, digest: str) -> str:
+        """The SHA-256 of a view's image, which must have a name of its own."""
         where = self._where
         if not view.image:
             raise DataError(f"{where}: it has an image but does not name it.", culprits=[where])
-        digest = sha256(image)
         if self._images.setdefault(view.image, digest) != digest:
             raise DataError(
                 f"{where}: another image is already there by the name {view.image}.",
@@ -203,6 +211,7 @@ def write_recording(
     evidence: Sequence[ViewEvidence],
     blueprint: BlueprintLike | None,
     images: ImagesKept = "full",
+    searches: Mapping[int, Searched] | None = None,
 ) -> None:
     """Writes a session and its results as one recording.
 
@@ -212,11 +221,31 @@ def write_recording(
         calibration: Result of the session, if there is one.
         evidence: Evidence of the views, in any order.
         blueprint: Viewer layout, as by `viewer.blueprint`; None for the viewer's own.
-        images: What is stored of the images beside their digests.
+        images: What is stored of the images beside their digests. They are stored whole where the
+            session could not be calibrated again without them: unless all searched ones are in
+            `searches`.
+        searches: What was found in each image, by view.
 
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
+    store, by_view = session.images, searches or {}
+    searched = [view for view in session.views if view.image and not view.has_corners]
+    found = {
+        (view.image, session.board_of(view)): search
+        for view in searched
+        if (
+            search := by_view.get(view.number)
+            or store.search_of(view.image, session.board_of(view))
+        )
+        is not None
+    }
+    if all(store.exists(view.image) for view in searched) and any(
+        (view.image, session.board_of(view)) not in found for view in searched
+    ):
+        images = "full"
+    elif isinstance(store, ExternalImages):
+        images = store.kept
     with (
         replacing_file(path) as aside,
         RecordingWriter(
@@ -226,6 +255,7 @@ def write_recording(
             blueprint=blueprint,
             label=path,
             images=images,
+            searches={} if images == "full" else found,
         ) as writer,
     ):
         writer.add_session(session)

@@ -23,6 +23,7 @@ _SAMPLE = 12
 _STRIP = 256
 # Minimum contrast that detectors need [grey levels].
 _LEAST_CONTRAST = 12
+_FAINT_QUALITY = 20
 # Instruction for an image in colour.
 GREY = "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
 
@@ -59,6 +60,14 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     if image is None:
         return "unreadable: not an image that can be decoded"
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
+
+
+def faint_jpeg(image: Image) -> bytes:
+    """Encodes a (h, w) or (h, w, 3) image as strongly compressed JPEG, to look at.
+
+    At full size, so that overlaid corners fit: a twentieth of the bytes.
+    """
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _FAINT_QUALITY])[1])
 
 
 def check_grey(image: Image, label: str) -> None:
