@@ -111,7 +111,7 @@ def test_heavy_libraries_enter_in_one_place():
     [
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
-            "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded_cell",
+            "visioncal.present.report, visioncal.present.recording, visioncal.cli.record",
             {"depthai", "rtde_control", "rtde_receive"},
         ),
         # A calibration waits for no plots, and for nothing that few sessions need.
@@ -136,18 +136,9 @@ def test_heavy_libraries_enter_in_one_place():
             "visioncal.cli.app",
             {"numpy", "rich", "visioncal.core.types"},
         ),
-        ("visioncal.cli.calibrate", {"numpy", "rich", "visioncal.core.types"}),
         (
-            "visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
-            "visioncal.cli.convert, visioncal.cli.correct, visioncal.cli.doctor, "
-            "visioncal.cli.dynamics_gains, visioncal.cli.dynamics_identify, "
-            "visioncal.cli.dynamics_payload, visioncal.cli.dynamics_plan, "
-            "visioncal.cli.dynamics_record, visioncal.cli.dynamics_validate, "
-            "visioncal.cli.export, visioncal.cli.fixture, visioncal.cli.locate, "
-            "visioncal.cli.plan, visioncal.cli.record, visioncal.cli.show, "
-            "visioncal.cli.simulate, "
-            "visioncal.cli.target, visioncal.cli.tcp, visioncal.cli.touch_test, "
-            "visioncal.cli.verify",
+            "visioncal.cli.session_options, visioncal.cli.result_options, "
+            "visioncal.cli.dynamics_options",
             {"numpy", "visioncal.core.types"},
         ),
         ("visioncal", {"numpy", "typer", "visioncal.core.types"}),

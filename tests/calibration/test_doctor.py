@@ -15,7 +15,6 @@ from support.fuzz.typed_fixes import mended
 from support.rendered import Shot, photograph
 
 import visioncal
-from visioncal.calibration.pipeline import checkup
 from visioncal.calibration.pipeline.checkup import to_document
 from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
@@ -158,7 +157,7 @@ def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     assert "SESSION" not in str(found)
     # The command finds the same again: once shows that.
     if name != "quaternion with w first":
-        monkeypatch.setattr(checkup, "doctor", lambda *_, **__: found)
+        monkeypatch.setattr("visioncal.cli.doctor.doctor", lambda *_, **__: found)
     done = command("doctor", folder, "--json")
     assert done.status == 3
     assert json.loads(done.out) == to_document(found)

@@ -10,7 +10,7 @@ from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
 from support.marks import slow
 from support.whole_cells import OPTIONS, recorded
 
-from visioncal.cli import planned_motions
+from visioncal.cli import dynamics
 from visioncal.core.transforms import invert
 from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.session import Session
@@ -174,7 +174,7 @@ def test_of_a_whole_cell(place):
 def test_of_dynamics(place, monkeypatch):
     # The motion that is planned need not be a good one: a short search will do.
     monkeypatch.setattr(
-        planned_motions,
+        dynamics,
         "ExcitationRequest",
         lambda *words, **more: replace(ExcitationRequest(*words, **more), starts=1, steps=3),
     )

@@ -119,7 +119,7 @@ def test_a_result_in_the_place_of_a_session_names_its_recording(tmp_path):
 
 def test_nothing_is_rendered_for_a_folder_that_is_not_empty(tmp_path, monkeypatch):
     (tmp_path / "mine.txt").touch()
-    monkeypatch.setattr("visioncal.simulation.simulate", None)
+    monkeypatch.setattr("visioncal.cli.simulate.simulate", None)
     done = visioncal("simulate", tmp_path)
     assert done.status == 2
     assert "exists and is not empty" in done.err
@@ -289,7 +289,7 @@ def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch
             (folder / "views.csv").write_text("view\n")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("visioncal.simulation.write_session", interrupted)
+    monkeypatch.setattr("visioncal.cli.simulate.write_session", interrupted)
     done = visioncal("simulate", cell, "--views", 3)
     assert (done.status, done.out) == (130, "")
     left = f"written so far: {cell / 'views.csv'}" if keeps else "nothing was written"

@@ -13,7 +13,7 @@ from support.commands import Done, visioncal
 from support.drawn import column
 from support.small_arm import small_arm, small_document
 
-from visioncal.cli import planned_motions
+from visioncal.cli import dynamics
 from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
@@ -113,7 +113,7 @@ def quick(monkeypatch):
     def short(allowed, request, progress):
         return excite(allowed, replace(request, steps=4), progress)
 
-    monkeypatch.setattr(planned_motions, "excite", short)
+    monkeypatch.setattr(dynamics, "excite", short)
 
 
 def plan(robot: object, out: Path, *more: object) -> Done:

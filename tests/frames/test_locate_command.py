@@ -10,11 +10,16 @@ from support.imaged import Shot, calibrated_cell, picture, session_of, shots
 from support.plates import CENTRES, marked_plate, plate_session
 from support.samples import fixture_frame
 
-from visioncal.cli.fixture import fixture_command
-from visioncal.cli.framing import FrameOptions, TouchOptions
+from visioncal.cli.framing import fixture_command, tcp_command
 from visioncal.cli.locate import locate_command
 from visioncal.cli.options import PartOptions
-from visioncal.cli.tcp import tcp_command
+from visioncal.cli.result_options import (
+    FixtureOptions,
+    FrameOptions,
+    LocateOptions,
+    TcpOptions,
+    TouchOptions,
+)
 from visioncal.core.errors import DataError
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import locate
@@ -25,9 +30,10 @@ PIXEL = "700,350"
 
 
 def _placed(command, source, calibration=None, *, out=None, name=None, touch_noise=None, **rest):
-    goes = FrameOptions(calibration, out, name)
+    goes = FrameOptions(calibration=calibration, out=out, name=name)
     written = TouchOptions(touch_noise=touch_noise)
-    command(goes, written, PartOptions(), touches=source, **rest)
+    record = FixtureOptions if command is fixture_command else TcpOptions
+    command(record(goes=goes, written=written, part=PartOptions(), touches=source, **rest))
 
 
 @pytest.fixture(scope="module", params=[IN_HAND, TO_HAND])
@@ -48,7 +54,7 @@ def cell(request, tmp_path_factory):
 
 def shown(capsys, **options):
     """What `locate --json` prints."""
-    locate_command(**options, as_json=True)
+    locate_command(LocateOptions(**options, as_json=True))
     return json.loads(capsys.readouterr().out)
 
 
@@ -77,12 +83,12 @@ def test_every_view_tells_where_the_target_is(cell, capsys):
         )
         assert place["budget_mm"]["total"] < 2.0
         assert place["warnings"] == []
-    locate_command(session, calibration, view=31)
+    locate_command(LocateOptions(source=session, calibration=calibration, view=31))
     told = capsys.readouterr()
     assert told.out.startswith("view 31: (")
     assert "95 % within" in told.out
     assert told.out.count("\n") == 1
-    locate_command(session, calibration)
+    locate_command(LocateOptions(source=session, calibration=calibration))
     lost = capsys.readouterr().err
     assert ("view 33: no pose of the robot" in lost) == (not to_hand)
 
@@ -98,12 +104,12 @@ def test_one_image_needs_a_target_and_a_pose(cell, capsys, tmp_path):
     assert found["image"] == "shot.png"
     np.testing.assert_allclose(found["p_base_m"], same["p_base_m"], atol=1e-9)
     with pytest.raises(DataError, match="--target is needed"):
-        locate_command(image, calibration)
+        locate_command(LocateOptions(source=image, calibration=calibration))
     with pytest.raises(DataError, match=r"shot\.png: target checkerboard"):
-        locate_command(image, calibration, target="checkerboard_9x6_25mm", pose=pose)
+        locate_command(LocateOptions(**wanted | {"target": "checkerboard_9x6_25mm"}, pose=pose))
     if pose is not None:
         with pytest.raises(DataError, match="robot's pose at the image is missing") as caught:
-            locate_command(**wanted)
+            locate_command(LocateOptions(**wanted))
         assert "--pose" in caught.value.next_step
 
 
@@ -134,9 +140,9 @@ def test_pixels_are_placed_on_planes(cell, capsys):
         (found,) = shown(capsys, **wanted, view=31)
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-9)
         with pytest.raises(DataError, match=r"4 views, .* --view is needed"):
-            locate_command(**wanted)
+            locate_command(LocateOptions(**wanted))
         with pytest.raises(DataError, match=r"view 33 .* has no pose of the robot"):
-            locate_command(**wanted, view=33)
+            locate_command(LocateOptions(**wanted, view=33))
 
 
 @pytest.mark.parametrize(
@@ -178,7 +184,7 @@ def test_mistakes_are_named(cell, options, words):
     if options["calibration"] == "nowhere":
         options["calibration"] = session.parent / "nowhere"
     with pytest.raises(DataError, match=words):
-        locate_command(**options)
+        locate_command(LocateOptions(**options))
 
 
 def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):

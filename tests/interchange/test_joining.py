@@ -13,6 +13,7 @@ import visioncal.present.recording
 from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.options import NeedOptions, WorkOptions
+from visioncal.cli.result_options import CalibrateOptions
 from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
 from visioncal.interchange.outputs import write_outputs
@@ -138,9 +139,13 @@ def pairs(tmp_path: Path) -> Path:
     return write_session(cell, tmp_path / "pairs", images=False)
 
 
+def options(session: Path, out: Path) -> CalibrateOptions:
+    return CalibrateOptions(sessions=[session], need=NeedOptions(), work=WorkOptions(), out=out)
+
+
 def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
     out = tmp_path / "out"
-    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
+    calibrate_command(options(pairs, out))
     assert frames_to_keep(out) is None
     assert not (out / "frames.json").exists()
     # Of what had joined, the fixture was placed by the camera.
@@ -153,7 +158,7 @@ def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, 
     FrameFile({"flange_from_old": tool_frame(), "flange_from_tool": tool_frame()}).save(
         out / "frames.json"
     )
-    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
+    calibrate_command(options(pairs, out))
     assert not Calibration.load(out).frames
     kept = FrameFile.load(out / "frames.json").frames
     assert kept.keys() == {"flange_from_old", *frames}
@@ -166,13 +171,13 @@ def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, 
 
 def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
     out = tmp_path / "out"
-    calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
+    calibrate_command(options(pairs, out))
     frames = with_frames(sample).calibration.frames
     replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
     (out / "frames.json").write_text("not frames", encoding="utf-8")
     before = contents(out)
     with pytest.raises(DataError, match=r"frames\.json, line 1.* is no JSON"):
-        calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
+        calibrate_command(options(pairs, out))
     assert contents(out) == before
 
 

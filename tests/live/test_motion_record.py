@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.commands import visioncal as run
 
+from visioncal.cli import dynamics
 from visioncal.core.errors import DriverError
-from visioncal.live.capture import motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.protocols import JointSample
 from visioncal.live.simulated.controller import ControllerOptions, spawn
@@ -80,7 +80,7 @@ def test_a_ur_is_recorded_through_its_client_library(tmp_path, monkeypatch):
             monkeypatch.setattr(joints, "sample", sampled)
             return record_motion(joints, **options)
 
-        monkeypatch.setattr(motions, "record_motion", recorded)
+        monkeypatch.setattr(dynamics, "record_motion", recorded)
         arguments = ("--arm", f"ur:{controller.host}", "--rest-s", "1.0")
         first = run("dynamics", "record", tmp_path / "s", *arguments)
     assert first.status == 0, first.err

@@ -21,7 +21,7 @@ from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
-from visioncal.cli import recorded_cell
+from visioncal.cli import record as record_module
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
 from visioncal.live.capture.cell import HostClock
@@ -62,7 +62,7 @@ def cell(planned, monkeypatch):
 def _use(monkeypatch, arm: FakeArm, camera: FakeCamera) -> None:
     monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm, "manual": lambda _: arm})
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
-    monkeypatch.setattr(recorded_cell, "HostClock", lambda: arm.clock)
+    monkeypatch.setattr(record_module, "HostClock", lambda: arm.clock)
 
 
 def record(out, *more: object) -> Done:

@@ -12,7 +12,7 @@ from support.boards import charuco, checkerboard, circles, printed
 from support.marks import slow
 from typer.testing import CliRunner
 
-from visioncal.cli.target import target_app
+from visioncal.cli.app import target_app
 from visioncal.core.errors import DataError
 from visioncal.simulation import CellOptions, fisheye_camera, prepare_scene, render, simulate
 from visioncal.vision.finders.identify import identify

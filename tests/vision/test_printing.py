@@ -11,7 +11,7 @@ import pytest
 from support.boards import MM_PER_INCH, any_page, charuco, checkerboard, printed, raster
 from typer.testing import CliRunner
 
-from visioncal.cli.target import target_app
+from visioncal.cli.app import target_app
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.vision.finders import DetectedCorners, find_target

@@ -19,9 +19,58 @@ from visioncal.core.version import __version__
 _EXIT_BROKEN_PIPE = 128 + 13
 
 
+class _Dynamics(LazyGroup):
+    """Its commands, in the order of a typical workflow."""
+
+    prefix = "dynamics_"
+    records = ("visioncal.cli.dynamics_options",)
+    listed: ClassVar = {
+        "plan": "Plan the motions that determine an arm's inertias and friction.",
+        "record": "Record angles, speeds and motor currents at the controller's full rate.",
+        "identify": "Identify an arm's inertias and friction from the torques of its motions.",
+        "validate": "Predict the torques of other motions, and say how near that comes.",
+        "payload": "Weigh what the arm carries, by how much more its drives gave than without it.",
+        "gains": "Find how much torque a drive's current makes, by a body that is known.",
+    }
+    homes: ClassVar = dict.fromkeys(listed, "dynamics")
+
+
+dynamics_app = typer.Typer(
+    cls=_Dynamics,
+    help="Identify an arm's inertias and friction, and weigh what it carries.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+class _Target(LazyGroup):
+    """What is done with a board."""
+
+    prefix = "target_"
+    records = ("visioncal.cli.session_options",)
+    listed: ClassVar = {
+        "make": "Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its "
+        "NAME.toml.",
+        "check": "Name the board in a photograph without further options, and print its "
+        "description.",
+    }
+    homes: ClassVar = dict.fromkeys(listed, "target")
+
+
+target_app = typer.Typer(
+    cls=_Target,
+    help="Print a board at its exact size, or name the one in a photograph.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
 class _Commands(LazyGroup):
     """All commands, in the order of a typical workflow."""
 
+    records = ("visioncal.cli.session_options", "visioncal.cli.result_options")
+    homes: ClassVar = {"tcp": "framing", "fixture": "framing"}
+    groups: ClassVar = {"target": target_app, "dynamics": dynamics_app}
     listed: ClassVar = {
         "demo": "Simulate a UR cell, calibrate it from its images, and compare with the truth.",
         "plan": "Propose the most informative robot stops, or those to add to a session.",

@@ -1,181 +1,87 @@
 """`visioncal convert`."""
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
+from visioncal.calibration.guess import Candidate, Guess
+from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages, say
-from visioncal.cli.options import Force
-from visioncal.cli.parsing import pair_in, size_in
-from visioncal.cli.pose_options import UNITS, RobotPoseOptions, names_in, poses_option
+from visioncal.cli.parsing import names_in, pair_in, size_in
 from visioncal.cli.progress import shown_progress
-from visioncal.core.choices import FOREIGN_NAMES, CameraMount
+from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.calibration.guess import Candidate, Guess
-    from visioncal.interchange.formats import DoubtfulSession, ForeignRecording, ImportOptions
-
-_FORMATS = ", ".join(FOREIGN_NAMES)
-_other = partial(typer.Option, rich_help_panel="The recording itself")
-_camera = partial(typer.Option, rich_help_panel="Its camera")
-_doubt = partial(typer.Option, rich_help_panel="Poses that may be misread, of a session as well")
+from visioncal.interchange.formats import (
+    DoubtfulSession,
+    ForeignRecording,
+    ImportOptions,
+    PoseImportOptions,
+    convert,
+    guess_foreign,
+)
 
 
-@dataclass(frozen=True)
-class ConvertOptions(RobotPoseOptions):
-    """Options for a foreign recording."""
-
-    form: Annotated[str | None, _other("--from", help=f"Its format, by name: {_FORMATS}.")] = None
-    mount: Annotated[CameraMount | None, _other(help="Where the camera is.")] = None
-    target: Annotated[
-        str | None,
-        _other(
-            help="A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
-            "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm."
+def convert_command(options: ConvertOptions) -> None:
+    """Runs `visioncal convert`."""
+    written = options.written
+    camera_columns = names_in(written.camera_columns, "--camera-columns")
+    requested = replace(
+        import_options(written),
+        camera=PoseImportOptions(
+            camera_columns, written.camera_form, written.camera_unit, written.camera_inverse
         ),
-    ] = None
-    tip: Annotated[str | None, _other(help="The frame that the poses are of.")] = None
-    camera_columns: Annotated[
-        str | None,
-        poses_option(
-            "--camera-columns",
-            "--camera-key",
-            help="Columns or keys of measured poses of the target: rvec,tvec.",
-        ),
-    ] = None
-    camera_form: Annotated[str | None, poses_option(help="As --robot-form.")] = None
-    camera_unit: Annotated[
-        str | None, poses_option(metavar=UNITS, help="Unit of their positions.")
-    ] = None
-    camera_inverse: Annotated[
-        bool | None,
-        poses_option("--camera-inverse/--camera-as-is", help="They give the camera in the target."),
-    ] = None
-    camera_file: Annotated[
-        Path | None,
-        poses_option(
-            help="A second file with the camera's poses; with times in both, the clocks' offset is "
-            "found."
-        ),
-    ] = None
-    images: Annotated[
-        Path | None,
-        _camera(help="The folder of the images; matched by name, by number, or in order."),
-    ] = None
-    image_column: Annotated[
-        str | None,
-        _camera(
-            "--image-column", "--image-key", help="The column or key that names each row's image."
-        ),
-    ] = None
-    corners: Annotated[
-        Path | None,
-        _camera(
-            help="A file with the corners that another program found: mrcal's .vnl or another "
-            "table, OpenCV's image_points, or lists by image in JSON, YAML or .npz."
-        ),
-    ] = None
-    intrinsics: Annotated[
-        str | None,
-        _camera(
-            help="A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
-            "of the source."
-        ),
-    ] = None
-    resolution: Annotated[
-        str | None, _camera(help="WIDTH,HEIGHT that the intrinsics hold for.")
-    ] = None
-
-    def requested(self) -> "ImportOptions":
-        """The import options.
-
-        Raises:
-            DataError: Names or a resolution are malformed.
-        """
-        from visioncal.interchange.formats import PoseImportOptions
-
-        columns = names_in(self.camera_columns, "--camera-columns")
-        return replace(
-            super().requested(),
-            camera=PoseImportOptions(
-                columns, self.camera_form, self.camera_unit, self.camera_inverse
-            ),
-            image=self.image_column,
-            camera_file=self.camera_file,
-            mount=self.mount,
-            target=self.target,
-            intrinsics=self.intrinsics,
-            images=self.images,
-            corners=self.corners,
-            resolution=None if self.resolution is None else size_in(self.resolution),
-            tip=self.tip,
-        )
-
-
-def convert_command(
-    source: Annotated[
-        Path,
-        typer.Argument(help="A session's folder, its .rrd, or somebody else's file or folder."),
-    ],
-    dest: Annotated[Path, typer.Argument(help="An .rrd, or the folder to write.")],
-    written: ConvertOptions,
-    force: Force = False,
-    guess: Annotated[
-        bool, _doubt("--guess", help="Try other readings of the poses, and ask.")
-    ] = False,
-    yes: Annotated[
-        bool, _doubt("--yes", help="Take the best one where it stands out clearly.")
-    ] = False,
-    mirror_poses: Annotated[
-        bool,
-        _doubt("--mirror-poses", help="Mirror the robot's poses where its frame is left-handed."),
-    ] = False,
-    exchange: Annotated[
-        str | None,
-        _doubt("--exchange", help="Two views whose images are exchanged, by number: 8,17."),
-    ] = None,
-) -> None:
-    """Write a session as a folder or a recording, or make one of another program's.
-
-    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
-    nothing was written, and the message says what is missing or wrong.
-    """
-    from visioncal.interchange.formats import convert
-
-    requested, form = written.requested(), written.form
-    if yes and not guess:
+        image=written.image_column,
+        camera_file=written.camera_file,
+        mount=written.mount,
+        target=written.target,
+        intrinsics=written.intrinsics,
+        images=written.images,
+        corners=written.corners,
+        resolution=None if written.resolution is None else size_in(written.resolution),
+        tip=written.tip,
+    )
+    if options.yes and not options.guess:
         raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
-    if mirror_poses and not guess:
+    if options.mirror_poses and not options.guess:
         words = "--mirror-poses is for what a guess finds; it needs --guess."
         raise DataError(words, culprits=["--mirror-poses"])
-    choose = partial(_chosen, yes=yes) if guess else None
+    choose = partial(_chosen, yes=options.yes) if options.guess else None
     session = convert(
-        source,
-        dest,
+        options.source,
+        options.dest,
         requested=requested,
-        form=form,
-        force=force,
+        form=written.form,
+        force=options.force,
         choose=choose,
-        mirrors_poses=mirror_poses,
-        exchange=None if exchange is None else pair_in(exchange, "--exchange"),
+        mirrors_poses=options.mirror_poses,
+        exchange=None if options.exchange is None else pair_in(options.exchange, "--exchange"),
     )
     for warning in session.warnings:
         say(f"note: {warning}")
-    say(f"wrote {dest}\nsha256 {session.digest()}")
+    say(f"wrote {options.dest}\nsha256 {session.digest()}")
 
 
-def _chosen(recorded: "DoubtfulSession | ForeignRecording", *, yes: bool) -> "Candidate":
+def import_options(poses: RobotPoseOptions) -> ImportOptions:
+    """The import options of a robot's poses.
+
+    Raises:
+        DataError: A name is empty or occurs twice.
+    """
+    columns = names_in(poses.robot_columns, "--robot-columns")
+    return ImportOptions(
+        robot=PoseImportOptions(columns, poses.robot_form, poses.robot_unit, poses.robot_inverse),
+        joints=names_in(poses.joint_columns, "--joint-columns"),
+        joints_deg=poses.joint_unit == "deg",
+        robot_model=poses.robot_model,
+    )
+
+
+def _chosen(recorded: DoubtfulSession | ForeignRecording, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and returns the clearly best or confirmed one."""
-    from visioncal.calibration.pipeline.guess_inputs import guess_session
-    from visioncal.interchange.formats import ForeignRecording, guess_foreign
-
     with shown_progress(quiet=False) as progress:
         if isinstance(recorded, ForeignRecording):
             guess = guess_foreign(recorded, progress=progress)
@@ -185,7 +91,7 @@ def _chosen(recorded: "DoubtfulSession | ForeignRecording", *, yes: bool) -> "Ca
     return _confirmed(guess, yes=yes)
 
 
-def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
+def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
     if not guess.stands_out:
         if guess.declared.closes:
             return guess.declared
@@ -216,10 +122,8 @@ def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
     return guess.best
 
 
-def _print_guess(guess: "Guess") -> None:
+def _print_guess(guess: Guess) -> None:
     """Prints the readings, the best first, the conclusion, and what remains ambiguous."""
-    from rich.table import Table
-
     console = messages()
     table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
     for candidate in guess.candidates:

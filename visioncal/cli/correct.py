@@ -1,93 +1,282 @@
 """`visioncal correct`."""
 
-import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
+import numpy as np
 import typer
+from rich.markup import escape
 
-from visioncal.cli.options import AsJson, ForceBoth, OutFile, PartOptions
-from visioncal.core.choices import WIDEST_RAD
+from visioncal.cli.console import answers, check_usable, messages, print_json, say, warn
+from visioncal.cli.parsing import numbers_in
+from visioncal.cli.result_options import CorrectOptions
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, write_atomically
+from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.interchange.result_files import load_calibration
+from visioncal.results import Calibration
+from visioncal.results.compensation.correction import (
+    CalibratedArm,
+    Corrected,
+    correct,
+    predicted_sigma_mm,
+)
+from visioncal.results.compensation.table import (
+    Targets,
+    columns_to_send,
+    read_targets,
+    table_to_send,
+)
+from visioncal.robot import Loads
+from visioncal.session.columns import column_of
+from visioncal.session.selecting import ARM, EYE
 
-
-@dataclass(frozen=True)
-class CorrectOptions:
-    """Options of the targets, their frame, and the arm's payload and temperature."""
-
-    targets: Annotated[
-        Path,
-        typer.Argument(
-            help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
-            "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
-        ),
-    ]
-    calibration: Annotated[
-        Path,
-        typer.Option(
-            "-c",
-            "--against",
-            "--calibration",
-            help="Of the calibrated arm: an output folder of calibrate, or its .rrd.",
-        ),
-    ]
-    part: PartOptions
-    out: OutFile = None
-    tool: Annotated[
-        str | None,
-        typer.Option(
-            help="Frame of the targets and of the corrected ones: a tool of the calibration, or "
-            "cam; by default the flange."
-        ),
-    ] = None
-    seed_joints: Annotated[
-        str | None,
-        typer.Option(
-            metavar="Q1,Q2,...",
-            help="Joint angles near which the first target is reached, in radians; else the "
-            "middle of the joints' limits. Each further target is reached near to the one before.",
-        ),
-    ] = None
-    payload_kg: Annotated[
-        float, typer.Option(help="Payload on the flange, for joints that bend (kg).")
-    ] = 0.0
-    payload_m: Annotated[
-        str, typer.Option(metavar="X,Y,Z", help="Its centre of mass in the flange's frame (m).")
-    ] = "0,0,0"
-    widest_deg: Annotated[
-        float,
-        typer.Option(
-            help="Warn where a joint turns farther than this from one target to the next."
-        ),
-    ] = math.degrees(WIDEST_RAD)
-    temperatures: Annotated[
-        str | None,
-        typer.Option(
-            metavar="T1,T2,...",
-            help="Temperatures of the links behind the joints, in degrees Celsius, for an arm "
-            "whose drift was calibrated; else as warm as it was when its session began.",
-        ),
-    ] = None
-    skip: Annotated[
-        bool,
-        typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
-    ] = False
-    force: ForceBoth = False
-    as_json: AsJson = False
-
-    @property
-    def file(self) -> Path | None:
-        """The file to write; None to print the table."""
-        return None if self.out == Path("-") else self.out
+_MOST_SHOWN = 10
+_MOST_DEG = 720.0
+# Away from singularities a millimetre turns joints by some tenths of a degree at most; beyond the
+# second limit the exact value does not matter.
+_SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
+_TOOLS = "flange_from_"
 
 
 def correct_command(options: CorrectOptions) -> None:
-    """Correct targets so that the arm reaches them by its nominal controller.
+    """Corrects a table of targets, and writes and prints the result.
 
-    Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit
-    status 3: nothing was, as the calibration's verdict is bad.
+    Raises:
+        DataError: Something cannot be read or written, or targets are out of reach.
+        VerdictError: The calibration, or the tool, is bad.
     """
-    # Imported late, so that --help stays fast.
-    from visioncal.cli.corrected_targets import correct_table
+    # None where the table is printed.
+    file = None if options.out == Path("-") else options.out
+    needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
+    loaded = load_calibration(options.calibration, options.part.choice, needs)
+    bad = check_usable(loaded.verdict, "the calibration", force=options.force)
+    calibration = _at_temperatures(loaded, options.temperatures)
+    arm = CalibratedArm.of(calibration)
+    if file is not None:
+        check_free(file, force=options.force)
+    targets = read_targets(options.targets, arm.real)
+    if not 0.0 < options.widest_deg <= _MOST_DEG:
+        raise DataError(
+            f"--widest-deg is {options.widest_deg:g}; degrees above 0 and up to {_MOST_DEG:g} are "
+            "needed.",
+            culprits=["--widest-deg"],
+        )
+    flange_from_tool = _tool(calibration, options.tool)
+    base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
+    corrected = correct(
+        calibration,
+        base_from_flange,
+        _seeds(targets.q_seed, options.seed_joints),
+        widest_rad=np.deg2rad(options.widest_deg),
+        loads=Loads.alike(
+            len(base_from_flange),
+            options.payload_kg,
+            numbers_in(options.payload_m, "--payload-m", "x,y,z"),
+            (0.0, 0.0, 0.0),
+        ),
+    )
+    unreachable = tuple(_unreachable(targets, corrected))
+    rows = np.flatnonzero(corrected.reached)
+    if unreachable and not (options.skip and len(rows)):
+        raise _refusal(unreachable, len(targets))
+    sigma_mm = predicted_sigma_mm(calibration, base_from_flange[:, :3, 3], corrected.q)
+    base_from_tool = corrected.base_from_flange @ flange_from_tool
+    columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
+    warnings = [
+        *bad,
+        *_warn_payload(arm, options.payload_kg),
+        *_warn_turns(arm, targets, corrected, options.widest_deg),
+        *_warn_singular(arm, targets, corrected.q, rows),
+    ]
+    if file is not None:
+        write_atomically(file, table_to_send(targets, columns, rows))
+    if options.as_json:
+        print_json(_document(targets, columns, rows, unreachable) | {"warnings": warnings})
+        return
+    if file is None:
+        typer.echo(table_to_send(targets, columns, rows), nl=False)
+    _report(columns, rows, unreachable, warnings, is_answer=file is not None)
+    if np.isnan(targets.q_seed).all() and options.seed_joints is None:
+        say(_posture(arm, corrected.q[rows[0]]))
+    if file is not None:
+        say(f"wrote {file}")
 
-    correct_table(options)
+
+def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration:
+    """The calibration at the stated temperatures."""
+    if words is None:
+        return calibration
+    form = ",".join(f"T{index + 1}" for index in range(calibration.drift.joint_count))
+    temperatures = np.array(numbers_in(words, "--temperatures", form))
+    wrong = next(filter(None, map(column_of("ambient_c").fault, temperatures.tolist())), "")
+    if wrong:
+        raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
+    return calibration.at_temperatures(temperatures)
+
+
+def _warn_payload(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
+    """Warns where a payload has no effect."""
+    if payload_kg and not arm.compliance.any():
+        yield (
+            f"--payload-kg {payload_kg:g} changes nothing: the calibration has no joints that bend "
+            "(level elastic)."
+        )
+
+
+def _tool(calibration: Calibration, name: str | None) -> FloatArray:
+    """(4, 4) `flange_from_tool` [m]; the identity where the targets are of the flange."""
+    if name is None:
+        return np.eye(4)
+    placed = calibration.placed
+    transform = name if name.startswith(_TOOLS) else f"{_TOOLS}{name}"
+    if transform not in placed:
+        tools = [word.removeprefix(_TOOLS) for word in placed if word.startswith(_TOOLS)]
+        raise DataError(
+            f"--tool {name}: calibration {calibration.session_name!r} has no {transform}; on its "
+            f"flange are {', '.join(tools) or 'no tools'}.",
+            culprits=["--tool"],
+            next_step=did_you_mean(name, tools) or "A tool joins it by visioncal tcp.",
+        )
+    return placed[transform].matrix
+
+
+def _seeds(seeds: FloatArray, words: str | None) -> FloatArray:
+    """Seeds of the rows (m, n); the first takes that of the option where it has none."""
+    if words is None:
+        return seeds
+    form = ",".join(f"q{index}" for index in range(1, seeds.shape[1] + 1))
+    first = np.array(numbers_in(words, "--seed-joints", form))
+    if np.isnan(seeds[0, 0]):
+        seeds = seeds.copy()
+        seeds[0] = first
+    return seeds
+
+
+def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, str]]:
+    """Rows that cannot be reached, with the reason."""
+    for row in np.flatnonzero(~corrected.reached):
+        off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
+        nearest = f"the nearest posture leaves {mm_and_deg(off_mm, off_deg)}"
+        beyond = corrected.beyond[row]
+        reason = (
+            f"reached only with {some_of(beyond)} beyond its limits; within them "
+            if beyond
+            else "out of reach: "
+        )
+        yield targets.places[row], reason + nearest
+
+
+def _refusal(unreachable: Sequence[tuple[str, str]], count: int) -> DataError:
+    lines = [f"{place}: {why}." for place, why in unreachable[:_MOST_SHOWN]]
+    if len(unreachable) > _MOST_SHOWN:
+        lines.append(f"And {len(unreachable) - _MOST_SHOWN} more of the kind.")
+    return DataError(
+        "\n".join([f"{len(unreachable)} of {count} targets cannot be reached.", *lines]),
+        culprits=[place for place, _ in unreachable],
+        next_step="Move them, or write the others with --skip-unreachable."
+        if len(unreachable) < count
+        else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
+    )
+
+
+def _warn_turns(
+    arm: CalibratedArm, targets: Targets, corrected: Corrected, widest_deg: float
+) -> Iterator[str]:
+    """Warns where joints turned far from the seed, possibly onto another branch."""
+    turned = np.rad2deg(corrected.turned_rad)
+    rows = np.flatnonzero(corrected.reached & (turned.max(axis=1) > widest_deg))
+    for row in rows[:_MOST_SHOWN]:
+        joint = int(np.argmax(turned[row]))
+        yield (
+            f"{targets.places[row]}: {arm.real.joint_names[joint]} turns by "
+            f"{turned[row, joint]:.0f} deg from where this target was looked for; no posture "
+            "nearer was found."
+        )
+    if len(rows) > _MOST_SHOWN:
+        yield f"And {len(rows) - _MOST_SHOWN} more targets of the kind."
+
+
+def _warn_singular(
+    arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArray
+) -> Iterator[str]:
+    """Warns near singularities, where a correction of a millimetre turns a joint far."""
+    turns = arm.turns_deg_per_mm(q[rows])
+    near = np.flatnonzero(turns.max(axis=1) > _SINGULAR_DEG)
+    if not len(near):
+        return
+    worst = near[int(np.argmax(turns[near].max(axis=1)))]
+    joint = int(np.argmax(turns[worst]))
+    largest_deg = float(turns[worst, joint])
+    turn_words = (
+        f"{largest_deg:.0f}" if largest_deg < _MOST_TURN_DEG else f"over {_MOST_TURN_DEG:.0f}"
+    )
+    yield (
+        f"{some_of([targets.places[rows[index]] for index in near])}: nearly singular; at "
+        f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
+        f"{turn_words} deg. Move slowly there, or keep away from it."
+    )
+
+
+def _posture(arm: CalibratedArm, q: FloatArray) -> str:
+    """States the initial posture of targets without seeds."""
+    turning = ~arm.real.chain.prismatic
+    words = [
+        f"{np.rad2deg(value):.0f}" if turns else f"{1e3 * value:.0f} mm"
+        for value, turns in zip(q, turning, strict=True)
+    ]
+    return (
+        f"the first is reached in the posture nearest to the middle of the joints' limits, "
+        f"({', '.join(words)}) deg; --seed-joints begins in another"
+    )
+
+
+def _report(
+    columns: Mapping[str, FloatArray],
+    rows: IntArray,
+    unreachable: Sequence[tuple[str, str]],
+    warnings: Sequence[str],
+    *,
+    is_answer: bool,
+) -> None:
+    console = messages()
+    mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
+    words = (
+        f"{len(rows)} of {len(rows) + len(unreachable)} targets corrected: moved by "
+        f"{mm_and_deg(float(np.median(mm)), float(np.median(deg)))} (median), by "
+        f"up to {mm_and_deg(float(mm.max()), float(deg.max()))}"
+    )
+    if "sigma_mm" in columns:
+        words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
+    # Where stdout has no table, this is the command's answer.
+    (answers() if is_answer else console).print(escape(words))
+    for place, why in unreachable[:_MOST_SHOWN]:
+        console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
+    if len(unreachable) > _MOST_SHOWN:
+        console.print(f"  and {len(unreachable) - _MOST_SHOWN} more")
+    for warning in warnings:
+        warn(warning)
+
+
+def _document(
+    targets: Targets,
+    columns: Mapping[str, FloatArray],
+    rows: IntArray,
+    unreachable: Sequence[tuple[str, str]],
+) -> dict[str, Any]:
+    kept = [column for column in targets.table.columns if column not in columns]
+    cells = [dict(zip(targets.table.columns, row, strict=True)) for row in targets.table.rows]
+    return {
+        "targets": [
+            {
+                "place": targets.places[row],
+                **{name: cells[row][name] for name in kept},
+                **{name: float(numbers[row]) for name, numbers in columns.items()},
+            }
+            for row in rows
+        ],
+        "unreachable": [{"place": place, "reason": why} for place, why in unreachable],
+    }

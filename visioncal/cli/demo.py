@@ -1,22 +1,22 @@
 """`visioncal demo`."""
 
 import shutil
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
 
+import numpy as np
 import typer
 
+from visioncal.calibration.pipeline import run
 from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_written, say
-from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
-from visioncal.core.choices import Faults
+from visioncal.cli.session_options import DemoOptions
+from visioncal.cli.summary import print_summary, truth_table
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import invert, log
 from visioncal.interchange.outputs import write_outputs
 from visioncal.live.drivers.extras import client_library
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.results import Calibration
-    from visioncal.simulation import Truth
+from visioncal.results import Calibration
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, Truth, read_truth, simulate, truth_path, write_session
 
 # False-alarm probability of that test, and factor on the sigmas: errors of one board's corners are
 # correlated by hundredths of a pixel, and joints deviate from their encoders, which a covariance of
@@ -24,56 +24,29 @@ if TYPE_CHECKING:
 _CHANCE, _SIGMA_FACTOR = 1e-3, 1.5
 
 
-def demo_command(
-    out: OutFolder = Path("demo"),
-    views: Annotated[int, typer.Option(min=5, max=200, help="Number of views.")] = 20,
-    seed: Seed = 0,
-    live: Annotated[
-        bool,
-        typer.Option(
-            "--live",
-            help="Plan the stops and record them, with a UR's own client library and a simulated "
-            "controller.",
-        ),
-    ] = False,
-    fault: Annotated[
-        Faults | None,
-        typer.Option(
-            metavar="FAULT",
-            help=f"With --live, let this happen half way: {', '.join(get_args(Faults))}.",
-            show_default=False,
-        ),
-    ] = None,
-) -> None:
-    """Simulate a UR cell, calibrate it from its images, and compare with the truth.
-
-    The camera's intrinsics are not given: they too are estimated from the images. With --live the
-    arm has joint offsets and the stops are planned from rough guesses; nothing real moves. Exit
-    status 0: the result is as near to the truth as it says; 3: it is not, or its verdict is
-    bad.
-    """
-    from visioncal.calibration.pipeline import run
-    from visioncal.cli.summary import print_summary, truth_table
-    from visioncal.session import Session
-    from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
-
-    if fault is not None and not live:
+def demo_command(options: DemoOptions) -> None:
+    """Runs `visioncal demo`."""
+    if options.fault is not None and not options.live:
         raise typer.BadParameter("--fault belongs to --live.")
-    if live:
+    if options.live:
         client_library("rtde_control", "ur")
-    session, result = out / "session", out / "result"
+    session, result = options.out / "session", options.out / "result"
     if truth_path(session).exists():
         # An earlier demonstration's; nothing else is ever removed.
         shutil.rmtree(session, ignore_errors=True)
-    if live:
+    if options.live:
         from visioncal.cli.live_demo import record_simulated
 
-        record_simulated(session, out / "plan", views, seed, fault)
+        record_simulated(session, options.out / "plan", options.views, options.seed, options.fault)
     with shown_progress(quiet=False) as progress:
-        if not live:
-            cell = simulate(CellOptions(views=views, seed=seed, state_intrinsics=False))
+        if not options.live:
+            cell = simulate(
+                CellOptions(views=options.views, seed=options.seed, state_intrinsics=False)
+            )
             write_session(
-                cell, session, lambda share: progress("render", round(share * views), views)
+                cell,
+                session,
+                lambda share: progress("render", round(share * options.views), options.views),
             )
         loaded = Session.load(session)
         done = run(loaded, progress=progress).with_paths(session, result)
@@ -94,13 +67,8 @@ def demo_command(
     report_written(written, status=exit_status(done.calibration.verdict) if agrees else EXIT_BAD)
 
 
-def chi_square(calibration: "Calibration", truth: "Truth") -> tuple[float, float]:
+def chi_square(calibration: Calibration, truth: Truth) -> tuple[float, float]:
     """Squared Mahalanobis distance of the errors of both transforms, and the limit of its test."""
-    import numpy as np
-
-    from visioncal.core.quantiles import chi2_limit
-    from visioncal.core.transforms import invert, log
-
     errors = [
         log(invert(truth.transforms[name]) @ edge.matrix)
         for name, edge in calibration.edges.items()

@@ -1,19 +1,12 @@
 """`visioncal diff`."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from rich.table import Table
 
 from visioncal.cli.console import answers, print_json
-from visioncal.cli.options import AsJson, PartOptions
+from visioncal.cli.result_options import DiffOptions
 from visioncal.core.number_format import figure
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from visioncal.results.compare import Comparison, LensChange, Significance
+from visioncal.interchange.result_files import load_result
+from visioncal.results.compare import Comparison, LensChange, Significance, compare, to_document
 
 # Below a nanometre and a micro-degree differences are rounding.
 _DECIMALS = 6
@@ -21,35 +14,22 @@ _LEAST_WIDTH = 110
 _WHOLE_PERCENT, _LEAST_PERCENT = 10.0, 0.01
 
 
-def diff_command(
-    first: Annotated[
-        Path, typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd).")
-    ],
-    second: Annotated[Path, typer.Argument(help="The one to compare with it.")],
-    part: PartOptions,
-    as_json: AsJson = False,
-) -> None:
-    """Show what changed between two calibrations, and what is only noise.
-
-    Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
-    """
-    from visioncal.interchange.result_files import load_result
-    from visioncal.results.compare import compare, to_document
-
+def diff_command(options: DiffOptions) -> None:
+    """Runs `visioncal diff`."""
     comparison = compare(
-        load_result(first),
-        load_result(second),
-        camera=part.camera,
-        robot=part.robot,
-        target=part.target,
+        load_result(options.first),
+        load_result(options.second),
+        camera=options.part.camera,
+        robot=options.part.robot,
+        target=options.part.target,
     )
-    if as_json:
+    if options.as_json:
         print_json(to_document(comparison))
         return
-    _print(comparison, (str(first), str(second)))
+    _print(comparison, (str(options.first), str(options.second)))
 
 
-def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
+def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
     console = answers(markup=False)
     # Names of cells' frames are long, and are not truncated.
     console.width = max(console.width, _LEAST_WIDTH)
@@ -74,7 +54,7 @@ def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
     console.print(_noise_table(comparison))
 
 
-def _edge_table(comparison: "Comparison") -> "Table":
+def _edge_table(comparison: Comparison) -> Table:
     table = _table("transform", "moved", "sigma", "moved / sigma", "by chance", "")
     for edge in comparison.edges:
         for moved, sigma, unit, test in (
@@ -91,7 +71,7 @@ def _edge_table(comparison: "Comparison") -> "Table":
     return table
 
 
-def _lens_table(lens: "LensChange") -> "Table":
+def _lens_table(lens: LensChange) -> Table:
     table = _table("lens", "first", "second", "difference", "sigma")
     sigmas = [""] * len(lens.names)
     if lens.sigmas is not None:
@@ -104,7 +84,7 @@ def _lens_table(lens: "LensChange") -> "Table":
     return table
 
 
-def _noise_table(comparison: "Comparison") -> "Table":
+def _noise_table(comparison: Comparison) -> Table:
     table = _table("noise, per axis", "first", "second")
     for noise_change in comparison.noise:
         values = (
@@ -114,7 +94,7 @@ def _noise_table(comparison: "Comparison") -> "Table":
     return table
 
 
-def _outcome(test: "Significance") -> tuple[str, str]:
+def _outcome(test: Significance) -> tuple[str, str]:
     percent = 100 * test.p_value
     chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{figure(percent)} %"
     return (
@@ -123,8 +103,7 @@ def _outcome(test: "Significance") -> tuple[str, str]:
     )
 
 
-def _table(*columns: str) -> "Table":
-    from rich.table import Table
+def _table(*columns: str) -> Table:
 
     table = Table(box=None, pad_edge=False, caption_justify="left")
     for column in columns:

@@ -1,41 +1,29 @@
 """`visioncal doctor`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
 
+from visioncal.calibration.pipeline.checkup import Checkup, doctor, next_command, to_document
 from visioncal.cli.console import EXIT_BAD, answers, print_json, with_run_paths
-from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.calibration.pipeline.checkup import Checkup
+from visioncal.cli.session_options import DoctorOptions
 
 
-def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
-    """Say what is wrong with a session before it is calibrated, and what to type.
-
-    Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and
-    clocks, in seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2:
-    it cannot be read.
-    """
-    from visioncal.calibration.pipeline.checkup import doctor, to_document
-
-    with with_run_paths(session), shown_progress(quiet=as_json) as progress:
-        found = doctor(session, progress=progress)
-    if as_json:
+def doctor_command(options: DoctorOptions) -> None:
+    """Runs `visioncal doctor`."""
+    with with_run_paths(options.session), shown_progress(quiet=options.as_json) as progress:
+        found = doctor(options.session, progress=progress)
+    if options.as_json:
         print_json(to_document(found))
     else:
-        _print(found, session)
+        _print(found, options.session)
     if not found.is_sound:
         raise typer.Exit(EXIT_BAD)
 
 
-def _print(checkup: "Checkup", session: Path) -> None:
-    from visioncal.calibration.pipeline.checkup import next_command
+def _print(checkup: Checkup, session: Path) -> None:
 
     console = answers()
     console.print(escape(f"{checkup.session}: {'; '.join(checkup.seen)}"))

@@ -1,105 +1,124 @@
-"""Shared options of `visioncal dynamics`: samples, and identified dynamics."""
+"""`visioncal dynamics`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
 
+import numpy as np
 import typer
+from rich.markup import escape
+from rich.table import Table
 
-from visioncal.cli.lazy import LazyGroup
-from visioncal.cli.options import RobotName
+from visioncal.cli.console import answers, exit_status, messages, print_json, report_written, say
+from visioncal.cli.dynamics_options import (
+    FRICTION,
+    PLANNED_FRICTION,
+    DynamicsGainsOptions,
+    DynamicsIdentifyOptions,
+    DynamicsPayloadOptions,
+    DynamicsPlanOptions,
+    DynamicsRecordOptions,
+    DynamicsValidateOptions,
+    StreamOptions,
+)
+from visioncal.cli.parsing import numbers_in
+from visioncal.cli.plan import boxes_of, floor_of
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.summary import print_verdict
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import some_of
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.dynamics.identified import Identified
-    from visioncal.dynamics.model import FrictionTerms
-    from visioncal.dynamics.run import IdentificationRequest
-
-MotionsArgument: TypeAlias = Annotated[
-    Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
-]
-CutoffOption: TypeAlias = Annotated[
-    float | None,
-    typer.Option(
-        "--cutoff-hz", min=0.1, help="Of the low-pass. Default: ten times the motion's band."
-    ),
-]
-AgainstOption: TypeAlias = Annotated[
-    Path | None, typer.Option("--against", help=f"A folder of identify, or its {DYNAMICS_FILE}.")
-]
-
-
-class _Commands(LazyGroup):
-    """Its commands, in the order of a typical workflow."""
-
-    prefix = "dynamics_"
-    listed: ClassVar = {
-        "plan": "Plan the motions that determine an arm's inertias and friction.",
-        "record": "Record angles, speeds and motor currents at the controller's full rate.",
-        "identify": "Identify an arm's inertias and friction from the torques of its motions.",
-        "validate": "Predict the torques of other motions, and say how near that comes.",
-        "payload": "Weigh what the arm carries, by how much more its drives gave than without it.",
-        "gains": "Find how much torque a drive's current makes, by a body that is known.",
-    }
-
-
-dynamics_app = typer.Typer(
-    cls=_Commands,
-    help="Identify an arm's inertias and friction, and weigh what it carries.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
+from visioncal.core.files import check_free
+from visioncal.core.interrupts import signals_as_interrupts
+from visioncal.core.number_format import figure, matched, significant, some_of
+from visioncal.core.types import FloatArray
+from visioncal.dynamics import (
+    BaseModel,
+    DynamicModel,
+    FrictionTerms,
+    Payload,
+    drive_gains,
+    estimate_payload,
 )
+from visioncal.dynamics.document import stribeck_rows, to_document
+from visioncal.dynamics.excitation import ExcitationRequest, excite
+from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified
+from visioncal.dynamics.identify import SLOW_RAD_S, Options
+from visioncal.dynamics.judge import judge
+from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
+from visioncal.dynamics.plan_files import MotionPlan, motion_document
+from visioncal.dynamics.run import (
+    IdentificationRequest,
+    conditioned_streams,
+    current_streams,
+    identify_session,
+    robot_of,
+    select_arm,
+    validate_session,
+)
+from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
+from visioncal.dynamics.validate import validate
+from visioncal.interchange.outputs import Written, write_dynamics, write_motions
+from visioncal.live.capture.motions import record_motion
+from visioncal.live.drivers.ur import UrMotion
+from visioncal.live.planning.cell import Box
+from visioncal.live.planning.messages import plan_warnings, plan_words
+from visioncal.robot import Inertias, Robot, load_robot, symmetric_matrices
+from visioncal.robot.bodies import Body, capsule
+from visioncal.session import STREAMS, Session, check_stream, save_stream
 
 
-@dataclass(frozen=True)
-class StreamOptions:
-    """Which samples are used, and how currents become torques."""
-
-    stream: Annotated[
-        list[str] | None, typer.Option(help="A stream with torques; may be repeated. Default: all.")
-    ] = None
-    cutoff_hz: CutoffOption = None
-    gains: Annotated[
-        str | None,
-        typer.Option(
-            metavar="K1,K2,...",
-            help="Torque for a current, by joint [N m/A], where currents were recorded.",
+def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
+    """Plans an exciting motion and sweeps, writes them into a folder, and reports them."""
+    motion, kept, limits = options.motion, options.kept, options.arm_options
+    arm = load_robot(options.robot)
+    allowed = motion_limits(
+        arm,
+        MotionMargins(
+            float(np.deg2rad(kept.margin_deg)),
+            limits.speed,
+            limits.acceleration,
+            limits.torque_margin,
+            1e-3 * kept.clearance_mm,
+            floor_of(kept),
         ),
-    ] = None
-    robot: RobotName = None
+        missing=DefaultLimits(
+            *map(_radians, (limits.range_deg, limits.speed_deg, limits.acceleration_deg))
+        ),
+        bodies=_bodies(arm, boxes_of(kept), limits.tool),
+        payload=None if limits.payload is None else _payload(limits.payload),
+    )
+    request = ExcitationRequest(
+        motion.duration,
+        motion.harmonics,
+        _friction_terms(motion.friction, PLANNED_FRICTION),
+        motion.starts,
+        motion.seed,
+        seconds=np.inf if motion.seconds is None else motion.seconds,
+    )
+    sweeps = None
+    with shown_progress(quiet=options.as_json) as progress:
+        # The sweeps first: they are quick, and fail for the same reasons.
+        if not motion.no_sweeps:
+            sweeps = plan_sweeps(
+                allowed, SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
+            )
+        plan = MotionPlan(allowed, excite(allowed, request, progress), sweeps)
+    document = motion_document(plan)
+    written = write_motions(options.out, plan, motion.rate_hz, document)
+    if options.as_json:
+        print_json(document)
+    else:
+        console = answers()
+        for words in plan_words(plan):
+            console.print(escape(words))
+        for words in plan_warnings(plan):
+            console.print(f"[bold yellow]warning:[/] {escape(words)}")
+    report_written(written, quiet=options.as_json)
 
-    def request(self) -> "IdentificationRequest":
-        """The request for the identification.
 
-        Raises:
-            DataError: The gains are no numbers.
-        """
-        from visioncal.dynamics.run import IdentificationRequest
-
-        try:
-            gains = tuple(float(part) for part in self.gains.split(",")) if self.gains else ()
-        except ValueError as error:
-            raise DataError(
-                f"--gains is {self.gains!r}; numbers with commas between are needed.",
-                culprits=["--gains"],
-            ) from error
-        return IdentificationRequest(
-            tuple(self.stream or ()), cutoff_hz=self.cutoff_hz, gains_nm_a=gains, robot=self.robot
-        )
-
-
-def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
-    """Reads the option --friction: names among `known`, separated by commas, or none.
-
-    Raises:
-        DataError: There is no such term.
-    """
-    from visioncal.dynamics.model import FrictionTerms
-
+def _friction_terms(words: str, known: Sequence[str]) -> FrictionTerms:
+    """Reads the option --friction: names among `known`, separated by commas, or none."""
     wanted = [] if words.strip().lower() == "none" else [part.strip() for part in words.split(",")]
     wrong = [name for name in wanted if name not in known]
     if wrong:
@@ -110,14 +129,73 @@ def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
     return FrictionTerms(*(name in wanted for name in known))
 
 
-def identified_of(against: Path | None, command: str) -> "Identified":
-    """Loads identified dynamics.
+def _radians(degrees: float | None) -> float | None:
+    if degrees is None:
+        return None
+    if not 0.0 < degrees < np.inf:
+        raise DataError(
+            f"a limit of {degrees:g} deg is given; a number above zero is needed.",
+            culprits=["--range-deg", "--speed-deg", "--acceleration-deg"],
+        )
+    return float(np.deg2rad(degrees))
 
-    Raises:
-        DataError: None are named, or they cannot be read.
-    """
-    from visioncal.dynamics.identified import Identified
 
+def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
+    bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
+    if tool is not None:
+        length, radius = (1e-3 * number for number in numbers_in(tool, "--tool", "length,radius"))
+        if min(length, radius) <= 0.0:
+            raise DataError(
+                f"--tool is {tool!r}; a length and a radius above zero [mm] are needed.",
+                culprits=["--tool"],
+            )
+        flange = arm.chain.placements[-1]
+        tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
+        bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
+    return tuple(bodies)
+
+
+def _payload(words: str) -> FloatArray:
+    """(10,) inertial parameters of a point mass, in the flange's frame."""
+    kg, *centre_mm = numbers_in(words, "--payload", "kg,x,y,z")
+    if kg < 0.0:
+        raise DataError(
+            f"--payload is {words!r}; a mass of 0 kg or more is needed.", culprits=["--payload"]
+        )
+    x, y, z = (1e-3 * value for value in centre_mm)
+    about = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
+    return kg * np.array([1.0, x, y, z, *about])
+
+
+def dynamics_record_command(options: DynamicsRecordOptions) -> None:
+    """Runs `visioncal dynamics record`."""
+    kind, _, host = options.arm.partition(":")
+    if kind != "ur" or not host:
+        raise DataError(
+            f"--arm is {options.arm!r}; ur:HOST is needed, as ur:192.168.0.10.",
+            culprits=["--arm"],
+            next_step="Other arms' recordings go into streams/NAME.csv of a session.",
+        )
+    path = options.out / STREAMS / f"{options.stream}.csv"
+    check_free(path, force=False, replaceable=False)
+    with signals_as_interrupts(), closing(UrMotion(host)) as joints:
+        found = record_motion(joints, rest_s=options.rest_s, report=messages().print)
+        model = options.robot or joints.model
+    check_stream(options.stream, found)
+    out, streams = options.out, {options.stream: found}
+    if (out / "session.toml").is_file():
+        save_stream(out, options.stream, found)
+    else:
+        document = {"schema": 1, "name": out.name or "motions", "robot": {"model": model}}
+        Session.of_streams(document, streams).save(out)
+    say(
+        f"wrote {len(found)} samples to {path}. They hold currents: identify needs --gains, "
+        "which visioncal dynamics gains finds"
+    )
+
+
+def _identified_of(against: Path | None, command: str) -> Identified:
+    """Loads identified dynamics."""
     if against is None:
         raise DataError(
             f"dynamics {command}: what was identified (--against {DYNAMICS_FILE}) is needed.",
@@ -125,3 +203,247 @@ def identified_of(against: Path | None, command: str) -> "Identified":
             next_step="Name the output folder of visioncal dynamics identify.",
         )
     return Identified.load(against)
+
+
+def _requested(streams: StreamOptions) -> IdentificationRequest:
+    """The request for an identification."""
+    try:
+        gains = tuple(float(part) for part in streams.gains.split(",")) if streams.gains else ()
+    except ValueError as error:
+        raise DataError(
+            f"--gains is {streams.gains!r}; numbers with commas between are needed.",
+            culprits=["--gains"],
+        ) from error
+    return IdentificationRequest(
+        tuple(streams.stream or ()),
+        cutoff_hz=streams.cutoff_hz,
+        gains_nm_a=gains,
+        robot=streams.robot,
+    )
+
+
+def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
+    """Identifies the dynamics from a session's streams, and writes and reports them."""
+    request = replace(
+        _requested(options.streams),
+        validate_on=options.validate_on or "",
+        rotors=options.rotors,
+        options=Options(
+            terms=replace(_friction_terms(options.friction, FRICTION), slow_rad_s=SLOW_RAD_S),
+            stribeck=options.stribeck,
+            checked=not options.unchecked,
+        ),
+    )
+    run = identify_session(Session.load(options.session), request)
+    identified = run.identified
+    written = Written(()) if options.output is None else write_dynamics(options.output, run)
+    if options.as_json:
+        print_json(to_document(identified))
+    else:
+        _report(identified, () if run.predicted is None else run.predicted.notes)
+    if options.output is None and not options.as_json:
+        say("nothing was written: -o names a folder for it")
+    report_written(written, quiet=options.as_json, status=exit_status(judge(identified)))
+
+
+def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
+    """Predicts the torques of a session's streams, and prints the prediction errors."""
+    identified = _identified_of(options.against, "validate")
+    request = _requested(options.streams)
+    predictions = validate_session(Session.load(options.session), identified, request)
+    if options.as_json:
+        documents = []
+        for prediction in predictions:
+            document = {
+                "stream": prediction.label,
+                "rms_nm": prediction.rms_nm(prediction.predicted_nm).tolist(),
+                "torque_nm": prediction.torque_nm.tolist(),
+            }
+            if prediction.consistent_nm is not None:
+                rms_nm = prediction.rms_nm(prediction.consistent_nm)
+                document["consistent_rms_nm"] = rms_nm.tolist()
+            documents.append(document)
+        print_json(documents)
+        return
+    for prediction in predictions:
+        answers().print(escape("\n".join([prediction.label, *prediction.notes])))
+        validation, fitted = validate(identified, prediction), identified.fitted_rms_nm
+        table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
+        for joint, name in enumerate(identified.robot.joint_names):
+            table.add_row(
+                name,
+                figure(float(validation.rms_nm[joint])),
+                f"{figure(100.0 * float(validation.shares[joint]))} %",
+                figure(float(fitted[joint])),
+            )
+        answers().print(table)
+
+
+def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
+    """Prints the verdict, the fit, and the notes on the validation samples."""
+    console = answers()
+    print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
+    for stream in identified.streams:
+        left_out = f", {stream.left_out} torques left out" if stream.left_out else ""
+        console.print(
+            escape(
+                f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
+                f"a motion up to {figure(stream.band_hz)} Hz{left_out}"
+            )
+        )
+        for note in stream.notes:
+            console.print(f"  - {escape(note)}")
+    fitted = {note for stream in identified.streams for note in stream.notes}
+    for note in (name for name in validation_notes if name not in fitted):
+        console.print(f"  - {escape(note)}")
+    counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
+    shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
+    console.print(
+        f"{identified.base.rank} base parameters: {shares}, {counts[-1][1]} {counts[-1][0]}, "
+        f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
+    )
+    console.print(_joint_table(identified))
+    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
+
+
+def _joint_table(identified: Identified) -> Table:
+    """Table of torque errors and friction by joint."""
+    names = [identified.base.model.names[index] for index in identified.base.independent]
+    values = dict(zip(names, identified.values.tolist(), strict=True))
+    stribeck = {row["joint"]: row for row in stribeck_rows(identified)}
+    joints = range(1, identified.robot.joint_count + 1)
+    columns: dict[str, list[float | None]] = {"fitted": [*identified.fitted_rms_nm]}
+    validation = identified.validation
+    if validation is not None:
+        columns["predicted"] = [*validation.rms_nm]
+        columns["of range, %"] = [*(100.0 * validation.shares)]
+        if validation.known_rms_nm is not None:
+            columns["before"] = [*validation.known_rms_nm]
+    for symbol in ("Fc", "Fv", "Ia"):
+        columns[symbol] = [values.get(f"{symbol}{joint}") for joint in joints]
+    columns["Fs/Fc"] = [stribeck.get(joint, {}).get("static_over_coulomb") for joint in joints]
+    columns["vs"] = [stribeck.get(joint, {}).get("speed_rad_s") for joint in joints]
+    filled = {
+        name: column
+        for name, column in columns.items()
+        if any(value is not None for value in column)
+    }
+    table = Table("joint", *filled, box=None)
+    for at, joint in enumerate(joints):
+        row = [
+            None if group[at] is None else figure(float(group[at] or 0.0))
+            for group in filled.values()
+        ]
+        table.add_row(str(joint), *row)
+    return table
+
+
+def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
+    """Estimates the payload, and prints it."""
+    identified = _identified_of(options.against, "payload")
+    loaded = conditioned_streams(
+        Session.load(options.session), identified, _requested(options.streams)
+    )
+    payload = estimate_payload(
+        identified,
+        loaded,
+        friction_changes=not options.same_friction,
+        gain_sigma=0.01 * options.gains_sigma,
+    )
+    if options.as_json:
+        print_json(payload.document())
+        return
+    for note in (note for conditioned in loaded for note in conditioned.notes):
+        say(note)
+    typer.echo("\n".join(_lines(payload)))
+
+
+def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
+    """Estimates the torque constants of an arm's drives from a known body on its flange."""
+    body = _body(options)
+    without = select_arm(Session.load(options.session), options.named)
+    robot = robot_of(without)
+    empty = current_streams(without, robot, options.cutoff_hz)
+    full = current_streams(
+        select_arm(Session.load(options.loaded), options.named),
+        robot,
+        options.cutoff_hz or empty[0].cutoff_hz,
+    )
+    base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
+    gains = drive_gains(base, empty, full, body)
+    if options.as_json:
+        rows: list[dict[str, str | float]] = [{"joint": name} for name in robot.joint_names]
+        # Only the joint where its gain is not determined.
+        for joint in np.flatnonzero(gains.determined):
+            rows[joint]["nm_per_a"] = float(gains.nm_per_a[joint])
+            rows[joint]["sigma_nm_per_a"] = float(gains.sigma[joint])
+        print_json(rows)
+        return
+    for name, gain, sigma, determined in zip(
+        robot.joint_names,
+        gains.nm_per_a.tolist(),
+        gains.sigma.tolist(),
+        gains.determined,
+        strict=True,
+    ):
+        words = "not determined: the body hardly moves it"
+        if determined:
+            words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
+        say(f"{name}: {words}")
+    if gains.determined.all():
+        typer.echo(f"--gains {','.join(f'{value:.5g}' for value in gains.nm_per_a)}")
+    else:
+        say(
+            "--gains needs all joints: move those that are not determined more, or take a body "
+            "that is heavier or whose centre is farther from their axes."
+        )
+
+
+def _lines(payload: Payload) -> list[str]:
+    mass = f"{matched(payload.mass_kg, payload.mass_sigma_kg)} kg"
+    pairs = zip(1e3 * payload.centre_m, 1e3 * payload.centre_sigma_m, strict=True)
+    centre = ", ".join(
+        f"{matched(value, sigma)} (sigma {significant(sigma)})" for value, sigma in pairs
+    )
+    gains = ""
+    if payload.gains_sigma_kg:
+        gains = f", {significant(payload.gains_sigma_kg)} of it from the drives' gains"
+    lines = [
+        f"mass {mass} (sigma {significant(payload.mass_sigma_kg)}{gains})",
+        f"centre {centre} mm in the flange's frame",
+    ]
+    if payload.consistent:
+        inertia = ", ".join(f"{value:.4g}" for value in payload.inertia_kg_m2)
+        lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
+    else:
+        lines.append("its inertia is lost in the noise")
+    left = ", ".join(significant(rm) for rm in payload.rms_nm.tolist())
+    lines.append(f"unexplained {left} N m, joint by joint")
+    return [*lines, f"on a UR: {_ur_words(payload)}"]
+
+
+def _ur_words(payload: Payload) -> str:
+    """The payload as a UR's program sets it, in kg, m and kg m^2."""
+    centre = ", ".join(f"{value:.5f}" for value in payload.centre_m)
+    if not payload.consistent:
+        return f"set_target_payload({payload.mass_kg:.4f}, [{centre}])"
+    xx, xy, yy, xz, yz, zz = payload.inertia_kg_m2.tolist()
+    inertia = ", ".join(f"{value:.6f}" for value in (xx, yy, zz, xy, xz, yz))
+    return f"set_target_payload({payload.mass_kg:.4f}, [{centre}], [{inertia}])"
+
+
+def _body(options: DynamicsGainsOptions) -> FloatArray:
+    """(10,) the body's inertial parameters in the flange's frame."""
+    centre = 1e-3 * np.array(numbers_in(options.com_mm, "--com-mm", "x,y,z"))
+    about = symmetric_matrices(
+        np.array(numbers_in(options.inertia, "--inertia", "xx,xy,yy,xz,yz,zz"))
+    )
+    body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
+    if not (options.mass_kg > 0.0 and body.consistent):
+        raise DataError(
+            f"--mass-kg {options.mass_kg:g} and --inertia {options.inertia} are those of no body.",
+            culprits=["--mass-kg", "--inertia"],
+            next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
+            "for a body as small as a point.",
+        )
+    return np.asarray(body.values[0])

@@ -4,97 +4,35 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-import typer
+import numpy as np
 from rich.markup import escape
 
 from visioncal.cli.console import answers, exit_status, print_json, report_written, say
-from visioncal.cli.options import Force, PartOptions
+from visioncal.cli.convert import import_options
 from visioncal.cli.parsing import numbers_in, refuse_given
-from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.cli.progress import shown_progress
+from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions, TouchOptions
+from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
+from visioncal.core.transforms import pose_difference
+from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.fixture import touched_fixture
+from visioncal.frames.fixture_from_markers import fixture_from_marker_images
+from visioncal.frames.frame_from_images import seen_frame
+from visioncal.frames.measured_points import NO_TOOL, Tool
 from visioncal.frames.naming import FrameKind, transform_name
+from visioncal.frames.tcp import touched_tool
+from visioncal.interchange.formats.touches import read_nominal, read_touches, robots_of
 from visioncal.interchange.outputs import RECORDING, Written
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.frames.drawing_points import NominalPoints
-    from visioncal.results import Calibration, Frame
-    from visioncal.session import Session
-    from visioncal.session.selecting import Choice, Part
-
-PointOption: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--point-mm",
-        metavar="X,Y,Z",
-        help="For images: the frame's origin in the target's frame, such as the tool's tip.",
-    ),
-]
-
-
-@dataclass(frozen=True)
-class FrameOptions:
-    """Destination and name of a frame."""
-
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            "-c",
-            "--calibration",
-            help="An output folder of calibrate: what it knows is used, and the frame joins it.",
-        ),
-    ] = None
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            help="A file of frames (.json) to put it into instead; made where missing.",
-        ),
-    ] = None
-    name: Annotated[str | None, typer.Option(help="Name of the frame: gripper, jig_2.")] = None
-    remove: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Remove one from the calibration, or from -o's file."),
-    ] = None
-    force: Force = False
-
-
-@dataclass(frozen=True)
-class TouchOptions(RobotPoseOptions):
-    """Convention and repeatability of touches."""
-
-    touch_noise: Annotated[
-        float | None,
-        typer.Option("--touch-noise-mm", help="Repeatability of a touch, per axis, in mm."),
-    ] = None
-
-    @property
-    def noise_m(self) -> float | None:
-        """Repeatability of a touch [m].
-
-        Raises:
-            DataError: It is no length from 0 to 1000 mm.
-        """
-        noise_mm = self.touch_noise
-        if noise_mm is None:
-            return None
-        if not 0.0 < noise_mm < 1e3:
-            raise DataError(
-                f"--touch-noise-mm is {noise_mm:g}; millimetres above 0 and under 1000 are needed.",
-                culprits=["--touch-noise-mm"],
-            )
-        return 1e-3 * noise_mm
-
-    def given(self) -> dict[str, object]:
-        """The options by their names; None for those that were not given."""
-        own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
-        named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
-        return {**named, "--touch-noise-mm": self.touch_noise}
+from visioncal.interchange.result_files import load_result, load_result_or_frames, rewrite_result
+from visioncal.results import Calibration, Frame, FrameFile
+from visioncal.results.frame import frames_document
+from visioncal.results.selecting import transform_name_in_cell
+from visioncal.robot import Robot, load_robot
+from visioncal.session import Session
+from visioncal.session.selecting import ARM, EYE, Choice, Part, has_several, select
 
 
 @dataclass(frozen=True)
@@ -103,8 +41,8 @@ class FrameLocation:
 
     name: str
     # The result of the camera and robot in question; None where none is named.
-    calibration: "Calibration | None"
-    result: "Calibration | None"  # The result from which it was extracted, of a cell or itself.
+    calibration: Calibration | None
+    result: Calibration | None  # The result from which it was extracted, of a cell or itself.
     folder: Path | None  # The output folder that the frame joins; None where it does not.
     file: Path | None  # The file of frames that it joins; None where it does not.
 
@@ -113,8 +51,8 @@ class FrameLocation:
         cls,
         options: FrameOptions,
         kind: FrameKind,
-        choice: "Choice",
-        needs: "Sequence[Part]",
+        choice: Choice,
+        needs: Sequence[Part],
         touched_by: str | None = None,
     ) -> "FrameLocation":
         """Resolves the calibration and the frame's destination, before anything is computed.
@@ -130,9 +68,6 @@ class FrameLocation:
         Raises:
             DataError: A frame of that name exists, or the destination cannot take one.
         """
-        from visioncal.interchange.result_files import load_result
-        from visioncal.results.selecting import transform_name_in_cell
-
         name, path, out = transform_name(kind, options.name), options.calibration, options.out
         result = None if path is None else load_result(path)
         cell = None if result is None else result.cell
@@ -143,8 +78,16 @@ class FrameLocation:
             name = transform_name_in_cell(result, choice, needs, name)
         folder = None if path is None or out is not None else _folder(path)
         location = cls(name, calibration, result, folder, out)
-        location._check_names()
-        if not options.force and (taken_in := location._existing()) is not None:
+        present, child = location._frames(), name.partition("_from_")[2]
+        for other in present:
+            if other != name and other.partition("_from_")[2] == child:
+                raise DataError(
+                    f"{child!r} is taken: {other} is there already.",
+                    culprits=[other],
+                    next_step="Give this one another name with --name.",
+                )
+        taken_in = out or folder
+        if name in present and taken_in is not None and not options.force:
             raise DataError(
                 f"{taken_in} already has {name}, and nothing is overwritten.",
                 culprits=[name],
@@ -152,38 +95,19 @@ class FrameLocation:
             )
         return location
 
-    def _frames(self) -> "dict[str, Frame]":
+    def _frames(self) -> dict[str, Frame]:
         """The frames that exist at the destination."""
-        from visioncal.results import FrameFile
-
         if self.file is not None:
             return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
         return {} if self.result is None else dict(self.result.frames)
 
-    def _existing(self) -> Path | None:
-        """The destination, where it has a frame of this name already."""
-        return (self.file or self.folder) if self.name in self._frames() else None
-
-    def _check_names(self) -> None:
-        """Refuses a child frame that exists with another parent."""
-        child = self.name.partition("_from_")[2]
-        for other in self._frames():
-            if other != self.name and other.partition("_from_")[2] == child:
-                raise DataError(
-                    f"{child!r} is taken: {other} is there already.",
-                    culprits=[other],
-                    next_step="Give this one another name with --name.",
-                )
-
-    def keep(self, frame: "Frame") -> Written:
+    def keep(self, frame: Frame) -> Written:
         """Writes the frame to its destination, if any; a bad one joins no result."""
         if frame.verdict.status == "bad" and self.file is None:
             return Written(())
         return self._write({**self._frames(), self.name: frame})
 
-    def _write(self, frames: "dict[str, Frame]") -> Written:
-        from visioncal.interchange.result_files import rewrite_result
-        from visioncal.results import FrameFile
+    def _write(self, frames: dict[str, Frame]) -> Written:
 
         if self.file is not None:
             FrameFile(frames).save(self.file)
@@ -199,8 +123,6 @@ class FrameLocation:
         Raises:
             DataError: No place is named, or it has no such frame.
         """
-        from visioncal.interchange.result_files import load_result
-
         path, file = options.calibration, options.out
         if path is None and file is None:
             raise DataError(
@@ -236,21 +158,13 @@ def _folder(path: Path) -> Path:
     return folder
 
 
-def keep_and_report(place: FrameLocation, frame: "Frame", source: Path, *, as_json: bool) -> None:
+def keep_and_report(place: FrameLocation, frame: Frame, source: Path, *, as_json: bool) -> None:
     """Writes a frame to its destination, and prints it for people, or as JSON."""
     # The suggested command runs again, and has a frame to replace then.
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
     out = place.file or place.folder or ""
     frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
-    report(place, frame, place.keep(frame), as_json=as_json)
-
-
-def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: bool) -> None:
-    """Prints a frame for people, or as JSON."""
-    from visioncal.cli.summary import print_verdict
-    from visioncal.results.frame import frames_document
-
-    status = exit_status(frame.verdict)
+    written, status = place.keep(frame), exit_status(frame.verdict)
     if as_json:
         print_json(frames_document({place.name: frame}))
         report_written(written, quiet=True, status=status)
@@ -274,7 +188,10 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
         say(f"nothing was written: a bad {place.name} does not join {place.folder}")
         report_written(written, status=status)
         return
-    _report_before(place, frame)
+    before = None if place.result is None else place.result.frames.get(place.name)
+    if before is not None:
+        mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
+        say(f"it replaces the one of {before.created}, {mm_and_deg(mm, deg)} away")
     undrawn = [undrawn.file for undrawn in written.failed_drawings]
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
@@ -284,39 +201,18 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     report_written(written, status=status)
 
 
-def _report_before(place: FrameLocation, frame: "Frame") -> None:
-    from visioncal.core.transforms import pose_difference
-
-    before = None if place.result is None else place.result.frames.get(place.name)
-    if before is not None:
-        mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
-        say(f"it replaces the one of {before.created}, {mm_and_deg(mm, deg)} away")
-
-
-@dataclass(frozen=True)
-class FrameRequest:
-    """Request of `tcp` or `fixture`."""
-
-    kind: FrameKind
-    # Touches, as a table or a session, or a session of images; None to remove a frame.
-    source: Path | None
-    goes: FrameOptions
-    written: TouchOptions  # Convention of the touches.
-    part: PartOptions
-    point_mm: str | None  # For images: the frame's origin in the target's frame, as typed.
-    as_json: bool
-
-
 def place_frame(
-    request: FrameRequest,
-    by_touches: "Callable[[Path, Calibration | None], Frame]",
-    drawing: "NominalPoints | None" = None,
+    kind: FrameKind,
+    request: TcpOptions | FixtureOptions,
+    by_touches: Callable[[Path, Calibration | None], Frame],
+    drawing: NominalPoints | None = None,
     tool: str | None = None,
 ) -> None:
     """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
 
     Args:
-        request: The request.
+        kind: Whether it is a tool or a fixture.
+        request: The options.
         by_touches: Places it by the touches of a file, given the calibration if there is one.
         drawing: Points or markers on a fixture; None where none are given.
         tool: The tool that touched a fixture, as typed.
@@ -325,17 +221,14 @@ def place_frame(
         DataError: The source cannot be read or does not show what is needed, or options contradict
             each other.
     """
-    from visioncal.interchange.formats.touches import robots_of
-    from visioncal.session.selecting import ARM, EYE, Choice
-
-    kind, part, source = request.kind, request.part, request.source
+    part, source = request.part, request.touches
     if source is None or request.goes.remove is not None:
-        report_written(_removed(request))
+        report_written(_removed(kind, request))
         return
     session = _image_session(source, {"--tool": tool, **request.written.given()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
-        refuse_given({"--point-mm": request.point_mm}, f"touches say where {origin} is")
+        refuse_given({"--point-mm": request.point}, f"touches say where {origin} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
         robots = robots_of(source)
         if request.goes.calibration is None and not robots and tool in (None, "none"):
@@ -352,17 +245,17 @@ def place_frame(
                 culprits=["-c"],
                 next_step="Name the output folder of visioncal calibrate.",
             )
-        frame = _by_images(request, session, location.calibration, drawing)
+        frame = _by_images(kind, request, session, location.calibration, drawing)
     keep_and_report(location, frame, source, as_json=request.as_json)
 
 
-def _removed(request: FrameRequest) -> Written:
+def _removed(kind: FrameKind, request: TcpOptions | FixtureOptions) -> Written:
     """Removes a frame, where no touches are given.
 
     Raises:
         DataError: There are touches too, or there is neither.
     """
-    command = "tcp" if request.kind == "tool" else "fixture"
+    command = "tcp" if kind == "tool" else "fixture"
     name = request.goes.remove
     if name is None:
         raise DataError(
@@ -371,15 +264,13 @@ def _removed(request: FrameRequest) -> Written:
             next_step=f"Name them: visioncal {command} TOUCHES -c OUT; or --remove NAME.",
         )
     refuse_given(
-        {"TOUCHES": request.source, "--name": request.goes.name}, "--remove measures nothing"
+        {"TOUCHES": request.touches, "--name": request.goes.name}, "--remove measures nothing"
     )
-    return FrameLocation.remove(request.goes, request.kind, name)
+    return FrameLocation.remove(request.goes, kind, name)
 
 
-def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
+def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:
     """Loads a session whose images are to place something; None where it has none."""
-    from visioncal.session import Session
-
     if not source.is_dir() and source.suffix.lower() != ".rrd":
         return None
     session = Session.load(source)
@@ -399,24 +290,72 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
 
 
 def _by_images(
-    request: FrameRequest,
-    session: "Session",
-    calibration: "Calibration",
-    drawing: "NominalPoints | None",
-) -> "Frame":
-    import numpy as np
-
-    from visioncal.frames.fixture_from_markers import fixture_from_marker_images
-    from visioncal.frames.frame_from_images import seen_frame
-    from visioncal.session.selecting import has_several, select
+    kind: FrameKind,
+    request: TcpOptions | FixtureOptions,
+    session: Session,
+    calibration: Calibration,
+    drawing: NominalPoints | None,
+) -> Frame:
 
     if has_several(session):
         session = select(session, request.part.choice, robot_between=False)
     if drawing is not None:
         refuse_given(
-            {"--point-mm": request.point_mm}, "beside --cad the drawing's origin is the frame's"
+            {"--point-mm": request.point}, "beside --cad the drawing's origin is the frame's"
         )
         return fixture_from_marker_images(session, calibration, drawing)
-    point = 1e-3 * np.array(numbers_in(request.point_mm or "0,0,0", "--point-mm", "x,y,z"))
+    point = 1e-3 * np.array(numbers_in(request.point or "0,0,0", "--point-mm", "x,y,z"))
     with shown_progress(quiet=request.as_json) as progress:
-        return seen_frame(session, calibration, request.kind, point, progress=progress)
+        return seen_frame(session, calibration, kind, point, progress=progress)
+
+
+def tcp_command(options: TcpOptions) -> None:
+    """Runs `visioncal tcp`."""
+
+    def by_touches(source: Path, calibration: Calibration | None) -> Frame:
+        written = options.written
+        rows = read_touches(source, import_options(written), options.part.robot)
+        return touched_tool(rows, calibration, _model(written), touch_noise_m=written.noise_m)
+
+    place_frame("tool", options, by_touches)
+
+
+def fixture_command(options: FixtureOptions) -> None:
+    """Runs `visioncal fixture`."""
+    drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
+
+    def by_touches(source: Path, calibration: Calibration | None) -> Frame:
+        written, robot = options.written, options.part.robot
+        tool = _tool(options.tool, calibration, robot)
+        rows = read_touches(source, import_options(written), robot, positions=tool is None)
+        noise_m, model = written.noise_m, _model(written)
+        return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
+
+    place_frame("fixture", options, by_touches, drawing, options.tool)
+
+
+def _model(written: TouchOptions) -> Robot | None:
+    return None if written.robot_model is None else load_robot(written.robot_model)
+
+
+def _tool(option: str | None, calibration: Calibration | None, robot: str | None) -> Tool | None:
+    """Finds the tool that touched the points."""
+    if option == "none":
+        return None
+    frames = {} if calibration is None else calibration.frames
+    if option is None and calibration is None:
+        raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
+    if option is None or option in frames or f"flange_from_{option}" in frames:
+        return Tool.among(frames, "The calibration", option)
+    path, _, name = option.rpartition(":")
+    if Path(option).exists():
+        return Tool.among(load_result_or_frames(Path(option), robot).frames, option, None)
+    if path and Path(path).exists():
+        return Tool.among(load_result_or_frames(Path(path), robot).frames, path, name)
+    if frames:
+        return Tool.among(frames, "The calibration", option)
+    raise DataError(
+        f"--tool {option}: there is no such file, nor a calibration (-c) that has such a tool.",
+        culprits=[option],
+        next_step=NO_TOOL,
+    )

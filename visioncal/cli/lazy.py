@@ -3,13 +3,12 @@
 import inspect
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
-from functools import wraps
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, TypeGuard, get_type_hints
+from typing import Annotated, Any, ClassVar, cast, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -20,6 +19,8 @@ from visioncal.core.number_format import some_of
 
 # As shells report a program ended by SIGINT.
 _EXIT_CTRL_C = 128 + 2
+# Source of a parameter that was typed.
+_TYPED = "COMMANDLINE"
 # Base class of usage errors; typer exports only a subclass.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
@@ -99,13 +100,17 @@ def _written_since(path: Path, since_s: float) -> Iterator[Path]:
 
 
 class LazyGroup(TyperGroup):
-    """A group that lists its commands without imports, and imports a command on demand."""
+    """A group that lists its commands without imports, and imports a command on demand.
+
+    The command `plan` of prefix `dynamics_` takes the record `DynamicsPlanOptions`, whose docstring
+    is its help, and is the function `dynamics_plan_command` of the module `dynamics_plan`.
+    """
 
     listed: ClassVar[Mapping[str, str]]  # First paragraphs of the commands' help, by name.
-    # Prefix of module names: the command `plan` of prefix `dynamics_` is the function
-    # `dynamics_plan_command` of the module `dynamics_plan`; a group is the `target_app` of
-    # `target`.
+    records: ClassVar[Sequence[str]]  # Modules of the records, which import nothing heavy.
+    homes: ClassVar[Mapping[str, str]] = {}  # Modules with another name than their command's.
     prefix: ClassVar[str] = ""
+    groups: ClassVar[Mapping[str, typer.Typer]] = {}  # Those of its commands that are groups.
 
     def __init__(self, **attributes: Any) -> None:  # noqa: ANN401 - typer's
         super().__init__(**attributes)
@@ -125,61 +130,57 @@ class LazyGroup(TyperGroup):
     @classmethod
     def imported(cls, name: str) -> Any:  # noqa: ANN401 - a command of typer's
         """A command of this group, with its parameters."""
-        module_name = f"{cls.prefix}{name}".replace("-", "_")
-        module = import_module(f"visioncal.cli.{module_name}")
-        if hasattr(module, f"{module_name}_app"):
-            return get_group(getattr(module, f"{module_name}_app"))
+        if name in cls.groups:
+            return get_group(cls.groups[name])
+        stem = f"{cls.prefix}{name}".replace("-", "_")
+        record_name = f"{stem.title().replace('_', '')}Options"
+        modules = map(import_module, cls.records)
+        record = next(filter(None, (getattr(module, record_name, None) for module in modules)))
+
+        def command(context: typer.Context, **values: Any) -> None:  # noqa: ANN401 - of any type
+            home = import_module(f"visioncal.cli.{cls.homes.get(name, stem)}")
+            sources = {key: context.get_parameter_source(key) for key in values}
+            given = {key for key, source in sources.items() if source and source.name == _TYPED}
+            getattr(home, f"{stem}_command")(_gathered(record, values, frozenset(given)))
+
+        parameters = [*_flattened(record)]
+        at = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        command.__signature__ = inspect.Signature([at, *parameters])  # type: ignore[attr-defined]
+        command.__annotations__ = {value.name: value.annotation for value in (at, *parameters)}
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{module_name}_command")))
+        app.command(name, cls=PlainCommand, help=record.__doc__)(command)
         return get_command(app)
 
 
-def with_fields(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose dataclass parameters are replaced by their fields, at any depth."""
-    parameters = inspect.signature(command).parameters.values()
-    hints = get_type_hints(command, include_extras=True)
-    flat = [
-        flattened
-        for parameter in parameters
-        for flattened in _flattened(parameter.name, hints[parameter.name], parameter.default)
-    ]
-
-    @wraps(command)
-    def by_fields(**given: Any) -> None:  # noqa: ANN401 - of any type
-        command(
-            **{
-                parameter.name: _gathered(parameter.name, hints[parameter.name], given)
-                for parameter in parameters
-            }
-        )
-
-    del by_fields.__wrapped__
-    by_fields.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
-    by_fields.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
-    return by_fields
+def _flattened(record: type) -> Iterator[inspect.Parameter]:
+    """Command-line parameters of a record's fields (`core.options`), at any depth."""
+    hints = get_type_hints(record)
+    for field in fields(record):
+        kind = hints[field.name]
+        if is_dataclass(kind):
+            yield from _flattened(cast(type, kind))
+        for form, (words, names, attributes) in field.metadata.items():
+            stated = {**attributes, "help": words, "rich_help_panel": attributes.get("panel")}
+            stated.pop("panel", None)
+            own = (f"--{field.name.replace('_', '-')}",) if form == "flag" else ()
+            declare = typer.Argument if form == "argument" else typer.Option
+            yield inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                annotation=Annotated[kind, declare(*(names or own), **stated)],
+                default=inspect.Parameter.empty if field.default is MISSING else field.default,
+            )
 
 
-def _flattened(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
-    """Command-line parameters of a parameter: itself, or the fields of its dataclass."""
-    if not _has_fields(kind):
-        at = inspect.Parameter.KEYWORD_ONLY
-        yield inspect.Parameter(name, at, annotation=kind, default=default)
-        return
-    hints = get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
-        given = inspect.Parameter.empty if field.default is MISSING else field.default
-        yield from _flattened(field.name, hints[field.name], given)
-
-
-def _gathered(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
-    """Builds a parameter from the command line's values."""
-    if not _has_fields(kind):
-        return given[name]
-    hints = get_type_hints(kind, include_extras=True)
-    return kind(
-        **{field.name: _gathered(field.name, hints[field.name], given) for field in fields(kind)}
+def _gathered(record: Any, values: Mapping[str, Any], given: frozenset[str]) -> Any:  # noqa: ANN401
+    """Builds a record from the command line's values, and the names of those that were typed."""
+    hints = get_type_hints(record)
+    content = {"given": given, **values}
+    return record(
+        **{
+            field.name: _gathered(hints[field.name], values, given)
+            if is_dataclass(hints[field.name])
+            else content[field.name]
+            for field in fields(record)
+        }
     )
-
-
-def _has_fields(kind: object) -> TypeGuard[type]:
-    return isinstance(kind, type) and is_dataclass(kind)

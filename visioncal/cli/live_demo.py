@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.cli.console import report_error, report_written, say
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.recorded_cell import (
+from visioncal.cli.record import (
     RecordedSetup,
     ViewLines,
     check_all,

@@ -2,17 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean, some_of
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from visioncal.frames.camera_chain import Plane
-    from visioncal.results import Calibration, Edge
+from visioncal.core.number_format import some_of
 
 # Digits of a view's number, and of the width or height of an image.
 _MOST_DIGITS = 6
@@ -21,7 +14,6 @@ FORMS = (
     "may point down: a board's points into it), or nx,ny,nz,d (a normal, and its product with any "
     "of the plane's points in mm)"
 )
-_LEAD = "base_from_"
 
 
 def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
@@ -100,6 +92,23 @@ def _whole_numbers(words: str) -> list[int]:
     return [int(cell) for cell in cells] if are_whole else []
 
 
+def names_in(words: str | None, option: str) -> tuple[str, ...]:
+    """Parses an option of names separated by commas.
+
+    Raises:
+        DataError: A name is empty or occurs twice.
+    """
+    if words is None:
+        return ()
+    names = tuple(part.strip() for part in words.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise DataError(
+            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
+            culprits=[option],
+        )
+    return names
+
+
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
     """Refuses options that do not apply here.
 
@@ -113,7 +122,7 @@ def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leav
         raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step=next_step)
 
 
-def named_result(path: "Path | None", option: str, what: str) -> "Path":
+def named_result(path: Path | None, option: str, what: str) -> Path:
     """The path of a result, which an option has to name.
 
     `what` describes it in messages: `verify: the calibration to check`.
@@ -128,73 +137,3 @@ def named_result(path: "Path | None", option: str, what: str) -> "Path":
             next_step="Name the output folder of visioncal calibrate.",
         )
     return path
-
-
-def plane_of(
-    words: str, sigma_mm: float, calibration: "Calibration", boards: "Mapping[str, Edge]"
-) -> "tuple[Plane, str]":
-    """Parses a plane.
-
-    Args:
-        words: As in `FORMS`; `base_from_` may be left out of a frame's name.
-        sigma_mm: Standard deviation of its height [mm].
-        calibration: The result whose frames can be named.
-        boards: Targets of a cell, which can be named as well, by their transforms.
-
-    Returns:
-        The plane, and a warning about its frame; empty where there is none.
-
-    Raises:
-        DataError: It is none of these, or there is no such frame.
-    """
-    import numpy as np
-
-    from visioncal.frames.camera_chain import Plane
-
-    frame, _, height = words.rpartition(":") if ":" in words else (words, "", "z=0")
-    if words.startswith("z="):
-        return Plane.horizontal(_height_m(words), 1e-3 * sigma_mm), ""
-    if "," in words:
-        nx, ny, nz, product = numbers_in(words, "--plane", "nx,ny,nz,d")
-        normal = np.array([nx, ny, nz])
-        foot = 1e-3 * product * normal / max(float(normal @ normal), 1e-300)
-        return Plane.through(normal, foot, 1e-3 * sigma_mm), ""
-    return _of_frame(frame, _height_m(height), sigma_mm, calibration, boards)
-
-
-def _of_frame(
-    words: str,
-    z_m: float,
-    sigma_mm: float,
-    calibration: "Calibration",
-    boards: "Mapping[str, Edge]",
-) -> "tuple[Plane, str]":
-    from visioncal.frames.camera_chain import Plane
-
-    placed = {**calibration.placed, **boards}
-    planes = [name for name in placed if name.startswith(_LEAD) and name != f"{_LEAD}cam"]
-    names = (words, f"{_LEAD}{words}", f"{_LEAD}target_{words}")
-    name = next((name for name in names if name in planes), "")
-    if not name:
-        there = some_of(planes) if planes else "none yet; visioncal fixture places them"
-        raise DataError(
-            f"--plane is {words[:80]!r}, and no frame in the base is called that; there are: "
-            f"{there}.",
-            culprits=["--plane"],
-            next_step=did_you_mean(f"{_LEAD}{words.removeprefix(_LEAD)}", planes)
-            or f"A plane is {FORMS}.",
-        )
-    warning = ""
-    if name in calibration.frames and calibration.frames[name].verdict.status == "bad":
-        warning = f"The verdict of {name} is bad: {calibration.frames[name].verdict.reasons[0]}"
-    return Plane.of_frame(placed[name], z_m, 1e-3 * sigma_mm), warning
-
-
-def _height_m(words: str) -> float:
-    if not words.startswith("z="):
-        raise DataError(
-            f"--plane ends in {words[:80]!r}; z=5, a height in mm, is needed there.",
-            culprits=["--plane"],
-            next_step=f"A plane is {FORMS}.",
-        )
-    return 1e-3 * numbers_in(words.removeprefix("z="), "--plane z", "z")[0]

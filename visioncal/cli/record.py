@@ -1,123 +1,425 @@
 """`visioncal record`."""
 
+import math
+import shlex
 import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Any
 
-import typer
+from rich.markup import escape
 
-from visioncal.cli.console import asked, say
-from visioncal.cli.options import AsJson, View, Yes
-from visioncal.cli.record_options import DeviceOptions, RecordCellOptions, TakingOptions
+from visioncal.cli.console import asked, messages, print_json, say
+from visioncal.cli.parsing import size_in
+from visioncal.cli.session_options import RecordCellOptions, RecordOptions
+from visioncal.core.errors import DataError, DriverError
 from visioncal.core.interrupts import signals_as_interrupts
-from visioncal.live.capture.options import CaptureOptions
+from visioncal.core.number_format import counted, figure
+from visioncal.core.types import Camera, Mount, Target
+from visioncal.interchange.formats.boards import target_named
+from visioncal.live.capture.assessment import RecordedAccuracy
+from visioncal.live.capture.cell import HostClock, LiveCell
+from visioncal.live.capture.devices import ArmSetup, is_folder, open_arm, open_camera
+from visioncal.live.capture.gate import Consent
+from visioncal.live.capture.journal import CaptureFacts, Journal
+from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.recording import (
+    Capture,
+    CaptureEvent,
+    MotionSummary,
+    Watcher,
+    ask_and_take,
+    follow,
+    missed_stops,
+    motion_summary,
+    record,
+)
+from visioncal.live.capture.take import Missed
+from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
+from visioncal.live.planning.plan_file import PlanFile, read_plan
+from visioncal.robot import Robot, load_robot
+
+# For type hints only: rerun takes half a second to import.
+if TYPE_CHECKING:
+    from visioncal.present.recording.live import LiveDrawing
 
 
-def record_command(
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="SESSION",
-            file_okay=False,
-            help="The session's folder; a new one.",
-        ),
-    ],
-    arm: Annotated[
-        str,
-        typer.Option(
-            metavar="ur:HOST|manual",
-            help="The arm: a UR by its address, or poses that you type from the pendant.",
-        ),
-    ],
-    camera: Annotated[
-        str,
-        typer.Option(
-            metavar="oak|uvc:N|uvc:URL|folder:PATH",
-            help="The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
-            "camera's stream, or pictures that were taken already.",
-        ),
-    ],
-    described: RecordCellOptions,
-    takes: TakingOptions,
-    device: DeviceOptions,
-    plan: Annotated[
-        Path | None, typer.Option(help="What visioncal plan wrote: a folder, or its plan.json.")
-    ] = None,
-    follow: Annotated[
-        bool,
-        typer.Option(
-            "--follow", help="Move nothing: take a view whenever the arm, guided by hand, rests."
-        ),
-    ] = False,
-    views: Annotated[
-        int, typer.Option(min=0, help="With --follow or a manual arm: end after this number.")
-    ] = 0,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a recording that was ended or cut off.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be driven; nothing moves.")
-    ] = False,
-    yes: Yes = False,
-    view: View = False,
-    as_json: AsJson = False,
-) -> None:
-    """Record a session: drive the stops of a plan, or follow an arm guided by hand.
-
-    Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
-    recording ended early, the arm stands still, and --resume continues it.
-    """
-    from visioncal.cli.recorded_cell import (
-        ViewLines,
-        check_all,
-        check_driven,
-        check_not_begun,
-        facts_of,
-        finish,
-        opened,
-        record_driven,
-        record_guided,
-        report_departure,
-        scene_of,
-        shown_in,
-    )
-    from visioncal.live.capture.devices import ArmSetup, is_folder
-    from visioncal.live.capture.gate import Consent
-    from visioncal.live.capture.journal import Journal
-    from visioncal.live.capture.recording import motion_summary
-
-    scene = scene_of(plan, described)
-    drives = not follow and arm.partition(":")[0] != "manual"
-    if drives or dry_run:
+def record_command(options: RecordOptions) -> None:
+    """Runs `visioncal record`."""
+    scene = scene_of(options.plan, options.described)
+    drives = not options.follow and options.arm.partition(":")[0] != "manual"
+    if drives or options.dry_run:
         check_driven(scene, drives=drives)
-    taking = takes.options(
-        single=is_folder(camera), lost=CaptureOptions.missed_in_a_row if drives else 0
+    takes, device = options.takes, options.device
+    taking = CaptureOptions(
+        speed=takes.speed,
+        frames=takes.frames,
+        keep=takes.keep,
+        still=Stillness(image_px=takes.still_px, quiet_s=takes.settle_s),
+        # A folder provides each picture once.
+        single=is_folder(options.camera),
+        missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
-    requested = device.setup()
+    resolution = None if device.resolution is None else size_in(device.resolution)
+    requested = DeviceSetup(resolution, device.exposure_us, device.gain, device.focus)
     answers = sys.stdin.isatty()
-    wish = ArmSetup("", not drives or dry_run, asked, described.pose_form, answers)
-    with signals_as_interrupts(), opened(arm, wish, camera, requested) as cell:
+    wish = ArmSetup("", not drives or options.dry_run, asked, options.described.pose_form, answers)
+    with signals_as_interrupts(), opened(options.arm, wish, options.camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
-        if dry_run:
+        if options.dry_run:
             report_departure(motion_summary(cell, scene.planned, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
-        consent = Consent.of("record", asked, yes=yes or not drives)
-        start = Journal.resume if resume else Journal.begin
-        count = len(scene.planned.stops) if drives else views
-        facts = facts_of(scene, cell, out.name)
-        journal = start(out, facts, cell.clock.unix_offset_s(), count)
+        consent = Consent.of("record", asked, yes=options.yes or not drives)
+        start = Journal.resume if options.resume else Journal.begin
+        count = len(scene.planned.stops) if drives else options.views
+        facts = facts_of(scene, cell, options.out.name)
+        journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
         if taking.single:
-            check_not_begun(journal, camera)
-        with shown_in(scene, cell, wanted=view) as viewers:
+            check_not_begun(journal, options.camera)
+        with shown_in(scene, cell, wanted=options.view) as viewers:
             watchers = [ViewLines(), *viewers]
             if drives:
                 steps = record_driven(cell, scene, journal, taking, watchers, consent)
             else:
                 ask = asked if answers else None
-                steps = record_guided(cell, scene, journal, taking, watchers, views, ask)
+                steps = record_guided(cell, scene, journal, taking, watchers, options.views, ask)
     if drives:
         check_all(journal, steps)
-    finish(journal, steps, as_json=as_json)
+    finish(journal, steps, as_json=options.as_json)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A watcher that draws each view."""
+
+    drawing: "LiveDrawing"
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Draws a view."""
+        # Rerun takes half a second to import, which recordings without a viewer need not wait for.
+        from visioncal.present.recording.live import LiveView
+
+        outcome = step.found
+        if isinstance(outcome, Missed):
+            return
+        sigma_mm = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
+        self.drawing.draw(
+            LiveView(
+                step.view,
+                outcome.frame.image,
+                outcome.corners.px,
+                outcome.state.base_from_flange,
+                outcome.state.q,
+                sigma_mm,
+                step.note,
+            )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSetup:
+    """Setup of a recording."""
+
+    mount: Mount
+    target: Target
+    robot: Robot | None  # The arm's model; None where unknown.
+    plan: PlanFile | None  # The stops; None without a plan.
+
+    @property
+    def planned(self) -> PlanFile:
+        """The plan.
+
+        Raises:
+            DataError: There is none.
+        """
+        if self.plan is None:
+            raise DataError(
+                "record: an arm is driven by a plan, and none is given.",
+                culprits=["--plan"],
+                next_step="Make one with visioncal plan, or guide the arm by hand: --follow.",
+            )
+        return self.plan
+
+    @property
+    def lens(self) -> Camera | None:
+        """The plan's lens; None without a plan."""
+        return None if self.plan is None else self.plan.cell.camera
+
+    def check(self, resolution: tuple[int, int], *, drives: bool) -> None:
+        """Checks that the camera has the image size of the plan.
+
+        Raises:
+            DataError: It has another.
+        """
+        if not drives or self.lens is None or resolution == self.lens.resolution:
+            return
+        had, has = (f"{w} x {h}" for w, h in (self.lens.resolution, resolution))
+        raise DataError(
+            f"the plan is for pictures of {had} px, and the camera gives {has} px: the board might "
+            "not be in them.",
+            culprits=["--resolution"],
+            next_step=f"Ask for them with --resolution {had.replace(' x ', ',')}, or plan anew.",
+        )
+
+
+def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> RecordedSetup:
+    """Builds the setup of a recording from a plan or from options.
+
+    Raises:
+        DataError: The plan cannot be read, options contradict it, or no board is named.
+    """
+    described = described or RecordCellOptions()
+    target, robot, mount = described.target, described.robot, described.mount
+    if plan is not None:
+        given = {"--target": target, "--robot": robot, "--mount": mount}
+        repeated = [name for name, value in given.items() if value is not None]
+        if repeated:
+            raise DataError(
+                f"{', '.join(repeated)}: the plan says that already.",
+                culprits=repeated,
+                next_step="Leave it out, or record without --plan.",
+            )
+        plan_file = read_plan(plan)
+        return RecordedSetup(
+            plan_file.cell.mount, _findable(plan_file.cell.target), plan_file.cell.robot, plan_file
+        )
+    if target is None:
+        raise DataError(
+            "record: --plan or --target is needed to know what to look for.",
+            culprits=["--plan", "--target"],
+            next_step="Name the board, as --target charuco_9x6_30mm.",
+        )
+    return RecordedSetup(
+        mount or "eye-in-hand",
+        _findable(target_named(target)),
+        None if robot is None else load_robot(robot),
+        None,
+    )
+
+
+def _findable(target: Target) -> Target:
+    """Refuses a rig of points that cannot be detected in images."""
+    if target.kind == "points" and not target.point_tags:
+        raise DataError(
+            f"record: target {target.name} is a rig of points, which no image is searched for.",
+            culprits=["--target"],
+            next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
+        )
+    return target
+
+
+def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
+    """Facts of the cell that are recorded besides its views."""
+    camera = cell.camera
+    return CaptureFacts(
+        name or "session",
+        scene.mount,
+        scene.target,
+        scene.robot,
+        cell.arm.name,
+        camera.name,
+        camera.resolution,
+        camera.factory,
+        dict(camera.settings),
+        "" if scene.plan is None else scene.plan.digest,
+    )
+
+
+def record_guided(
+    cell: LiveCell,
+    scene: RecordedSetup,
+    journal: Journal,
+    taking: CaptureOptions,
+    watchers: Sequence[Watcher],
+    views: int,
+    ask: Callable[[str], str] | None,
+) -> list[CaptureEvent]:
+    """Records an arm that a person moves.
+
+    Raises:
+        DriverError: A device failed, or nothing was recorded.
+        DataError: A view cannot be written, or three in a row gave none.
+    """
+    prediction = RecordedAccuracy(journal.folder)
+    lens = cell.camera.factory or scene.lens
+    try:
+        capture = Capture(
+            *(cell, scene.target, scene.robot, lens, journal, taking, prediction.after, watchers)
+        )
+        if not isinstance(cell.arm, MovingArm):
+            if ask is None:
+                say("Poses are read from stdin, one a line, and no question is asked; q ends.")
+            return ask_and_take(capture, cell.arm, views, ask)
+        say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
+        return follow(capture, views)
+    finally:
+        prediction.close()
+
+
+@contextmanager
+def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
+    """Opens the viewer if wanted; without a display the recording continues without it."""
+    if not wanted:
+        yield []
+        return
+    # Rerun takes half a second to import, which recordings without a viewer need not wait for.
+    from visioncal.present.recording import live
+    from visioncal.present.viewer.live import live_viewer
+
+    plan = None if scene.plan is None else scene.plan.cell
+    drawn = live.LiveCell(
+        scene.mount,
+        scene.target,
+        cell.camera.resolution,
+        scene.robot,
+        cell.camera.factory or scene.lens,
+        None if plan is None else plan.x,
+        None if plan is None else plan.z,
+    )
+    with ExitStack() as opened:
+        watchers: list[Watcher] = []
+        try:
+            stream = opened.enter_context(live_viewer(f"recording with {cell.camera.name}"))
+            drawing = live.LiveDrawing(stream, drawn)
+            drawing.begin()
+            watchers = [Shown(drawing)]
+        except DriverError as error:
+            say(f"{error} The recording goes on without it.")
+        yield watchers
+
+
+@contextmanager
+def opened(arm: str, wish: ArmSetup, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
+    """Opens both devices, and closes them at the end of the block."""
+    with closing(open_arm(arm, wish)) as opened:
+        if not wish.watch_only and not isinstance(opened, MovingArm):
+            raise DriverError(
+                f"{opened.name} cannot be driven.",
+                culprits=[opened.name],
+                next_step="Guide it by hand: --follow.",
+            )
+        with closing(open_camera(camera, requested)) as device:
+            yield LiveCell(opened, (device,), HostClock())
+
+
+class ViewLines:
+    """A watcher that prints a line for each view."""
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Prints the line."""
+        say(step.line)
+
+
+def record_driven(
+    cell: LiveCell,
+    scene: RecordedSetup,
+    journal: Journal,
+    taking: CaptureOptions,
+    watchers: Sequence[Watcher],
+    consent: Consent,
+) -> list[CaptureEvent]:
+    """Drives the plan's stops, each with the user's consent."""
+    leaving = motion_summary(cell, scene.planned, [view.number for view in journal.views], taking)
+    report_departure(leaving, cell, taking)
+    if not leaving.stops:
+        return []
+    return record(cell, scene.planned, journal, taking, consent, watchers)
+
+
+def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
+    """Prints what is about to be driven."""
+    say, count = messages().print, len(leaving.stops)
+    if not count:
+        say("All stops of the plan have their view; nothing is left to drive.")
+        return
+    first, seconds = leaving.stops[0], leaving.duration_s
+    duration = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+    postures = len(leaving.first)
+    via = (
+        f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
+        if postures > 1
+        else ""
+    )
+    say(
+        escape(
+            f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
+            f"{taking.speed:g} rad/s, about {duration}"
+        )
+    )
+    say(
+        f"  first to view {first.view}{via}; a joint turns by up to "
+        f"{figure(math.degrees(leaving.turn_rad))} deg; the way is clear of all that was declared "
+        "to the plan"
+    )
+
+
+def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
+    """Ends with status 2 where stops of the plan gave no view."""
+    missing = missed_stops(steps)
+    if missing:
+        words = "; ".join(f"view {key}: {reason}" for key, reason in missing.items())
+        raise DataError(
+            f"{len(missing)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
+            f"views are in {journal.folder}.",
+            culprits=[f"view {index}" for index in missing],
+            next_step="--resume tries them again.",
+        )
+
+
+def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
+    """Prints a summary of the recording, and the next command."""
+    if as_json:
+        print_json(_summary(journal, steps))
+        return
+    say(
+        f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
+        f"{shlex.quote(str(journal.folder))} -o out"
+    )
+
+
+def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
+    predicted = [
+        step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
+    ]
+    summary: dict[str, Any] = {
+        "session": str(journal.folder),
+        "views": [view.number for view in journal.views],
+        "times_s": [
+            {
+                "view": step.view,
+                "moved_s": round(step.moved_s, 3),
+                "settled_s": round(step.settled_s, 3),
+                "worked_s": round(step.worked_s, 3),
+            }
+            for step in steps
+        ],
+    }
+    if predicted:
+        summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
+    return summary
+
+
+def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
+    """Refuses to drive without a plan, before a device is opened."""
+    if drives:
+        _ = scene.planned
+        return
+    raise DataError(
+        "--dry-run: a guided arm is not driven, so there is nothing to say of it.",
+        culprits=["--dry-run"],
+        next_step="Leave it out.",
+    )
+
+
+def check_not_begun(journal: Journal, camera: str) -> None:
+    """Refuses to resume from a folder of images, which would start again with the first one."""
+    if journal.views:
+        raise DataError(
+            f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "
+            "views are there.",
+            culprits=["--resume"],
+            next_step="Record all of it into a new folder.",
+        )

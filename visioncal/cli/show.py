@@ -4,81 +4,44 @@ import shlex
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from visioncal.cli.console import say
 from visioncal.cli.parsing import refuse_given
+from visioncal.cli.result_options import ShowOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence
 from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
+from visioncal.interchange.result_files import load_result, load_stored
+from visioncal.results.views import worst_view
 
 # The first bytes of every rerun recording.
 _MAGIC = b"RRF2"
 
 
-def show_command(
-    result: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT",
-            help="An output folder, its calibration.json, or a recording (.rrd); with --viewer a "
-            "plan, too.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="The page; report.html or certificate.html otherwise."),
-    ] = None,
-    viewer: Annotated[
-        bool, typer.Option("--viewer", help="Open the recording in the rerun viewer, instead.")
-    ] = False,
-    web: Annotated[
-        bool, typer.Option("--web", help="With --viewer: in a browser, not in a window.")
-    ] = False,
-    view: Annotated[
-        int | None,
-        typer.Option(
-            help="With --viewer: the number of the view to open the window at. Default: the worst; "
-            "in a browser the first."
-        ),
-    ] = None,
-    certificate: Annotated[
-        bool, typer.Option("--certificate", help="One page to print and sign, instead.")
-    ] = False,
-    operator: Annotated[str, typer.Option(help="With --certificate: who calibrated.")] = "",
-    serial: Annotated[
-        list[str] | None,
-        typer.Option(metavar="WHAT=NUMBER", help="With --certificate, as camera=1234."),
-    ] = None,
-) -> None:
-    """Show an earlier result: its report, its recording, or its certificate.
-
-    Pictures, coverage and joint angles of the report come from the recording.rrd beside a
-    calibration.json; where it is missing or belongs to another result, the report says so. With
-    --viewer --web the page's URL goes to stdout, and only this machine can reach it; Ctrl-C ends.
-    """
-    if not certificate:
-        given = {"--operator": operator or None, "--serial": serial}
+def show_command(options: ShowOptions) -> None:
+    """Runs `visioncal show`."""
+    if not options.certificate:
+        given = {"--operator": options.operator or None, "--serial": options.serial}
         refuse_given(given, "they are for --certificate", "Give that, too, or leave it out.")
-    if not viewer:
-        given_view = {"--web": web or None, "--view": view}
+    if not options.viewer:
+        given_view = {"--web": options.web or None, "--view": options.view}
         refuse_given(given_view, "they are for --viewer", "Give that, too, or leave it out.")
-        signed = {"operator": operator} if operator else {}
-        signed |= dict(map(_serial_number, serial or ()))
-        _write_page(result, out, signed if certificate else None)
+        signed = {"operator": options.operator} if options.operator else {}
+        signed |= dict(map(_serial_number, options.serial or ()))
+        _write_page(options.result, options.out, signed if options.certificate else None)
         return
-    if web and view is not None:
+    if options.web and options.view is not None:
         raise typer.BadParameter("--view goes without --web: a browser opens at the first view.")
-    refuse_given({"--out": out}, "--viewer writes no page", "Leave it out.")
-    file = find_recording(result)
+    refuse_given({"--out": options.out}, "--viewer writes no page", "Leave it out.")
+    file = find_recording(options.result)
     # Imported late, so that --help stays fast.
     from visioncal.present.viewer import review_native, review_web
 
-    if not web:
-        review_native(file, _row(file, view))
+    if not options.web:
+        review_native(file, _row(file, options.view))
         return
 
     def opened(url: str) -> None:
@@ -92,8 +55,6 @@ def show_command(
 
 def _write_page(result: Path, out: Path | None, signed: dict[str, str] | None) -> None:
     """Writes the report, or the certificate with what a person adds to it."""
-    # Imported late, so that --help stays fast.
-    from visioncal.interchange.result_files import load_stored
     from visioncal.present.report.page import write_certificate, write_report
 
     stored = load_stored(result)
@@ -123,9 +84,7 @@ def _serial_number(text: str) -> tuple[str, str]:
 
 def _row(file: Path, view: int | None) -> int | None:
     """Index of the view at which a recording is opened; None for the first."""
-    from visioncal.interchange.result_files import load_result
     from visioncal.present.recording import read_session
-    from visioncal.results.views import worst_view
 
     if view is None:
         # A plan and an uncalibrated session have no worst view.

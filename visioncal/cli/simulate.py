@@ -1,23 +1,53 @@
 """`visioncal simulate`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from dataclasses import fields, replace
+from typing import TypeVar
 
-import typer
+import numpy as np
 
 from visioncal.cli.console import say
-from visioncal.cli.options import Seed
 from visioncal.cli.progress import shown_progress
-from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, CameraMount
+from visioncal.cli.session_options import Instrument, SimulateOptions
 from visioncal.core.errors import DataError
-
-# For type hints only, so that --help stays fast.
-if TYPE_CHECKING:
-    from visioncal.simulation import CellOptions, SimulatedCell
-    from visioncal.simulation.instrument_session import InstrumentOptions
-Read: TypeAlias = Literal["point", "points", "probe"]
+from visioncal.session import frame_name
+from visioncal.session.saving import refuse_filled
+from visioncal.simulation import (
+    BOARDS,
+    CAMERAS,
+    ArmOptions,
+    CameraAt,
+    CellOptions,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    Payload,
+    PointAt,
+    RobotAt,
+    Round,
+    Second,
+    SimulatedCell,
+    SweepOptions,
+    WarmUpOptions,
+    arm_named,
+    read_cell,
+    simulate,
+    simulate_warm_up,
+    sweep,
+    touch,
+    truth_path,
+    write_session,
+)
+from visioncal.simulation.dynamics import LinkBody
+from visioncal.simulation.exercise import (
+    ExerciseOptions,
+    Senses,
+    exercise,
+    seed_of,
+    with_exercises,
+    write_exercise,
+)
+from visioncal.simulation.instrument_session import THREE, InstrumentOptions, tracked, write_tracked
 
 # Parameters of a cell of one robot, for any kind of recording.
 _SINGLE = frozenset(
@@ -48,133 +78,10 @@ _TAKES: Mapping[str, frozenset[str]] = {
 }
 
 
-@dataclass(frozen=True)
-class SimulateOptions:
-    """Options of the simulated session."""
-
-    folder: Annotated[Path, typer.Argument(help="Where to write the session.")]
-    mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand"
-    views: Annotated[int, typer.Option(min=1, help="Number of views.")] = 20
-    robot: Annotated[str, typer.Option(metavar="|".join(SIMULATED_ARMS), help="The arm.")] = "ur10e"
-    camera: Annotated[
-        Literal["wide", "fine", "fisheye"],
-        typer.Option(help="1280 x 800, 2448 x 2048, or a fisheye."),
-    ] = "wide"
-    board: Annotated[
-        Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"],
-        typer.Option(help="The board's pattern."),
-    ] = "charuco"
-    second_board: Annotated[
-        bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
-    ] = False
-    robot_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Repeatability of the robot (mm).")
-    ] = 0.03
-    robot_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation (mrad).")
-    ] = 0.05
-    arm_sigma_mm: Annotated[
-        float,
-        typer.Option(min=0.0, max=100.0, help="Sigma of the errors of the arm's lengths (mm)."),
-    ] = 0.0
-    arm_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Sigma of the errors of its angles (mrad).")
-    ] = 0.0
-    wrong_views: Annotated[int, typer.Option(min=0, help="Views whose reported pose is wrong.")] = 0
-    board_scale: Annotated[
-        float, typer.Option(min=0.5, max=2.0, help="Ratio of printed to stated size of the board.")
-    ] = 1.0
-    with_intrinsics: Annotated[
-        bool, typer.Option(help="Whether the session states the camera's intrinsics.")
-    ] = True
-    images: Annotated[
-        bool, typer.Option(help="Whether to render images; pose pairs are written otherwise.")
-    ] = True
-    sweep: Annotated[
-        bool,
-        typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
-    ] = False
-    clock_offset_ms: Annotated[
-        float, typer.Option(help="With --sweep: lead of the camera's clock (ms).")
-    ] = 37.0
-    readout_ms: Annotated[
-        float,
-        typer.Option(
-            help="With --sweep: readout time from an image's first row to its last (ms); unless "
-            "0, the frames have corners (corners.csv) in place of poses."
-        ),
-    ] = 0.0
-    warm_up: Annotated[
-        bool,
-        typer.Option(
-            help="A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures."
-        ),
-    ] = False
-    cell: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE.toml",
-            help=f"A whole cell: {', '.join(SIMULATED_CELLS)}, or a file that describes one.",
-        ),
-    ] = None
-    instrument: Annotated[
-        Read | None,
-        typer.Option(
-            help="A tracker that reads one point or three on the flange, or a probe; of a whole "
-            "cell on every flange."
-        ),
-    ] = None
-    torques: Annotated[
-        bool,
-        typer.Option(
-            "--torques",
-            help="Streams of a moving arm's torques, without views; of a whole cell beside its "
-            "views.",
-        ),
-    ] = False
-    touches: Annotated[
-        bool,
-        typer.Option(
-            "--touches",
-            help="Also touches of a tool and a fixture by every robot, in touches.csv ...",
-        ),
-    ] = False
-    currents: Annotated[
-        bool,
-        typer.Option(
-            help="Motor currents: with --warm-up for temperatures, with --torques for torques."
-        ),
-    ] = False
-    stiffness_knm: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="Stiffness of every joint (kN m/rad); rigid if left out."),
-    ] = None
-    payload_kg: Annotated[
-        list[float] | None,
-        typer.Option(min=0.0, help="Payload of the arm (kg); repeated for stops in turn."),
-    ] = None
-    recording: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Another recording of the same cell: fresh stops, for verify and locate."
-        ),
-    ] = 0
-    camera_moved_mm: Annotated[
-        float,
-        typer.Option(min=0.0, max=100.0, help="How far the camera was knocked (mm); the first."),
-    ] = 0.0
-    seed: Seed = 0
-
-
-def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
-    """Write a simulated session, and its truth in a file beside it."""
-    from visioncal.cli.simulated_cell import CENTRE_M, exercise_options, exercised, whole_cell
-    from visioncal.session.saving import refuse_filled
-    from visioncal.simulation import BOARDS, CAMERAS, CellOptions, Payload, Second, truth_path
-    from visioncal.simulation.exercise import write_exercise
-    from visioncal.simulation.instrument_session import InstrumentOptions, tracked, write_tracked
-
-    given, folder = _given_for(context), asked.folder
+def simulate_command(asked: SimulateOptions) -> None:
+    """Runs `visioncal simulate`."""
+    _check_given(asked)
+    given, folder = asked.given, asked.folder
     options = CellOptions(
         robot=asked.robot,
         mount=asked.mount,
@@ -188,8 +95,10 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
         dh_sigma_rad=1e-3 * asked.arm_sigma_mrad,
         wrong_views=asked.wrong_views,
         board_scale=asked.board_scale,
-        compliance_rad_per_nm=_compliance(asked.robot, asked.stiffness_knm),
-        payloads=tuple(Payload(value, CENTRE_M) for value in asked.payload_kg or ()),
+        compliance_rad_per_nm=()
+        if asked.stiffness_knm is None
+        else (1e-3 / asked.stiffness_knm,) * len(arm_named(asked.robot).offset),
+        payloads=tuple(Payload(value, _CENTRE_M) for value in asked.payload_kg or ()),
         second=Second() if asked.second_board else None,
         recording=asked.recording,
         camera_moved_m=1e-3 * asked.camera_moved_mm,
@@ -198,29 +107,25 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     # Checked first, as rendering takes long.
     refuse_filled(folder.absolute())
     if asked.cell is not None:
-        cell = whole_cell(asked.cell, options, given, asked.instrument)
-        _write(exercised(cell, asked) if asked.torques else cell, asked)
+        _write(_whole_cell(asked.cell, options, asked), asked)
     elif asked.instrument is not None:
-        stops = asked.views if "views" in given else InstrumentOptions.stops
-        write_tracked(tracked(_read_by(asked.instrument, options, stops)), folder)
+        instrument = InstrumentOptions(
+            stops=asked.views if "views" in given else InstrumentOptions.stops,
+            points=THREE if asked.instrument == "points" else THREE[:1],
+            poses=asked.instrument == "probe",
+            seed=options.seed,
+            **options.part(ArmOptions),
+        )
+        write_tracked(tracked(instrument), folder)
     elif asked.torques:
-        write_exercise(exercise_options(asked, asked.robot, asked.seed), folder)
+        write_exercise(_exercise_options(asked, asked.robot, asked.seed), folder)
     else:
         _write(_single(options, asked), asked)
     say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
+def _single(options: CellOptions, asked: SimulateOptions) -> SimulatedCell:
     """A cell of one robot: at stops, in a sweep, or during warm-up."""
-    from visioncal.simulation import (
-        Round,
-        SweepOptions,
-        WarmUpOptions,
-        simulate,
-        simulate_warm_up,
-        sweep,
-    )
-
     if asked.warm_up:
         rounds = Round(first=asked.views)
         warm_up = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
@@ -233,10 +138,8 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
     return simulate(options)
 
 
-def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
+def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
     """Writes a cell, and its robots' touches."""
-    from visioncal.simulation import touch, write_session
-
     count = len(cell.sights)
     with shown_progress(quiet=False) as progress:
         write_session(
@@ -248,36 +151,9 @@ def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
         )
 
 
-def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "InstrumentOptions":
-    """Options of an instrument that measures the cell's arm."""
-    from visioncal.simulation import ArmOptions
-    from visioncal.simulation.instrument_session import THREE, InstrumentOptions
-
-    return InstrumentOptions(
-        stops=stops,
-        points=THREE if instrument == "points" else THREE[:1],
-        poses=instrument == "probe",
-        seed=options.seed,
-        **options.part(ArmOptions),
-    )
-
-
-def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
-    """Compliance of each joint [rad/(N m)]; empty for a rigid arm."""
-    from visioncal.simulation import arm_named
-
-    if stiffness_knm is None:
-        return ()
-    return (1e-3 / stiffness_knm,) * len(arm_named(robot).offset)
-
-
-def _given_for(context: typer.Context) -> frozenset[str]:
-    """The given parameters, after checking that they apply to the kind of session."""
-    sources = {name: context.get_parameter_source(name) for name in context.params}
-    given = frozenset(
-        name for name, source in sources.items() if source and source.name == "COMMANDLINE"
-    )
-    kinds = [take for take in _TAKES if context.params.get(take)]
+def _check_given(asked: SimulateOptions) -> None:
+    """Refuses options that do not apply to the kind of session."""
+    kinds = [take for take in _TAKES if take and getattr(asked, take)]
     if "cell" in kinds:
         kinds = [kind for kind in kinds if kind not in _WITH_CELL]
     if len(kinds) > 1:
@@ -291,9 +167,9 @@ def _given_for(context: typer.Context) -> frozenset[str]:
         )
     kind = kinds[0] if kinds else ""
     takes = _TAKES[kind]
-    if kind == "cell" and context.params.get("torques"):
+    if kind == "cell" and asked.torques:
         takes = takes | {"currents"}
-    for wrong in sorted(given - takes - {"folder", kind}):
+    for wrong in sorted(asked.given - takes - {"folder", kind}):
         possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
         raise DataError(
             f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
@@ -302,8 +178,119 @@ def _given_for(context: typer.Context) -> frozenset[str]:
             if kind != "cell"
             else "Leave it out; what a whole cell is made of is said by a file of your own.",
         )
-    return given
 
 
 def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}" if name else "a plain cell of one robot"
+
+
+_T = TypeVar("_T", RobotAt, CameraAt)
+# Fields of robots and cameras, by the parameters that set them.
+_FIELDS: Mapping[str, str] = {
+    "robot_sigma_mm": "robot_sigma_m",
+    "robot_sigma_mrad": "robot_sigma_rad",
+    "arm_sigma_mm": "dh_sigma_m",
+    "arm_sigma_mrad": "dh_sigma_rad",
+    "stiffness_knm": "compliance_rad_per_nm",
+    "payload_kg": "payloads",
+    "with_intrinsics": "state_intrinsics",
+}
+# Centre of a simulated load in the flange's frame [m].
+_CENTRE_M = (0.0, 0.0, 0.1)
+# Half the side of a cubic load [m], and torque constant of each drive [N m/A].
+_HALF_M = 0.05
+_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
+
+
+def _whole_cell(name: str, options: CellOptions, asked: SimulateOptions) -> SimulatedCell:
+    """Simulates a whole cell; the user's options override its description."""
+    cell = simulate(_described(name, options, asked.given, asked.instrument))
+    if not (cell.sights or cell.readings):
+        raise DataError(
+            f"--cell {name}: nothing in this cell is seen or read.",
+            culprits=[name],
+            next_step="Give it a camera that sees a target, or an instrument and points.",
+        )
+    if not asked.torques:
+        return cell
+    exercises = {
+        robot.name: exercise(_exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
+        for at, robot in enumerate(cell.layout.robots)
+    }
+    return with_exercises(cell, exercises)
+
+
+def _described(
+    name: str, options: CellOptions, given: frozenset[str], instrument: Instrument | None
+) -> NetworkOptions:
+    """A cell's description, with the user's options in its place."""
+    described = read_cell(name)
+    fields_by_option = {"views": "stops", "wrong_views": "stray_images"}
+    fields_by_option |= {"seed": "seed", "recording": "recording"}
+    described = replace(
+        described,
+        **{
+            field: getattr(options, parameter)
+            for parameter, field in fields_by_option.items()
+            if parameter in given
+        },
+        robots=tuple(_with_given(robot, options, given) for robot in described.robots),
+        cameras=tuple(_with_given(camera, options, given) for camera in described.cameras),
+        boards=tuple(
+            replace(board, scale=options.board_scale) if "board_scale" in given else board
+            for board in described.boards
+        ),
+    )
+    if "camera_moved_mm" in given:
+        if not described.cameras:
+            raise DataError(
+                f"--cell {name}: there is no camera to knock.", culprits=["--camera-moved-mm"]
+            )
+        frame = frame_name("camera", described.cameras[0].name)
+        knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
+        described = replace(described, moved=(*described.moved, knocked))
+    return described if instrument is None else _with_instrument(name, described, instrument)
+
+
+def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
+    """A robot or a camera with the user's options."""
+    names = {field.name for field in fields(thing)}
+    changes = {_FIELDS[name] for name in given & _FIELDS.keys()} & names
+    return replace(thing, **{name: getattr(options, name) for name in changes})
+
+
+def _with_instrument(
+    name: str, described: NetworkOptions, instrument: Instrument
+) -> NetworkOptions:
+    """The description with an instrument that measures every robot's flange."""
+    if described.instruments or described.points:
+        raise DataError(
+            f"--cell {name} has instruments or points of its own.",
+            culprits=["--instrument"],
+            next_step="Leave --instrument out.",
+        )
+    places = THREE if instrument == "points" else THREE[:1]
+    points = tuple(
+        PointAt(f"{robot.name}{at}", robot.name, place)
+        for robot in described.robots
+        for at, place in enumerate(places, start=1)
+    )
+    tracker = InstrumentAt("tracker", (2.5, -1.0, 0.4), 2.5)
+    if instrument == "probe":
+        tracker = replace(tracker, sigma_rad=InstrumentOptions.sigma_rad)
+    return replace(described, instruments=(tracker,), points=points)
+
+
+def _exercise_options(options: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
+    """An arm's motions, without load or with a cube on its flange."""
+    loads = options.payload_kg or [0.0]
+    if len(loads) > 1:
+        raise DataError(
+            f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
+            culprits=["--payload-kg"],
+            next_step="Make a session of each load, with the same --seed.",
+        )
+    inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
+    load = LinkBody(loads[0], np.array(_CENTRE_M), inertia) if loads[0] else None
+    senses = Senses(gains_nm_a=_GAINS_NM_A if options.currents else ())
+    return ExerciseOptions(robot, load, senses, seed=seed)

@@ -1,0 +1,200 @@
+"""Records of `visioncal dynamics`: its commands' options, and their help."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from visioncal.cli.options import json_flag, out_folder, robot_name
+from visioncal.cli.session_options import ClearanceOptions, kept_option
+from visioncal.core.choices import DYNAMICS_FILE, GAIN_SIGMA
+from visioncal.core.options import REQUIRED, argument, flag, option
+
+# Terms of friction that torques determine, and those that a motion can be planned for.
+FRICTION = ("coulomb", "viscous", "offset")
+PLANNED_FRICTION = (*FRICTION, "motor-inertia")
+
+motions_argument = partial(
+    argument, "A session with streams of angles and torques: a folder or an .rrd."
+)
+cutoff_option = partial(
+    option, "Of the low-pass. Default: ten times the motion's band.", "--cutoff-hz", min=0.1
+)
+against_option = partial(option, f"A folder of identify, or its {DYNAMICS_FILE}.", "--against")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamOptions:
+    """Which samples are used, and how currents become torques."""
+
+    stream: list[str] | None = option("A stream with torques; may be repeated. Default: all.")
+    cutoff_hz: float | None = cutoff_option()
+    gains: str | None = option(
+        "Torque for a current, by joint [N m/A], where currents were recorded.", metavar="K1,K2,..."
+    )
+    robot: str | None = robot_name()
+
+
+_motion = partial(option, panel="The motion")
+_missing = partial(option, panel="What its description lacks")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExcitationOptions:
+    """Options of the motion."""
+
+    duration: float = _motion("Duration of the exciting motion, in s.", default=20.0)
+    harmonics: int = _motion("Harmonics of that period.", default=5)
+    friction: str = _motion(
+        f"What is to be identified besides inertias: {', '.join(PLANNED_FRICTION)}; or none.",
+        default="coulomb,viscous,offset",
+    )
+    sweep_speeds: int = _motion("Speeds at which each joint sweeps.", default=6)
+    no_sweeps: bool = _motion("Only the exciting motion.", "--no-sweeps", default=False)
+    rate_hz: float = _motion(
+        "Sampling rate of the tables, in Hz.", "--rate", default=500.0, min=1.0, max=4000.0
+    )
+    starts: int = _motion(
+        "Random motions to search from; more take longer and find better ones.", default=4
+    )
+    seconds: float | None = _motion(
+        "End the search after this time of one core, in s, once a motion is found; the "
+        "result then depends on the computer."
+    )
+    seed: int = _motion("Random seed of the starts.", default=0, min=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmOptions:
+    """Limits, payload and fixed joints of the arm."""
+
+    speed: float = kept_option("Fraction of the maximum speeds.", default=0.9)
+    acceleration: float = kept_option("Fraction of the maximum accelerations.", default=0.9)
+    torque_margin: float = kept_option(
+        "Safety factor on the torques of the nominal inertias.", default=1.2
+    )
+    tool: str | None = kept_option(
+        "What sticks out of the flange, along its z, in mm.", metavar="LENGTH,RADIUS"
+    )
+    payload: str | None = kept_option(
+        "What the flange carries: its mass, and its centre in the flange's frame in mm.",
+        metavar="KG,X,Y,Z",
+    )
+    range_deg: float | None = _missing("Range to either side of joints without limits.")
+    speed_deg: float | None = _missing("Maximum speed, in deg/s.")
+    acceleration_deg: float | None = _missing("Maximum acceleration, in deg/s^2.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsPlanOptions:
+    """Plan the motions that determine an arm's inertias and friction.
+
+    Writes an exciting motion and sweeps as tables (.csv), plan.json and plan.rrd to look at.
+    Nothing is sent to a robot. Exit status 2: the limits allow none.
+    """
+
+    robot: str = argument("A built-in robot, or the path of a .urdf, .toml or .json.")
+    motion: ExcitationOptions
+    kept: ClearanceOptions
+    arm_options: ArmOptions
+    out: Path = out_folder(default=Path("motions"))
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsRecordOptions:
+    """Record angles, speeds and motor currents at the controller's full rate.
+
+    The motion is another program's: start that once this command waits for it. Exit status 0: it
+    is recorded; 2: it is not.
+    """
+
+    out: Path = argument("The session's folder; made, or given another stream.")
+    arm: str = option("The arm: ur:HOST.", default=REQUIRED)
+    stream: str = option("Name of the recorded stream.", default="excite")
+    robot: str | None = option("Its model; by default what the controller says.")
+    rest_s: float = option("The motion ends after this time at rest (s).", default=3.0, min=0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsIdentifyOptions:
+    """Identify an arm's inertias and friction from the torques of its motions.
+
+    Exit status 0: there is a result to use; 3: its verdict is bad; 2: there is none, for the reason
+    given.
+    """
+
+    session: Path = motions_argument()
+    streams: StreamOptions
+    validate_on: str | None = option(
+        "A stream to predict. Default: the last 30 % of the fastest motion."
+    )
+    output: Path | None = option(
+        f"A folder for {DYNAMICS_FILE}, report and recording.", "-o", "--output", file_okay=False
+    )
+    friction: str = option(
+        f"Friction terms of the joints: {', '.join(FRICTION)}; or none.",
+        default="coulomb,viscous,offset",
+    )
+    rotors: bool | None = option(
+        "Motors' inertia in the torques, or none in those of sensors behind the gears. "
+        "Default: whichever predicts unseen torques better.",
+        "--rotors/--no-rotors",
+    )
+    stribeck: bool = option(
+        "Look for humps of dry friction.", "--stribeck/--no-stribeck", default=True
+    )
+    unchecked: bool = flag("Take torques that contradict the robot's inertias.")
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsValidateOptions:
+    """Predict the torques of other motions, and say how near that comes.
+
+    Exit status 0: there are figures; 2: there are none, for the reason given.
+    """
+
+    session: Path = motions_argument()
+    streams: StreamOptions
+    against: Path | None = against_option()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsPayloadOptions:
+    """Weigh what the arm carries, by how much more its drives gave than without it.
+
+    Exit status 0: there are figures; 2: there are none, for the reason given.
+    """
+
+    session: Path = motions_argument()
+    streams: StreamOptions
+    against: Path | None = against_option()
+    same_friction: bool = flag("Friction is as it was without the payload, however it presses.")
+    gains_sigma: float = option(
+        "Sigma of each of the --gains, in percent.", default=100.0 * GAIN_SIGMA, min=0.0
+    )
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicsGainsOptions:
+    """Find how much torque a drive's current makes, by a body that is known.
+
+    Exit status 0: there are gains; 2: there are none, for the reason given.
+    """
+
+    session: Path = motions_argument()
+    loaded: Path = option("A session of the same arm with the body on it.", default=REQUIRED)
+    mass_kg: float = option("Of the body (kg).", default=REQUIRED)
+    com_mm: str = option(
+        "Its centre of mass in the flange's frame (mm).", default=REQUIRED, metavar="X,Y,Z"
+    )
+    inertia: str = option(
+        "Its inertia about that centre (kg m^2).",
+        default="0,0,0,0,0,0",
+        metavar="XX,XY,YY,XZ,YZ,ZZ",
+    )
+    cutoff_hz: float | None = cutoff_option()
+    named: str | None = robot_name()
+    as_json: bool = json_flag()

@@ -1,0 +1,477 @@
+"""Records of the commands that make and use results: their options, and their help."""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+import typer
+
+from visioncal.cli.options import (
+    NeedOptions,
+    PartOptions,
+    WorkOptions,
+    camera_name,
+    force_bad,
+    force_both,
+    force_flag,
+    json_flag,
+    out_file,
+    out_folder,
+    robot_name,
+    session_argument,
+    yes_flag,
+)
+from visioncal.cli.parsing import FORMS
+from visioncal.cli.session_options import RobotPoseOptions
+from visioncal.core.choices import EXPORT_NAMES, UNITS_M, WIDEST_RAD, Convention, SolverName
+from visioncal.core.errors import DataError
+from visioncal.core.options import REQUIRED, argument, flag, option
+from visioncal.interchange.outputs import REPORT, VERIFY
+
+# A pose of the robot, as typed.
+POSE = "x,y,z,qx,qy,qz,qw"
+
+
+def _show_formats(wanted: bool) -> None:
+    if wanted:
+        # Imported late, so that --help stays fast.
+        from visioncal.interchange.exports import EXPORT_FORMATS
+
+        width = max(len(export_format.name) for export_format in EXPORT_FORMATS)
+        for export_format in EXPORT_FORMATS:
+            typer.echo(f"{export_format.name:<{width}}  {export_format.words}")
+        raise typer.Exit
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """Turn a session into a hand-eye calibration, with reasons to trust it or not.
+
+    Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
+    earlier result there are kept in frames.json. Exit status 0: there is a result to use, good or
+    check; 3: there is one, and its verdict is bad; 2: the input or the motion cannot give one, and
+    an existing folder stays as it was; 1: drawing the report or the recording failed, and
+    calibration.json is there. Several cameras or robots are
+    solved together, in one frame; other commands take one of each out of that result (--camera,
+    --robot, --target).
+    """
+
+    sessions: list[Path] = argument(
+        "A session's folder, or its .rrd recording; several with --robot-shared.",
+        metavar="SESSION...",
+    )
+    need: NeedOptions
+    work: WorkOptions
+    out: Path = out_folder(default=Path("out"))
+    views: str | None = option(
+        "These views alone, as those before or after something moved.", metavar="1-12,14"
+    )
+    solver: SolverName = option(
+        "The joint fit, or a closed form by name; all are compared anyway.", default="joint"
+    )
+    level: str = option(
+        "What is calibrated of the arm: hand-eye (nothing), offsets (of its joints), "
+        "kinematics, elastic (bending joints, too), thermal (drift with temperature, too).",
+        default="auto",
+        metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
+    )
+    convention: Convention | None = option(
+        "Convention of the arm's joint table in the result; by default the stated one."
+    )
+    robot_shared: bool = flag(
+        "Several sessions of one arm, each with a camera and a board of its own: the arm "
+        "is calibrated from all of them."
+    )
+    corrected: bool = flag(
+        "Targets are corrected for the calibrated arm (visioncal correct) before they are "
+        "sent; else the verdict is about picks by the controller's own poses."
+    )
+    dense: bool = flag(
+        "Fit the board to all pixels of images that are too blurred, by focus or motion, "
+        "for the corners to be found."
+    )
+    as_json: bool = json_flag()
+    verbose: bool = flag("Also show every solver's result.", "-v", "--verbose")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """Calibrate many sessions at once, and report which stand out of their fleet.
+
+    Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
+    them, outliers among robots of the same model first. Existing results are kept: started again,
+    an interrupted batch continues. Exit status 0: there are results, none of them bad; 3: one is
+    bad; 2: there is none.
+    """
+
+    out: Path = option(
+        "Folder for the results, one in each session's.",
+        "-o",
+        "--out",
+        default=REQUIRED,
+        file_okay=False,
+    )
+    need: NeedOptions
+    sessions: list[str] | None = argument(
+        "Sessions, recordings, folders with some below them, or globs.", default=None
+    )
+    workers: int | None = option(
+        "Number of parallel workers, on one core each; by default one a core.", min=1
+    )
+    scheduler: str | None = option(
+        "A Dask scheduler, as tcp://HOST:8786, whose workers see the same files; needs "
+        "the extra cluster.",
+        metavar="ADDRESS",
+    )
+    against: Path | None = option(
+        "An earlier batch: which results changed by more than their sigmas."
+    )
+    level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
+    no_report: bool = flag(f"Leave each {REPORT} out.")
+    recordings: bool = flag("Also write each recording, with all images.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions:
+    """Show an earlier result: its report, its recording, or its certificate.
+
+    Pictures, coverage and joint angles of the report come from the recording.rrd beside a
+    calibration.json; where it is missing or belongs to another result, the report says so. With
+    --viewer --web the page's URL goes to stdout, and only this machine can reach it; Ctrl-C ends.
+    """
+
+    result: Path = argument(
+        "An output folder, its calibration.json, or a recording (.rrd); with --viewer a plan, too.",
+        metavar="OUT",
+    )
+    out: Path | None = option("The page; report.html or certificate.html otherwise.", "-o", "--out")
+    viewer: bool = flag("Open the recording in the rerun viewer, instead.")
+    web: bool = flag("With --viewer: in a browser, not in a window.")
+    view: int | None = option(
+        "With --viewer: the number of the view to open the window at. Default: the worst; "
+        "in a browser the first."
+    )
+    certificate: bool = flag("One page to print and sign, instead.")
+    operator: str = option("With --certificate: who calibrated.", default="")
+    serial: list[str] | None = option("With --certificate, as camera=1234.", metavar="WHAT=NUMBER")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyOptions:
+    """Check whether a calibration still holds, and what has changed if it does not.
+
+    Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
+    """
+
+    session: Path = argument("Five stops or more of the same cell: a folder or an .rrd.")
+    part: PartOptions
+    against: Path | None = option("The calibration: an output folder of calibrate, or its .rrd.")
+    board_moved: bool = flag("The board was put elsewhere on purpose.")
+    collision: bool = flag("A collision was reported since.")
+    policy: Path | None = option("Your own table of when to calibrate again (.toml).")
+    output: Path | None = option(
+        f"A folder for {REPORT} and {VERIFY}.", "-o", "--output", file_okay=False
+    )
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffOptions:
+    """Show what changed between two calibrations, and what is only noise.
+
+    Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
+    """
+
+    first: Path = argument("An output folder, its calibration.json, or a recording (.rrd).")
+    second: Path = argument("The one to compare with it.")
+    part: PartOptions
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Write a result, or the calibrated arm, in another program's or robot's format.
+
+    The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
+    nothing was written, for the reason given; 3: nothing was, as the result's verdict is bad.
+    """
+
+    source: Path = argument(
+        "An output folder, its calibration.json or dynamics.json, a recording (.rrd), or "
+        "a file of frames."
+    )
+    to: str = option(
+        f"{', '.join(EXPORT_NAMES)}; --list says what each is.", default=REQUIRED, metavar="FORMAT"
+    )
+    part: PartOptions
+    out: Path | None = out_file()
+    edge: str | None = option(
+        "The transform; where none is named the camera's, the only tool or the only "
+        "fixture, as the format has it. Of an aligned cell any frame from any other, or all."
+    )
+    inverse: bool = flag("Write the inverse of it.")
+    parent: str | None = option("Exported name of the frame in which the pose is given.")
+    child: str | None = option("Exported name of the frame whose pose it is.")
+    number: int | None = option("Number of the controller's tool or base.")
+    mass_kg: float | None = option("The tool's mass, for ABB's tooldata (kg).")
+    cog_mm: tuple[float, float, float] | None = option(
+        "Its centre of mass in the flange's frame: X Y Z (mm)."
+    )
+    convention: str | None = option(
+        "robot-dh: convention of its joint table; modified is Craig's.",
+        metavar="|".join(get_args(Convention)),
+    )
+    calibration_hash: str | None = option(
+        "ur-kinematics: the hash that ur_calibration extracts.", "--hash"
+    )
+    with_corrections: bool = flag(
+        "robot-urdf, robot-dh, ur-kinematics: links for use with the table of "
+        "joint-corrections; without it, those that leave the least alone."
+    )
+    lens: Path | None = option(
+        "The receiving program's own lens, as convert --intrinsics reads it: the "
+        "camera's transform is written for that.",
+        metavar="FILE",
+    )
+    force: bool = force_both()
+    _list: bool = flag("List the formats.", "--list", callback=_show_formats, is_eager=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectOptions:
+    """Correct targets so that the arm reaches them by its nominal controller.
+
+    Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit
+    status 3: nothing was, as the calibration's verdict is bad.
+    """
+
+    targets: Path = argument(
+        "A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
+        "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
+    )
+    calibration: Path = option(
+        "Of the calibrated arm: an output folder of calibrate, or its .rrd.",
+        "-c",
+        "--against",
+        "--calibration",
+        default=REQUIRED,
+    )
+    part: PartOptions
+    out: Path | None = out_file()
+    tool: str | None = option(
+        "Frame of the targets and of the corrected ones: a tool of the calibration, or "
+        "cam; by default the flange."
+    )
+    seed_joints: str | None = option(
+        "Joint angles near which the first target is reached, in radians; else the "
+        "middle of the joints' limits. Each further target is reached near to the one before.",
+        metavar="Q1,Q2,...",
+    )
+    payload_kg: float = option("Payload on the flange, for joints that bend (kg).", default=0.0)
+    payload_m: str = option(
+        "Its centre of mass in the flange's frame (m).", default="0,0,0", metavar="X,Y,Z"
+    )
+    widest_deg: float = option(
+        "Warn where a joint turns farther than this from one target to the next.",
+        default=math.degrees(WIDEST_RAD),
+    )
+    temperatures: str | None = option(
+        "Temperatures of the links behind the joints, in degrees Celsius, for an arm "
+        "whose drift was calibrated; else as warm as it was when its session began.",
+        metavar="T1,T2,...",
+    )
+    skip: bool = flag("Write the other targets where some are refused.", "--skip-unreachable")
+    force: bool = force_both()
+    as_json: bool = json_flag()
+
+
+point_option = partial(
+    option,
+    "For images: the frame's origin in the target's frame, such as the tool's tip.",
+    "--point-mm",
+    metavar="X,Y,Z",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions:
+    """Destination and name of a frame."""
+
+    calibration: Path | None = option(
+        "An output folder of calibrate: what it knows is used, and the frame joins it.",
+        "-c",
+        "--calibration",
+    )
+    out: Path | None = option(
+        "A file of frames (.json) to put it into instead; made where missing.", "-o", "--out"
+    )
+    name: str | None = option("Name of the frame: gripper, jig_2.")
+    remove: str | None = option(
+        "Remove one from the calibration, or from -o's file.", metavar="NAME"
+    )
+    force: bool = force_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchOptions(RobotPoseOptions):
+    """Convention and repeatability of touches."""
+
+    touch_noise: float | None = option(
+        "Repeatability of a touch, per axis, in mm.", "--touch-noise-mm"
+    )
+
+    @property
+    def noise_m(self) -> float | None:
+        """Repeatability of a touch [m].
+
+        Raises:
+            DataError: It is no length from 0 to 1000 mm.
+        """
+        noise_mm = self.touch_noise
+        if noise_mm is None:
+            return None
+        if not 0.0 < noise_mm < 1e3:
+            raise DataError(
+                f"--touch-noise-mm is {noise_mm:g}; millimetres above 0 and under 1000 are needed.",
+                culprits=["--touch-noise-mm"],
+            )
+        return 1e-3 * noise_mm
+
+    def given(self) -> dict[str, object]:
+        """The options by their names; None for those that were not given."""
+        own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
+        named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
+        return {**named, "--touch-noise-mm": self.touch_noise}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TcpOptions:
+    """Find a tool's tip, and its rotation, from touches of fixed points; or from images.
+
+    A touch of kind point has the tip at the point; of kind z, the point lies on the tool's positive
+    z axis; of kind xz, in its xz plane on the side of positive x. In images, a target on the tool
+    gives both, by the camera that -c names. Exit status 2: nothing was written, for the reason
+    given; 3: the tool is bad, and joins no calibration.
+    """
+
+    goes: FrameOptions
+    written: TouchOptions
+    part: PartOptions
+    touches: Path | None = argument(
+        "A table with a row a touch: the columns of views.csv, kind (point, z or xz) and "
+        "point. Or a session whose images show a target on the tool.",
+        default=None,
+    )
+    point: str | None = point_option()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixtureOptions:
+    """Find a fixture in the base, from touches of it or of a drawing's points.
+
+    A touch of kind origin is at the fixture's origin; of kind x, on its positive x axis; of kind
+    xy, in its xy plane on the side of positive y: one of each at least. With --cad, three points or
+    more that the drawing has, by their names. In images a target on the fixture gives its frame, or
+    with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
+    the reason given; 3: the fixture is bad, and joins no calibration.
+    """
+
+    goes: FrameOptions
+    written: TouchOptions
+    part: PartOptions
+    touches: Path | None = argument(
+        "A table with a row a touch: the columns of views.csv, and kind (origin, x or xy) "
+        "or, with --cad, point. Or a session whose images show a target on the fixture.",
+        default=None,
+    )
+    cad: Path | None = option(
+        "A table of the drawing: point, x_mm, y_mm, z_mm (or x_m ...), sigma_mm."
+    )
+    cad_unit: str | None = option("What x, y, z in it are in.", metavar="|".join(UNITS_M))
+    tool: str | None = option(
+        "What touched: a tool of the calibration, a file of frames (frames.json, or "
+        "frames.json:gripper), or none, where the poses are of the tip itself."
+    )
+    point: str | None = point_option()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchTestOptions:
+    """Prove a calibration: touch what the camera locates, and enter the gaps.
+
+    The session has one image or more of a board as it lies now. Prints where to send the robot,
+    hovering first, corrected where the arm is calibrated; at a terminal it asks for each gap. With
+    all gaps, they are compared with what was predicted, and kept in the result and its report. Exit
+    status 3: they are larger, or nothing was done as the calibration or the tool is bad.
+    """
+
+    session: Path = session_argument()
+    calibration: Path | None = option("An output folder of calibrate.", "-c", "--calibration")
+    tool: str | None = option(
+        "Which tool of the calibration has the tip, see tcp; its only tool need not be "
+        "named. none: a gauge of --clearance-mm before the flange."
+    )
+    clearance_mm: float | None = option(
+        "With --tool none: the flange comes no nearer to the board, and a gauge of this "
+        "length has the tip; longer than all that the flange carries.",
+        min=0.0,
+        max=2000.0,
+    )
+    height_mm: float = option(
+        "Hovering height, before the touch.", default=50.0, min=1.0, max=1000.0
+    )
+    gaps_mm: str | None = option(
+        "Measured gaps from tip to point, in their order.", metavar="A,B,C,D,E"
+    )
+    drive: str | None = option(
+        "Bring the tip above each point by this arm, slowly; the rest is by hand.",
+        metavar="ur:HOST",
+    )
+    yes: bool = yes_flag()
+    force: bool = force_bad()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocateOptions:
+    """Locate what an image shows in the robot's base, with its uncertainty.
+
+    It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
+    reason given; 3: there is none, as the calibration's verdict is bad.
+    """
+
+    source: Path | None = argument(
+        "A session, or one image (png, jpg, tif, bmp, webp); may be left out with --pixel.",
+        default=None,
+    )
+    calibration: Path | None = option(
+        "The camera's: an output folder of calibrate, or its .rrd.", "-c", "--calibration"
+    )
+    pixel: list[str] | None = option(
+        "A feature, in the image as it was taken; several may be given.", metavar="U,V"
+    )
+    plane: str | None = option(f"Plane of the features: {FORMS}.")
+    plane_sigma: float | None = option("Sigma of the plane's height, in mm.", "--plane-sigma-mm")
+    point: str | None = option(
+        "A point of the target, instead of its origin.", "--point-mm", metavar="X,Y,Z"
+    )
+    target: str | None = option(
+        "What to look for, instead of the session's own: a name in targets/, a .toml, or "
+        "in one word as marker_DICT_4X4_50_10_48mm; or one of a whole cell's, as floor."
+    )
+    camera: str | None = camera_name()
+    robot: str | None = robot_name()
+    view: int | None = option("Which of the session's views; else all that show the target.")
+    pose: str | None = option(
+        "Pose of the flange at the image, in metres, for a camera on the flange.",
+        metavar=POSE.upper(),
+    )
+    sigma_px: float | None = option(
+        "Noise of a feature's coordinate; else that of the calibration's corners."
+    )
+    force: bool = force_bad()
+    as_json: bool = json_flag()

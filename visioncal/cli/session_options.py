@@ -1,0 +1,537 @@
+"""Records of the commands that make and check sessions: their options, and their help."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+from visioncal.cli.options import (
+    force_flag,
+    json_flag,
+    out_folder,
+    seed_option,
+    session_argument,
+    view_flag,
+    yes_flag,
+)
+from visioncal.core.choices import (
+    FOREIGN_NAMES,
+    PLAN_SPEED,
+    POSE_FORMS,
+    SIMULATED_ARMS,
+    SIMULATED_CELLS,
+    UNITS_M,
+    CameraMount,
+    Faults,
+    Mount,
+)
+from visioncal.core.options import REQUIRED, argument, flag, option
+from visioncal.live.capture.options import Keep, Stillness
+from visioncal.live.planning.purposes import PURPOSES
+
+# Options by their headings in the help.
+_what = partial(option, panel="What is planned")
+_cell = partial(option, panel="The cell, where the source does not say it")
+_certainty = partial(option, panel="How well it is known")
+kept_option = partial(option, panel="What the arm must keep")
+_record_cell = partial(option, panel="The cell, where no plan says it")
+_taking = partial(option, panel="How views are taken")
+_moving = partial(option, panel="How the arm is moved")
+_device = partial(option, panel="What the camera is set to")
+_poses = partial(option, panel="The poses of somebody else's recording")
+_recording = partial(option, panel="The recording itself")
+_camera = partial(option, panel="Its camera")
+_doubt = partial(option, panel="Poses that may be misread, of a session as well")
+
+Instrument: TypeAlias = Literal["point", "points", "probe"]
+BoardKind: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "circles", "marker"]
+# Largest number of stops where a need decides it.
+MOST_FOR_NEED = 40
+_USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
+_FORMS = f"{', '.join(POSE_FORMS)}, or a rotation such as euler-ZYX-deg, quaternion-wxyz"
+_UNITS = "|".join(UNITS_M)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Simulate a UR cell, calibrate it from its images, and compare with the truth.
+
+    The camera's intrinsics are not given: they too are estimated from the images. With --live the
+    arm has joint offsets and the stops are planned from rough guesses; nothing real moves. Exit
+    status 0: the result is as near to the truth as it says; 3: it is not, or its verdict is
+    bad.
+    """
+
+    out: Path = out_folder(default=Path("demo"))
+    views: int = option("Number of views.", default=20, min=5, max=200)
+    seed: int = seed_option()
+    live: bool = flag(
+        "Plan the stops and record them, with a UR's own client library and a simulated controller."
+    )
+    fault: Faults | None = option(
+        f"With --live, let this happen half way: {', '.join(get_args(Faults))}.",
+        metavar="FAULT",
+        show_default=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateOptions:
+    """Write a simulated session, and its truth in a file beside it."""
+
+    folder: Path = argument("Where to write the session.")
+    mount: CameraMount = option("Where the camera is.", default="eye-in-hand")
+    views: int = option("Number of views.", default=20, min=1)
+    robot: str = option("The arm.", default="ur10e", metavar="|".join(SIMULATED_ARMS))
+    camera: Literal["wide", "fine", "fisheye"] = option(
+        "1280 x 800, 2448 x 2048, or a fisheye.", default="wide"
+    )
+    board: Literal[
+        "charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"
+    ] = option("The board's pattern.", default="charuco")
+    second_board: bool = flag("A second board, a checkerboard, beside it.")
+    robot_sigma_mm: float = option(
+        "Repeatability of the robot (mm).", default=0.03, min=0.0, max=100.0
+    )
+    robot_sigma_mrad: float = option(
+        "Repeatability of its rotation (mrad).", default=0.05, min=0.0, max=100.0
+    )
+    arm_sigma_mm: float = option(
+        "Sigma of the errors of the arm's lengths (mm).", default=0.0, min=0.0, max=100.0
+    )
+    arm_sigma_mrad: float = option(
+        "Sigma of the errors of its angles (mrad).", default=0.0, min=0.0, max=100.0
+    )
+    wrong_views: int = option("Views whose reported pose is wrong.", default=0, min=0)
+    board_scale: float = option(
+        "Ratio of printed to stated size of the board.", default=1.0, min=0.5, max=2.0
+    )
+    with_intrinsics: bool = option(
+        "Whether the session states the camera's intrinsics.", default=True
+    )
+    images: bool = option(
+        "Whether to render images; pose pairs are written otherwise.", default=True
+    )
+    sweep: bool = option(
+        "A sweep without stops: pose pairs by one clock, the robot by another.", default=False
+    )
+    clock_offset_ms: float = option("With --sweep: lead of the camera's clock (ms).", default=37.0)
+    readout_ms: float = option(
+        "With --sweep: readout time from an image's first row to its last (ms); unless "
+        "0, the frames have corners (corners.csv) in place of poses.",
+        default=0.0,
+    )
+    warm_up: bool = option(
+        "A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures.",
+        default=False,
+    )
+    cell: str | None = option(
+        f"A whole cell: {', '.join(SIMULATED_CELLS)}, or a file that describes one.",
+        metavar="NAME|FILE.toml",
+    )
+    instrument: Instrument | None = option(
+        "A tracker that reads one point or three on the flange, or a probe; of a whole "
+        "cell on every flange."
+    )
+    torques: bool = flag(
+        "Streams of a moving arm's torques, without views; of a whole cell beside its views."
+    )
+    touches: bool = flag("Also touches of a tool and a fixture by every robot, in touches.csv ...")
+    currents: bool = option(
+        "Motor currents: with --warm-up for temperatures, with --torques for torques.",
+        default=False,
+    )
+    stiffness_knm: float | None = option(
+        "Stiffness of every joint (kN m/rad); rigid if left out.", min=0.1
+    )
+    payload_kg: list[float] | None = option(
+        "Payload of the arm (kg); repeated for stops in turn.", min=0.0
+    )
+    recording: int = option(
+        "Another recording of the same cell: fresh stops, for verify and locate.", default=0, min=0
+    )
+    camera_moved_mm: float = option(
+        "How far the camera was knocked (mm); the first.", default=0.0, min=0.0, max=100.0
+    )
+    seed: int = seed_option()
+    given: frozenset[str]  # Names of the fields that were typed.
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardOptions:
+    """Options that describe a board."""
+
+    kind: BoardKind | None = option("What to print.")
+    columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
+    rows: int | None = option("The same along y.")
+    square_mm: float | None = option(
+        "Side of a square, distance of rows of circles; left out: the largest."
+    )
+    marker_mm: float | None = option("Side of the markers of a ChArUco board.")
+    dictionary: str = option("As DICT_5X5_100, DICT_APRILTAG_36h11.", default="")
+    legacy: bool = flag("The ChArUco layout from before OpenCV 4.6.")
+    marker_id: int | None = option("Id of a single marker; an AprilGrid's first.", "--id")
+    size_mm: float | None = option("Side of a single marker or a tag; left out: the largest.")
+    spacing: float | None = option(
+        "White between an AprilGrid's tags, as a share of their side: 0.3."
+    )
+    border: int | None = option("Dark modules around their bits: 2, as Kalibr has it.")
+    diameter_mm: float | None = option("Diameter of circles.")
+    asymmetric: bool = flag("Every second row of circles is shifted by half.")
+    name: str = option("Name of a board described by options.", default="")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetMakeOptions:
+    """Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its NAME.toml.
+
+    Rulers along both axes show whether the printer kept the size. Exit status 0: all files are
+    written; 2: none, because the board does not fit or files are there already.
+    """
+
+    target: str | None = argument(
+        "A board that comes with visioncal, or the path of a .toml; or describe one by "
+        "--kind and the options after it.",
+        default=None,
+    )
+    out: Path = option("Folder for the files.", "-o", "--out", default=Path(), file_okay=False)
+    page: str | None = option(
+        "A5 to A0, letter, legal, tabloid, or a size as 500x300 (width x height, mm). "
+        "Left out: A4, or the smallest larger one for a board of given size."
+    )
+    landscape: bool | None = option("Left out: as the board fits.", "--landscape/--portrait")
+    dpi: float = option("Resolution of the PNG, in pixels per inch.", default=300.0)
+    board: BoardOptions
+    force: bool = flag("Replace files that are there.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetCheckOptions:
+    """Name the board in a photograph without further options, and print its description.
+
+    Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
+    """
+
+    image: Path = argument("A photograph of the board: png, jpg, tif, bmp or webp.")
+    square_mm: float | None = option(
+        "Measured side of a square; of a tag for an AprilGrid or a single one."
+    )
+    out: Path | None = option("Write the description here.", "-o", "--out")
+    as_json: bool = json_flag()
+    force: bool = flag("Replace a description that is there.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopOptions:
+    """What is planned."""
+
+    add: int | None = _what(
+        "How many stops to add to a recorded session, which counts.", min=1, max=500
+    )
+    purpose: str = _what(
+        "What they are for.", "--for", default="hand-eye", metavar="|".join(PURPOSES)
+    )
+    stops: int | None = _what(f"How many stops: {_USUAL_STOPS}.", min=1, max=500)
+    wish_mm: float | None = _what("Fewer stops where they predict this sigma, in mm.")
+    wish_deg: float | None = _what("The same of the rotation, in degrees.")
+    need_mm: float | None = _what(
+        "Fewer stops where they predict that 95 % of picks land within so many mm; up to "
+        f"{MOST_FOR_NEED} stops where no number is given."
+    )
+    need_deg: float | None = _what("The same of the rotation, in degrees.")
+    workspace: str | None = _what(
+        "Where the arm's accuracy matters: a box by its centre in the base and its "
+        "lengths, in mm; by default all of its reach.",
+        metavar="X,Y,Z:SX,SY,SZ",
+    )
+    start_joints: str | None = _what(
+        "The arm's present joint angles, in radians; without them the path to the first "
+        "stop is not checked.",
+        metavar="Q1,Q2,...",
+    )
+    candidates: int = _what("Number of candidate stops.", default=1500, min=12, max=20000)
+    seed: int = _what("Random seed of the candidate stops.", default=0, min=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanCellOptions:
+    """Options of the cell; None for those that were not given."""
+
+    robot: str | None = _cell("The robot, where a session names none.")
+    target: str | None = _cell(
+        "The board: a name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm."
+    )
+    camera: str | None = _cell(
+        "The lens: four numbers in pixels, a file of intrinsics, or an earlier calibration.",
+        metavar="FX,FY,CX,CY | FILE",
+    )
+    resolution: str | None = _cell("Size of the images in pixels.", metavar="W,H")
+    mount: Mount | None = _cell("Where the camera is.")
+    cam: str | None = _cell(
+        "Rough place of the camera on the flange (or in the base), in mm and degrees: "
+        "turned about the fixed axes x, then y, then z. It looks along its z.",
+        metavar="'X Y Z RX RY RZ'",
+    )
+    board: str | None = _cell(
+        "Rough place of the board in the base (or on the flange), in the same form. Its z "
+        "points into the paper: face up is '... 180 0 0'.",
+        metavar="'X Y Z RX RY RZ'",
+    )
+    guess_mm: float = _certainty(
+        "Sigma of both rough positions, per axis, in mm.", default=20.0, min=0.1, max=500.0
+    )
+    guess_deg: float = _certainty(
+        "The same of their rotations, in degrees.", default=5.0, min=0.01, max=45.0
+    )
+    noise_px: float | None = _certainty(
+        "Sigma of a corner in the image; by default 0.1, or as recorded."
+    )
+    noise_mm: float | None = _certainty(
+        "Sigma of the robot at a stop, per axis; by default 0.03, or as recorded."
+    )
+    noise_deg: float | None = _certainty(
+        "The same of its rotation; by default 0.003, or as recorded."
+    )
+
+    def options(self, *names: str) -> dict[str, object]:
+        """Some options by their names; None for those that were not given."""
+        return {f"--{name}": getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClearanceOptions:
+    """Clearances that the arm must keep in any motion."""
+
+    boxes: list[str] | None = kept_option(
+        "An obstacle, by its centre in the base and its lengths, in mm; may be repeated.",
+        "--box",
+        metavar="NAME:X,Y,Z:SX,SY,SZ",
+    )
+    floor: str = kept_option(
+        "Height of the floor or table in the base, in mm.", default="0", metavar="Z|none"
+    )
+    clearance_mm: float = kept_option(
+        "Distance of the arm from floor, board, boxes and itself.",
+        default=30.0,
+        min=0.0,
+        max=1000.0,
+    )
+    margin_deg: float = kept_option(
+        "Distance of the joints from their limits.", default=3.0, min=0.0, max=90.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightOptions:
+    """Conditions that the camera must keep."""
+
+    tilt_deg: float = kept_option(
+        "Largest angle between the line of sight and the board's normal.",
+        default=50.0,
+        min=5.0,
+        max=80.0,
+    )
+    edge_px: float = kept_option(
+        "Distance of the board from the image's edge.", default=20.0, min=0.0, max=10000.0
+    )
+    distance_mm: str | None = kept_option(
+        "Distance of the camera from the board; by default as the board fills the image.",
+        metavar="NEAR,FAR",
+    )
+    focus_mm: str | None = kept_option("Depths at which images are sharp.", metavar="NEAR,FAR")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """Propose the most informative robot stops, or those to add to a session.
+
+    Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
+    a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
+    """
+
+    source: str = argument(
+        "A robot (a built-in name, a .urdf or .toml), a session, or an output folder of calibrate."
+    )
+    wanted: StopOptions
+    words: PlanCellOptions
+    kept: ClearanceOptions
+    sight: SightOptions
+    out: Path = out_folder(default=Path("plan"))
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordCellOptions:
+    """The cell, where there is no plan."""
+
+    target: str | None = _record_cell(
+        "The board: a name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm."
+    )
+    robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
+    mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
+    pose_form: str | None = _record_cell(
+        "With a manual arm: how poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakingOptions:
+    """How views are taken."""
+
+    frames: int = _taking("Frames a view.", default=3, min=1, max=100)
+    keep: Keep = _taking("The sharpest of these, or their mean.", default="sharpest")
+    still_px: float = _taking(
+        "Image motion above which no view is taken.", default=Stillness.image_px, min=0.01, max=10.0
+    )
+    settle_s: float = _taking(
+        "How long arm and image must be still before a view.",
+        default=Stillness.quiet_s,
+        min=0.0,
+        max=30.0,
+    )
+    speed: float = _moving("Speed of the fastest joint, in rad/s; at most 1.5.", default=PLAN_SPEED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceOptions:
+    """Camera settings."""
+
+    resolution: str | None = _device("Size of the images in pixels.", metavar="W,H")
+    exposure_us: int | None = _device("Exposure time in microseconds.")
+    gain: int | None = _device("ISO, or the device's own unit.")
+    focus: int | None = _device("Lens position, in the device's own unit.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordOptions:
+    """Record a session: drive the stops of a plan, or follow an arm guided by hand.
+
+    Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
+    recording ended early, the arm stands still, and --resume continues it.
+    """
+
+    out: Path = option(
+        "The session's folder; a new one.",
+        "-o",
+        "--out",
+        default=REQUIRED,
+        metavar="SESSION",
+        file_okay=False,
+    )
+    arm: str = option(
+        "The arm: a UR by its address, or poses that you type from the pendant.",
+        default=REQUIRED,
+        metavar="ur:HOST|manual",
+    )
+    camera: str = option(
+        "The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
+        "camera's stream, or pictures that were taken already.",
+        default=REQUIRED,
+        metavar="oak|uvc:N|uvc:URL|folder:PATH",
+    )
+    described: RecordCellOptions
+    takes: TakingOptions
+    device: DeviceOptions
+    plan: Path | None = option("What visioncal plan wrote: a folder, or its plan.json.")
+    follow: bool = flag("Move nothing: take a view whenever the arm, guided by hand, rests.")
+    views: int = option("With --follow or a manual arm: end after this number.", default=0, min=0)
+    resume: bool = flag("Go on with a recording that was ended or cut off.")
+    dry_run: bool = flag("Only say what would be driven; nothing moves.")
+    yes: bool = yes_flag()
+    view: bool = view_flag()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotPoseOptions:
+    """Options for the convention of the robot's poses."""
+
+    robot_columns: str | None = _poses(
+        "Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
+        "--robot-columns",
+        "--robot-key",
+    )
+    robot_form: str | None = _poses(f"Their convention: {_FORMS}.")
+    robot_unit: str | None = _poses("Unit of their positions.", metavar=_UNITS)
+    robot_inverse: bool | None = _poses(
+        "They give the base in the flange.", "--robot-inverse/--robot-as-is"
+    )
+    joint_columns: str | None = _poses(
+        "Columns or keys of the joint angles.", "--joint-columns", "--joint-key"
+    )
+    joint_unit: Literal["rad", "deg"] = _poses("Unit of the joint angles.", default="rad")
+    robot_model: str | None = _poses("A built-in robot, or the path of a .urdf or .toml.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForeignOptions(RobotPoseOptions):
+    """Options for a foreign recording."""
+
+    form: str | None = _recording(f"Its format, by name: {', '.join(FOREIGN_NAMES)}.", "--from")
+    mount: CameraMount | None = _recording("Where the camera is.")
+    target: str | None = _recording(
+        "A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
+        "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm."
+    )
+    tip: str | None = _recording("The frame that the poses are of.")
+    camera_columns: str | None = _poses(
+        "Columns or keys of measured poses of the target: rvec,tvec.",
+        "--camera-columns",
+        "--camera-key",
+    )
+    camera_form: str | None = _poses("As --robot-form.")
+    camera_unit: str | None = _poses("Unit of their positions.", metavar=_UNITS)
+    camera_inverse: bool | None = _poses(
+        "They give the camera in the target.", "--camera-inverse/--camera-as-is"
+    )
+    camera_file: Path | None = _poses(
+        "A second file with the camera's poses; with times in both, the clocks' offset is found."
+    )
+    images: Path | None = _camera(
+        "The folder of the images; matched by name, by number, or in order."
+    )
+    image_column: str | None = _camera(
+        "The column or key that names each row's image.", "--image-column", "--image-key"
+    )
+    corners: Path | None = _camera(
+        "A file with the corners that another program found: mrcal's .vnl or another "
+        "table, OpenCV's image_points, or lists by image in JSON, YAML or .npz."
+    )
+    intrinsics: str | None = _camera(
+        "A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
+        "of the source."
+    )
+    resolution: str | None = _camera("WIDTH,HEIGHT that the intrinsics hold for.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions:
+    """Write a session as a folder or a recording, or make one of another program's.
+
+    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
+    nothing was written, and the message says what is missing or wrong.
+    """
+
+    source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
+    dest: Path = argument("An .rrd, or the folder to write.")
+    written: ForeignOptions
+    force: bool = force_flag()
+    guess: bool = _doubt("Try other readings of the poses, and ask.", "--guess", default=False)
+    yes: bool = _doubt("Take the best one where it stands out clearly.", "--yes", default=False)
+    mirror_poses: bool = _doubt(
+        "Mirror the robot's poses where its frame is left-handed.", "--mirror-poses", default=False
+    )
+    exchange: str | None = _doubt("Two views whose images are exchanged, by number: 8,17.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions:
+    """Say what is wrong with a session before it is calibrated, and what to type.
+
+    Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and
+    clocks, in seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2:
+    it cannot be read.
+    """
+
+    session: Path = session_argument()
+    as_json: bool = json_flag()
