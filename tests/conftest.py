@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from support.result_schema import faults_below
 
-from visioncal.live.drivers import ur, ur_net, ur_states
+from visioncal.live.drivers import ur, ur_net
 from visioncal.simulation import CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -57,7 +57,7 @@ def patient(monkeypatch) -> None:
         (ur_net, "_CONNECT_S"),
         (ur_net, "_ANSWER_S"),
         (ur_net, "_WAIT_S"),
-        (ur_states, "_SILENCE_S"),
+        (ur, "_SILENCE_S"),
     ):
         monkeypatch.setattr(module, name, 10.0)
     monkeypatch.setattr(ur_net.Dashboard.__init__, "__defaults__", (10.0,))

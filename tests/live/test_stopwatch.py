@@ -1,6 +1,6 @@
 """Time by which others are called silent, and how a stall of this computer is left out of it."""
 
-from visioncal.live.drivers.stopwatch import Stopwatch
+from visioncal.live.drivers.protocols import Stopwatch
 
 
 def test_what_a_stall_takes_is_left_out():

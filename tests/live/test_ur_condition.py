@@ -9,8 +9,13 @@ import pytest
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.drivers.ur_net import check_states_come, connect, read_tool_offset, resolve
-from visioncal.live.drivers.ur_status import read_condition
+from visioncal.live.drivers.ur_net import (
+    check_states_come,
+    connect,
+    read_condition,
+    read_tool_offset,
+    resolve,
+)
 from visioncal.live.simulated.controller import ControllerOptions, free_host, spawn
 
 OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))

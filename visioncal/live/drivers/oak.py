@@ -14,9 +14,7 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera
 from visioncal.live.drivers.extras import Handle, depthai
-from visioncal.live.drivers.oak_calibration import factory_intrinsics
-from visioncal.live.drivers.protocols import DeviceSetup, Frame
-from visioncal.live.drivers.stopwatch import Stopwatch
+from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 
 # The camera that every OAK has: the colour camera, or the only one.
 _SOCKET = "CAM_A"
@@ -55,11 +53,13 @@ class OakCamera:
             with _worded(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened)
                 self.name = f"{opened.getDeviceName()} {_SOCKET} ({sensor.sensorName})"
-                self.resolution = requested.resolution or _default_resolution(
-                    sensor.width, sensor.height
-                )
+                # The sensor's whole view that USB can carry, in even numbers of pixels.
+                parts = math.ceil(sensor.width / _WIDTH_PX)
+                whole = sensor.width // parts // 2 * 2, sensor.height // parts // 2 * 2
+                self.resolution = requested.resolution or whole
                 calibration = opened.readCalibrationOrDefault()
-                requested = _with_focus(requested, calibration, sensor)
+                if requested.focus is None and sensor.hasAutofocus:
+                    requested = replace(requested, focus=_calibrated_focus(calibration, sensor))
                 pipeline = dai.Pipeline(opened)
                 node = pipeline.create(dai.node.Camera).build(sensor.socket)
                 output = self._output(dai, node, requested, sensor)
@@ -155,7 +155,7 @@ class OakCamera:
     ) -> tuple[Camera | None, dict[str, str | float]]:
         """Factory intrinsics, with a setting that states their source or why they are not used."""
         try:
-            camera = factory_intrinsics(calibration, _SOCKET, self.resolution)
+            camera = _factory_intrinsics(calibration, _SOCKET, self.resolution)
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
         focus = _calibrated_focus(calibration, sensor)
@@ -189,19 +189,6 @@ def _sensor(device: Handle) -> Handle:
     return sensors[_SOCKET]
 
 
-def _default_resolution(width: int, height: int) -> tuple[int, int]:
-    """Resolution of the sensor's whole view that USB can carry, in even numbers of pixels."""
-    parts = math.ceil(width / _WIDTH_PX)
-    return width // parts // 2 * 2, height // parts // 2 * 2
-
-
-def _with_focus(requested: DeviceSetup, calibration: Handle, sensor: Handle) -> DeviceSetup:
-    """Adds the factory calibration's focus, unless another one is requested."""
-    if requested.focus is not None or not sensor.hasAutofocus:
-        return requested
-    return replace(requested, focus=_calibrated_focus(calibration, sensor))
-
-
 def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
     """Lens position of the factory calibration; None for a fixed lens."""
     if not sensor.hasAutofocus or not calibration.hasCameraCalibration(sensor.socket):
@@ -230,3 +217,53 @@ def _worded(dai: ModuleType, name: str, what: str = "gives no frames any more") 
 def _stop(pipeline: Handle) -> None:
     pipeline.stop()
     pipeline.wait()
+
+
+def _factory_intrinsics(handler: Handle, socket: str, resolution: tuple[int, int]) -> Camera:
+    """Reads a camera's intrinsics from a device's calibration.
+
+    Depthai's CalibrationHandler uses single precision, and one matrix per camera at one size of the
+    sensor, from which others follow by scaling to cover and cropping about the middle; distortion
+    is OpenCV's 14 coefficients, or the fisheye's 4.
+
+    Args:
+        handler: Its CalibrationHandler.
+        socket: The camera, such as `CAM_A`.
+        resolution: (width, height) of the pictures, scaled and cropped from the sensor's [px].
+
+    Raises:
+        DriverError: It has none of this camera, or its lens model is not supported.
+    """
+    dai = depthai()
+    board_socket = getattr(dai.CameraBoardSocket, socket)
+    try:
+        matrix = np.array(handler.getCameraIntrinsics(board_socket, *resolution), dtype=float)
+        coefficients = np.array(handler.getDistortionCoefficients(board_socket), dtype=float)
+        model = handler.getDistortionModel(board_socket)
+    except RuntimeError as error:
+        raise DriverError(
+            f"The device has no calibration of {socket}: {error}.",
+            culprits=[socket],
+            next_step="Leave the intrinsics out: they are then estimated from the images.",
+        ) from error
+    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    if model == dai.CameraModel.Fisheye:
+        return Camera("fisheye", resolution, intrinsics, coefficients[:4])
+    if model == dai.CameraModel.Perspective:
+        tail = coefficients[8:]
+        if np.any(tail != 0.0):
+            raise DriverError(
+                f"The device's lens {socket} has thin-prism or tilt coefficients up to "
+                f"{np.abs(tail).max():.3g}, which our model has not; zeros are needed.",
+                culprits=[socket],
+                next_step="Leave the intrinsics out: they are then estimated from the images.",
+            )
+        count = 8 if np.any(coefficients[5:8] != 0.0) else 5
+        padded = np.pad(coefficients, (0, max(8 - len(coefficients), 0)))
+        return Camera("brown", resolution, intrinsics, padded[:count])
+    raise DriverError(
+        f"The device's lens {socket} is of the model {model.name}; Perspective or Fisheye is "
+        "needed.",
+        culprits=[socket],
+        next_step="Leave the intrinsics out: they are then estimated from the images.",
+    )

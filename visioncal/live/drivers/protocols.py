@@ -1,11 +1,18 @@
-"""Interfaces of arms and cameras; the drivers know nothing of sessions or calibration."""
+"""Interfaces of arms and cameras, and their stopwatch.
 
-from collections.abc import Mapping
+The drivers know nothing of sessions or calibration.
+"""
+
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 from visioncal.core.types import Camera, FloatArray, Image
 
+# Most time that counts between two readings [s]: waiting callers read more often, and anything
+# longer is a stall of this computer.
+_LONGEST_S = 0.2
 # Whether the arm may move; `reduced` still moves, slowly.
 Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "fault"]
 
@@ -135,3 +142,26 @@ class DeviceSetup:
     exposure_us: int | None = None  # Exposure time [us].
     gain: int | None = None  # ISO, or in the device's own unit.
     focus: int | None = None  # Lens position in the device's own unit.
+
+
+class Stopwatch:
+    """Time since its start during which this program ran.
+
+    It is read repeatedly while waiting for a device. When a virtual machine pauses or a computer
+    swaps, all devices seem late at once, though none was silent.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self.restart()
+
+    def restart(self) -> None:
+        """Sets it to zero."""
+        self._read_s, self._sum_s = self._now(), 0.0
+
+    def read(self) -> float:
+        """Time since its start without stalls [s]."""
+        now = self._now()
+        self._sum_s += min(now - self._read_s, _LONGEST_S)
+        self._read_s = now
+        return self._sum_s

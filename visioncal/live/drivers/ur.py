@@ -1,10 +1,19 @@
-"""Arms of Universal Robots, through the client library ur-rtde."""
+"""Arms of Universal Robots, through the client library ur-rtde.
+
+Its control interface serves one call at a time and, if the controller falls silent, may not return
+for minutes. One thread owns it; callers wait no longer than their timeout.
+"""
 
 import ctypes
+import queue
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, wait
 from contextlib import suppress
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,21 +22,21 @@ from visioncal.core.errors import DriverError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.extras import client_library
-from visioncal.live.drivers.protocols import ArmState, JointSample
-from visioncal.live.drivers.stopwatch import Stopwatch
-from visioncal.live.drivers.ur_line import CallThread
+from visioncal.live.drivers.protocols import ArmState, JointSample, Safety, Stopwatch
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,
+    Condition,
     Dashboard,
     check_states_come,
     connect,
+    read_condition,
     read_tool_offset,
     resolve,
+    safety_of,
 )
-from visioncal.live.drivers.ur_states import StateStream
-from visioncal.live.drivers.ur_status import Condition, read_condition
 
 _EXTRA = "ur"
+# Fast compared with the arm's motion, at a small load of the computer.
 _RATE_HZ = 125.0
 # Timeout of a call [s]; it takes three or four states, 30 ms.
 _CALL_S = 0.9
@@ -46,6 +55,190 @@ _SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
 # State rates of CB3 and e-Series, by PolyScope's major version.
 _RATES_HZ = {3: 125.0, 5: 500.0}
+# Only names in the client's own table of variables: an unknown one would silently shift all that
+# follow.
+_VARIABLES = (
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "actual_current",
+    "actual_TCP_pose",
+    "joint_temperatures",
+    "robot_mode",
+    "runtime_state",
+    "robot_status_bits",
+    "safety_status_bits",
+)
+# Variables of newer controllers, and the first version, by major version.
+_PAYLOAD = ("payload", "payload_cog")
+_REPORTS_PAYLOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
+# Silence after which a controller, which sends every 8 ms, counts as lost [s].
+_SILENCE_S = 0.8
+_POLL_S = 0.0005
+# Time over which the shortest delay from the controller is taken [s]: clocks drift by less than a
+# millisecond in it.
+_DELAYS_S = 10.0
+T = TypeVar("T")
+# Python exceptions for the C++ ones that the library throws.
+_THROWN = (RuntimeError, ValueError)
+# Polling interval of waiting callers [s].
+_GLANCE_S = 0.05
+
+
+class CallThread:
+    """Worker thread that runs calls in order, and a periodic task [s] while there are none."""
+
+    def __init__(self, name: str, idle: Callable[[], None], every_s: float) -> None:
+        self._name = name
+        self._idle, self._every_s = idle, every_s
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        # A daemon: a call that never returns must not keep the program from ending.
+        threading.Thread(target=self._work, name=name, daemon=True).start()
+
+    def call(self, work: Callable[[], T], *, limit_s: float, what: str) -> T:
+        """Runs a call in the thread, with a timeout [s]; `what` it does is for messages.
+
+        Raises:
+            DriverError: It threw, or did not return in time.
+        """
+        future: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(work())
+            except _THROWN as error:
+                future.set_exception(error)
+
+        self._jobs.put(run)
+        waiting = Stopwatch()
+        try:
+            while not wait([future], _GLANCE_S).done:
+                if waiting.read() > limit_s:
+                    raise DriverError(
+                        f"{self._name} did not {what} within {limit_s:.1f} s.",
+                        culprits=[self._name],
+                        next_step="Look at the pendant and at the network cable.",
+                    )
+            return future.result()
+        except _THROWN as error:
+            raise DriverError(
+                f"{self._name} could not {what}: {error}.", culprits=[self._name]
+            ) from error
+
+    def end(self) -> None:
+        """Ends the thread after the queued calls."""
+        self._jobs.put(None)
+
+    def _work(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=self._every_s)
+            except queue.Empty:
+                self._idle()
+                continue
+            if job is None:
+                return
+            job()
+
+
+class StateStream:
+    """States of a controller in the order of arrival.
+
+    Args:
+        library: The module `rtde_receive`.
+        host: The controller's address.
+        version: PolyScope's version.
+        rate_hz: Requested states per second.
+    """
+
+    def __init__(
+        self,
+        library: ModuleType,
+        host: str,
+        version: tuple[int, int, int],
+        rate_hz: float = _RATE_HZ,
+    ) -> None:
+        self._host = host
+        self.reports_payload = version >= _REPORTS_PAYLOAD[version[0]]
+        names = [*_VARIABLES, *(_PAYLOAD if self.reports_payload else ())]
+        try:
+            self.client: Any = library.RTDEReceiveInterface(host, rate_hz, names)
+        except RuntimeError as error:
+            raise DriverError(
+                f"The states of the controller at {host} cannot be read: {error}.", culprits=[host]
+            ) from error
+        self._newest = self.client.getTimestamp()
+        self._silence = Stopwatch()
+        self._delays: deque[tuple[float, float]] = deque()
+
+    @property
+    def alive(self) -> bool:
+        """Whether states arrive."""
+        stamp = self.client.getTimestamp()
+        if stamp != self._newest:
+            self._newest = stamp
+            self._silence.restart()
+        return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
+
+    def check(self) -> None:
+        """Checks that states arrive.
+
+        Raises:
+            DriverError: None came for 0.8 s, or the connection is closed.
+        """
+        if self.alive:
+            return
+        how = (
+            f"it has sent nothing for {self._silence.read():.1f} s"
+            if self.client.isConnected()
+            else "it closed the connection"
+        )
+        raise DriverError(
+            f"The controller at {self._host} is lost: {how}.",
+            culprits=[self._host],
+            next_step="Look at the robot: it may be switched off, or its cable is out. Connect "
+            "again once the pendant has started.",
+        )
+
+    def wait(self) -> float:
+        """Waits for a state that is sent after the call.
+
+        Returns:
+            The controller's timestamp [s].
+
+        Raises:
+            DriverError: None arrives.
+        """
+        before = self.client.getTimestamp()
+        while (stamp := float(self.client.getTimestamp())) == before:
+            self.check()
+            time.sleep(_POLL_S)
+        now = time.monotonic()
+        self._newest = stamp
+        self._silence.restart()
+        self._delays.append((now, now - stamp))
+        while self._delays[0][0] < now - _DELAYS_S:
+            self._delays.popleft()
+        return stamp
+
+    def host_time(self, stamp: float) -> float:
+        """Converts a controller timestamp to the monotonic clock, by the shortest recent delay [s].
+
+        A state may be noticed late, but never early.
+        """
+        return stamp + min(delay for _, delay in self._delays)
+
+    @property
+    def safety(self) -> Safety:
+        """State of the safety system."""
+        return safety_of(int(self.client.getSafetyStatusBits()))
+
+    def disconnect(self) -> threading.Thread:
+        """Disconnects in a thread: a client whose controller is gone may not return at all."""
+        keep(self.client)
+        disconnecting = threading.Thread(target=self.client.disconnect, daemon=True)
+        disconnecting.start()
+        return disconnecting
 
 
 class UrArm:
@@ -106,7 +299,10 @@ class UrArm:
             stamp = self._states.wait()
             pose, q, dq = client.getActualTCPPose(), client.getActualQ(), client.getActualQd()
             currents, temperatures = client.getActualCurrent(), client.getJointTemperatures()
-            payload = self._payload()
+            payload_kg, payload_m = None, None
+            if self._states.reports_payload:
+                payload_kg = float(client.getPayload())
+                payload_m = np.array(client.getPayloadCog())
             safety = self._states.safety
             # Otherwise values of a newer state are among them.
             if client.getTimestamp() == stamp:
@@ -117,8 +313,8 @@ class UrArm:
             q=np.array(q),
             dq=np.array(dq),
             flange_from_tool=self._flange_from_tool,
-            payload_kg=payload[0],
-            payload_m=payload[1],
+            payload_kg=payload_kg,
+            payload_m=payload_m,
             currents_a=np.array(currents),
             temperatures_c=np.array(temperatures),
             safety=safety,
@@ -132,8 +328,23 @@ class UrArm:
                 refuses.
         """
         goal = np.asarray(q, dtype=float)
-        _check_goal(goal, speed, acceleration)
-        line = self._control_line()
+        if goal.shape != (6,) or not np.isfinite(goal).all():
+            raise DriverError(
+                f"A UR has six joints; a motion to {goal.tolist()} cannot be asked for."
+            )
+        if not (0.0 < speed <= _SPEED_LIMIT and 0.0 < acceleration <= _ACCELERATION_LIMIT):
+            raise DriverError(
+                f"A motion at {speed:g} rad/s and {acceleration:g} rad/s^2 cannot be asked for; "
+                f"more than 0 and at most {_SPEED_LIMIT} and {_ACCELERATION_LIMIT} are needed."
+            )
+        self._check_open()
+        line = self._line
+        if line is None:
+            raise DriverError(
+                f"The {self._name} is only watched; it cannot be moved from here.",
+                culprits=[self._name],
+                next_step="Move it by hand, or open it for moving.",
+            )
         self._states.check()
         self._check_safety()
         if not self._control.isProgramRunning():
@@ -200,11 +411,8 @@ class UrArm:
         if self._moves_before is not None:
             self.halt()
         self._closed = True
-        keep(self._states.client)
-        # Each disconnection sleeps for half a second, so they run in parallel; one whose controller
-        # is gone may not return at all.
-        disconnecting_states = threading.Thread(target=self._states.client.disconnect, daemon=True)
-        disconnecting_states.start()
+        # Each disconnection sleeps for half a second, so they run in parallel.
+        disconnecting_states = self._states.disconnect()
         ends_s = time.monotonic() + _CLOSE_S
         if self._line is not None:
             keep(self._control)
@@ -256,22 +464,6 @@ class UrArm:
             self._control.stopScript()
         self._control.disconnect()
 
-    def _payload(self) -> tuple[float | None, FloatArray | None]:
-        if not self._states.reports_payload:
-            return None, None
-        client = self._states.client
-        return float(client.getPayload()), np.array(client.getPayloadCog())
-
-    def _control_line(self) -> CallThread:
-        self._check_open()
-        if self._line is None:
-            raise DriverError(
-                f"The {self._name} is only watched; it cannot be moved from here.",
-                culprits=[self._name],
-                next_step="Move it by hand, or open it for moving.",
-            )
-        return self._line
-
     def _check_open(self) -> None:
         if self._closed:
             raise DriverError(f"The {self._name} was closed.", culprits=[self._name])
@@ -321,16 +513,6 @@ def keep(client: Any) -> None:  # noqa: ANN401
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
 
 
-def _check_goal(q: FloatArray, speed: float, acceleration: float) -> None:
-    if q.shape != (6,) or not np.isfinite(q).all():
-        raise DriverError(f"A UR has six joints; a motion to {q.tolist()} cannot be asked for.")
-    if not (0.0 < speed <= _SPEED_LIMIT and 0.0 < acceleration <= _ACCELERATION_LIMIT):
-        raise DriverError(
-            f"A motion at {speed:g} rad/s and {acceleration:g} rad/s^2 cannot be asked for; more "
-            f"than 0 and at most {_SPEED_LIMIT} and {_ACCELERATION_LIMIT} are needed."
-        )
-
-
 def _matrix(pose: list[float]) -> FloatArray:
     """Pose (4, 4) from x, y, z [m] and a rotation vector [rad]."""
     numbers = np.array(pose)
@@ -377,8 +559,4 @@ class UrMotion:
 
     def close(self) -> None:
         """Disconnects."""
-        keep(self._states.client)
-        # A client whose controller is gone may not return at all.
-        disconnecting = threading.Thread(target=self._states.client.disconnect, daemon=True)
-        disconnecting.start()
-        disconnecting.join(_CLOSE_S)
+        self._states.disconnect().join(_CLOSE_S)

@@ -1,4 +1,4 @@
-"""Plain connections to a UR controller, all with timeouts.
+"""Plain connections to a UR controller, all with timeouts, and its condition.
 
 The client library waits for a silent controller without a timeout, holding the interpreter lock.
 Its servers are therefore checked from here first: the dashboard, and the primary interface, whose
@@ -7,14 +7,17 @@ form; numbers are big-endian (Universal Robots, "Remote Control Via TCP/IP").
 """
 
 import queue
+import re
 import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import BinaryIO, Self
 
 from visioncal.core.errors import DriverError
+from visioncal.live.drivers.protocols import Safety
 
 DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
 # A controller in the same network answers within milliseconds.
@@ -32,6 +35,45 @@ _ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
 # Upper bound of a message's size.
 _MAX_BYTES = 1 << 20
+_VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)\.\d+")
+# Oldest versions with the floating-point registers that ur-rtde's control script needs.
+_LEAST = {3: (3, 4), 5: (5, 4)}
+# First version that reports whether it is in remote control.
+_REPORTS_REMOTE = (5, 6)
+_RUNNING = "RUNNING"
+# Models that exist in two series, of which the dashboard reports only the size.
+_MODELS_OF_TWO_SERIES = ("UR3", "UR5", "UR10", "UR16")
+# Modes in which joints report their positions.
+_REPORTING_MODES = (_RUNNING, "IDLE", "BACKDRIVE")
+_MODE_STEPS = {
+    "POWER_OFF": "Switch it on at the pendant: the circle at the lower left, then On and Start.",
+    "IDLE": "Release its brakes at the pendant: the circle at the lower left, then Start.",
+}
+_EMERGENCY = (
+    "Make sure that the cell is clear, pull out the emergency-stop button, and switch the arm on "
+    "at the pendant."
+)
+_PROTECTIVE = (
+    "Look what the arm touches or which limit it met, and free it; then press Enable Robot on the "
+    "pendant, which waits 5 s, and go on."
+)
+_SAFETY_STEPS = {
+    "PROTECTIVE_STOP": _PROTECTIVE,
+    "SAFEGUARD_STOP": "Close the safety gate, or leave the scanner's field, and reset it.",
+    "AUTOMATIC_MODE_SAFEGUARD_STOP": "Close the safety gate and reset it.",
+    "RECOVERY": "Move the arm back within its safety limits by hand, in recovery mode.",
+    "SYSTEM_EMERGENCY_STOP": _EMERGENCY,
+    "ROBOT_EMERGENCY_STOP": _EMERGENCY,
+    "SYSTEM_THREE_POSITION_ENABLING_STOP": "Hold the enabling switch, or go to automatic mode.",
+}
+_FAULT_STEP = "Read the pendant's log, and start the controller anew."
+# RTDE's `safety_status_bits`, the gravest first.
+_SAFETY_BITS: tuple[tuple[int, Safety], ...] = (
+    (1 << 8 | 1 << 9, "fault"),
+    (1 << 5 | 1 << 6 | 1 << 7, "emergency-stop"),
+    (1 << 2 | 1 << 3 | 1 << 4, "protective-stop"),
+    (1 << 1, "reduced"),
+)
 
 
 def resolve(host: str) -> str:
@@ -100,10 +142,18 @@ class Dashboard:
         self._socket.settimeout(answer_s)
         self._file = self._socket.makefile("rb")
         try:
-            self._check_banner(self._line())
+            banner = self._line()
         except DriverError:
             self.close()
             raise
+        if _BANNER not in banner:
+            self.close()
+            raise DriverError(
+                f"{self._label} greets with {banner[:60]!r}, not as a {_BANNER}: this is no UR "
+                "controller.",
+                culprits=[self._label],
+                next_step="Give the address that the robot's pendant shows.",
+            )
 
     def ask(self, line: str) -> str:
         """Sends a line and returns the answer.
@@ -127,15 +177,6 @@ class Dashboard:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _check_banner(self, banner: str) -> None:
-        if _BANNER not in banner:
-            raise DriverError(
-                f"{self._label} greets with {banner[:60]!r}, not as a {_BANNER}: this is no UR "
-                "controller.",
-                culprits=[self._label],
-                next_step="Give the address that the robot's pendant shows.",
-            )
 
     def _line(self) -> str:
         try:
@@ -200,47 +241,121 @@ def read_tool_offset(host: str) -> list[float]:
     Raises:
         DriverError: The controller cannot be reached, or does not report it.
     """
-    content = _package(host, _CARTESIAN, _TOOL.size, "its tool offset")
-    return list(_TOOL.unpack_from(content)[6:])
-
-
-def _package(host: str, kind: int, size: int, what: str) -> bytes:
-    for package_kind, content in _packages(host):
-        if package_kind == kind and len(content) >= size:
-            return content
+    ends_s = time.monotonic() + _WAIT_S
+    try:
+        link = connect(host, _PORTS[0], "the primary interface")
+    except DriverError:
+        link = connect(host, _PORTS[1], "the primary interface")
+    with link, link.makefile("rb") as file, suppress(OSError, struct.error):
+        while time.monotonic() < ends_s:
+            size, kind = _PRIMARY_HEADER.unpack(file.read(_PRIMARY_HEADER.size))
+            if not _PRIMARY_HEADER.size <= size <= _MAX_BYTES:
+                break
+            message, offset = file.read(size - _PRIMARY_HEADER.size), 0
+            while kind == _ROBOT_STATE and offset + _PRIMARY_HEADER.size <= len(message):
+                size, package = _PRIMARY_HEADER.unpack_from(message, offset)
+                start = offset + _PRIMARY_HEADER.size
+                if package == _CARTESIAN and size >= _PRIMARY_HEADER.size + _TOOL.size:
+                    return list(_TOOL.unpack_from(message, start)[6:])
+                offset += max(size, _PRIMARY_HEADER.size)
     raise DriverError(
-        f"The controller at {host} does not report {what} on its primary interface.",
+        f"The controller at {host} does not report its tool offset on its primary interface.",
         culprits=[host],
         next_step="It takes PolyScope 3.4 or newer; open the primary client interface under "
         "Settings > Security > Services.",
     )
 
 
-def _packages(host: str) -> Iterator[tuple[int, bytes]]:
-    """Packages of all robot states that arrive within the timeout."""
-    ends_s = time.monotonic() + _WAIT_S
-    try:
-        link = connect(host, _PORTS[0], "the primary interface")
-    except DriverError:
-        link = connect(host, _PORTS[1], "the primary interface")
-    with link, link.makefile("rb") as file:
-        try:
-            while time.monotonic() < ends_s:
-                size, kind = _PRIMARY_HEADER.unpack(file.read(_PRIMARY_HEADER.size))
-                if not _PRIMARY_HEADER.size <= size <= _MAX_BYTES:
-                    return
-                message = file.read(size - _PRIMARY_HEADER.size)
-                if kind == _ROBOT_STATE:
-                    yield from _split_packages(message)
-        except (OSError, struct.error):
-            return
+@dataclass(frozen=True)
+class Condition:
+    """The dashboard's answers."""
+
+    host: str
+    version: tuple[int, int, int]  # PolyScope's version: major, minor, bug fix.
+    model: str  # The arm's name, such as `UR10e`.
+    mode: str  # The robot's mode, such as `RUNNING`.
+    safety: str  # The state of the safety system, such as `NORMAL`.
+    remote: bool  # Whether it is in remote control; True where it does not report it.
+
+    def check_moves(self) -> None:
+        """Checks that it can be moved from outside.
+
+        Raises:
+            DriverError: It cannot, with the remedy.
+        """
+        if self.safety not in ("NORMAL", "REDUCED"):
+            raise self._refuse(
+                f"is stopped by its safety system: {self.safety}",
+                _SAFETY_STEPS.get(self.safety, _FAULT_STEP),
+            )
+        self.check_reports()
+        if self.mode != _RUNNING:
+            raise self._refuse(f"is not ready to move: its mode is {self.mode}")
+        if not self.remote:
+            raise self._refuse(
+                "is in local control, and takes no orders from here",
+                "Switch it to Remote Control at the upper right of the pendant; the mode is there "
+                "once it is enabled under Settings > System > Remote Control.",
+            )
+
+    def check_reports(self) -> None:
+        """Checks that it reports its joint positions.
+
+        Raises:
+            DriverError: It does not, with the remedy.
+        """
+        if self.mode not in _REPORTING_MODES:
+            raise self._refuse(f"does not know where its joints are: its mode is {self.mode}")
+
+    def _refuse(self, why: str, step: str = "") -> DriverError:
+        mode_step = _MODE_STEPS.get(self.mode, "Look at the pendant, and switch the arm on there.")
+        return DriverError(
+            f"The {self.model} at {self.host} {why}.",
+            culprits=[self.host],
+            next_step=step or mode_step,
+        )
 
 
-def _split_packages(message: bytes) -> Iterator[tuple[int, bytes]]:
-    offset = 0
-    while offset + _PRIMARY_HEADER.size <= len(message):
-        size, kind = _PRIMARY_HEADER.unpack_from(message, offset)
-        if size < _PRIMARY_HEADER.size:
-            return
-        yield kind, message[offset + _PRIMARY_HEADER.size : offset + size]
-        offset += size
+def read_condition(host: str) -> Condition:
+    """Reads the condition from the dashboard.
+
+    Raises:
+        DriverError: It cannot be reached, is not a UR's, or is too old.
+    """
+    with Dashboard(host) as dashboard:
+        version = _read_version(host, dashboard.ask("PolyscopeVersion"))
+        model = dashboard.ask("get robot model")
+        mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
+        query = "safetystatus" if version >= (5, 4, 0) else "safetymode"
+        safety = dashboard.ask(query).rpartition(":")[2].strip()
+        remote = (
+            version < _REPORTS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
+        )
+    series = "e" if version[0] == 5 and model in _MODELS_OF_TWO_SERIES else ""
+    return Condition(host, version, f"{model}{series}", mode, safety, remote)
+
+
+def safety_of(bits: int) -> Safety:
+    """Reads RTDE's `safety_status_bits`."""
+    return next((safety for mask, safety in _SAFETY_BITS if bits & mask), "normal")
+
+
+def _read_version(host: str, text: str) -> tuple[int, int, int]:
+    match = _VERSION.search(text)
+    version = tuple(map(int, match.groups())) if match else ()
+    if len(version) != 3:
+        raise DriverError(
+            f"The controller at {host} answers {text[:60]!r} when asked for its version; four "
+            "numbers are needed, as in URSoftware 5.11.0.108249.",
+            culprits=[host],
+            next_step="Check that the address is a UR's with PolyScope 3 or 5.",
+        )
+    major, minor, patch = version
+    if major not in _LEAST or (major, minor) < _LEAST[major]:
+        raise DriverError(
+            f"The controller at {host} has PolyScope {major}.{minor}.{patch}; ur-rtde needs 3.4 or "
+            "newer on the CB-series, and 5.4 or newer on the e-Series.",
+            culprits=[host],
+            next_step="Update PolyScope, or type poses by hand with the manual arm.",
+        )
+    return major, minor, patch

@@ -15,8 +15,7 @@ import numpy as np
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, Image
-from visioncal.live.drivers.protocols import DeviceSetup, Frame
-from visioncal.live.drivers.stopwatch import Stopwatch
+from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 from visioncal.vision.finders.imaging import decode_image
 
 # Timeout of the first picture [s]; of opening a stream, and of a picture of it [ms].
