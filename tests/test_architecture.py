@@ -111,7 +111,7 @@ def test_heavy_libraries_enter_in_one_place():
     [
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
-            "visioncal.present.report, visioncal.present.recording, visioncal.cli.record",
+            "visioncal.present.report.page, visioncal.present.recording, visioncal.cli.record",
             {"depthai", "rtde_control", "rtde_receive"},
         ),
         # A calibration waits for no plots, and for nothing that few sessions need.
@@ -126,8 +126,14 @@ def test_heavy_libraries_enter_in_one_place():
         # Calibrating a session drives no robot, and simulates none.
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
-            "visioncal.present.report, visioncal.present.recording, visioncal.cli.summary",
+            "visioncal.present.report.page, visioncal.present.recording, visioncal.cli.summary",
             {"visioncal.dynamics", "visioncal.live", "visioncal.simulation"},
+        ),
+        # A finished batch starts no solver, and draws nothing.
+        (
+            "visioncal.interchange.batch, visioncal.present.report.fleet, visioncal.cli.batch",
+            {"matplotlib", "rerun", "scipy.optimize", "scipy.sparse.csgraph", "distributed"}
+            | {"visioncal.calibration.pipeline", "visioncal.calibration.stages"},
         ),
         # A report by itself waits for no library of recordings.
         ("visioncal.interchange.outputs, visioncal.present.report.page", {"rerun", "pyarrow"}),

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from visioncal.interchange.exports import export
     from visioncal.interchange.formats import convert
     from visioncal.live.planning.plan import make_plan
-    from visioncal.present.report import write_report
     from visioncal.present.report.drawing import Drawing
+    from visioncal.present.report.page import write_report
     from visioncal.results import Calibration, Verdict
     from visioncal.results.compare import compare
     from visioncal.results.compensation import CalibratedArm, Corrected, correct
@@ -92,7 +92,7 @@ _HOMES = {
     "touched_fixture": "visioncal.frames.fixture",
     "touched_tool": "visioncal.frames.tcp",
     "verify": "visioncal.calibration.verification",
-    "write_report": "visioncal.present.report",
+    "write_report": "visioncal.present.report.page",
     "write_session": "visioncal.simulation",
 }
 

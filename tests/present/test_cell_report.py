@@ -8,9 +8,8 @@ from support.aligned_cells import made_up_cell, with_cell
 
 from visioncal.core.number_format import significant
 from visioncal.present.network_layout import pairs, weakest_frame
-from visioncal.present.report import write_report
 from visioncal.present.report.network import known_in_each_other
-from visioncal.present.report.page import render
+from visioncal.present.report.page import render, write_report
 from visioncal.results import Calibration, Moved, RobotResult, UnconnectedFrame, ViewResult
 from visioncal.results.arm import ArmLevel, ArmResult
 

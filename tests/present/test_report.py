@@ -25,8 +25,7 @@ from visioncal.present.advice import suspects
 from visioncal.present.placements import placement
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
-from visioncal.present.report import write_report
-from visioncal.present.report.page import render
+from visioncal.present.report.page import render, write_report
 from visioncal.present.report.thumbnails import thumbnail
 from visioncal.results import (
     Calibration,

@@ -85,7 +85,7 @@ def write_outputs(
     def report(path: Path) -> None:
         # Plots and the recording's codec take half a second to import, which --help need not wait
         # for.
-        from visioncal.present.report import write_report
+        from visioncal.present.report.page import write_report
 
         kept = session is not None and RECORDING not in without
         review = review_command(folder / RECORDING) if kept else ""

@@ -268,7 +268,7 @@ def _pool(count: int) -> Iterator[Executor]:
         # inherits the caller's threads and locks.
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(
-            [work.__module__, "visioncal.calibration.pipeline", "visioncal.present.report"]
+            [work.__module__, "visioncal.calibration.pipeline", "visioncal.present.report.page"]
         )
     else:
         context = multiprocessing.get_context("spawn")

@@ -16,7 +16,7 @@ _MOST_NAMED = 6
 def fleet_page(rows: Sequence[FleetRow]) -> str:
     """Renders the page as HTML text, with links relative to its folder; worst sessions first."""
     states = Counter(row.verdict or row.state for row in rows)
-    return template("fleet.html.j2").render(
+    return template("fleet.html.j2", has_result=False).render(
         kind="Batch",
         name=f"{len(rows)} sessions",
         subtitle="",

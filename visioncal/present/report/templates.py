@@ -8,15 +8,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
-from visioncal.present import advice, arms, details, facts, result_parts, torques
-from visioncal.present.report import armplots, content, network, plots, sources
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
-# Modules whose functions the templates call.
-_CALLED = (
-    *(result_parts, facts, arms, details, torques, advice),
-    *(content, network, plots, armplots, sources),
-)
 
 
 @cache
@@ -26,13 +19,16 @@ def _software() -> str:
     return f"visioncal {__version__}, Python {platform.python_version()}{versions}"
 
 
-def template(name: str) -> Template:
-    """A template by name, in which undefined variables are errors."""
-    return _environment().get_template(name)
+def template(name: str, *, has_result: bool = True) -> Template:
+    """A template by name, in which undefined variables are errors.
+
+    One of a result may call all functions that describe and draw results.
+    """
+    return _environment(has_result=has_result).get_template(name)
 
 
 @cache
-def _environment() -> Environment:
+def _environment(*, has_result: bool) -> Environment:
     # Cached, as compiling the templates takes longer than rendering a page.
     environment = Environment(
         loader=PackageLoader("visioncal", "present/report"),
@@ -42,11 +38,21 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["significant"] = significant
-    functions = {
+    environment.globals |= {"software": _software, "version": __version__}
+    if not has_result:
+        return environment
+    # Imported late: a page without figures does not wait for matplotlib.
+    from visioncal.present import advice, arms, details, facts, result_parts, torques
+    from visioncal.present.report import armplots, content, network, plots, sources
+
+    called = (
+        *(result_parts, facts, arms, details, torques, advice),
+        *(content, network, plots, armplots, sources),
+    )
+    environment.globals |= {
         name: var
-        for module in _CALLED
+        for module in called
         for name, var in vars(module).items()
         if getattr(var, "__module__", "") == module.__name__
     }
-    environment.globals |= functions | {"software": _software, "version": __version__}
     return environment
