@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
 
@@ -43,15 +42,6 @@ def first(rows: Sequence[_Any], count: int = 1) -> list[_Any]:
 def wished(usual: int, quick: int = 1, place: int = 0) -> int:
     """Reads how many seeds or worlds are wished from the words on the command line."""
     return int(WORDS[place]) if place < len(WORDS) else few(usual, quick)
-
-
-def need(package: str, how: str) -> None:
-    """Ends where a package is missing that only this benchmark needs; no error with `--quick`."""
-    if find_spec(package) is None:
-        words = f"{package} is not installed: pip install {how}"
-        if QUICK:
-            print(f"left out: {words}")
-        sys.exit(None if QUICK else words)
 
 
 def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> None:

@@ -4,6 +4,7 @@ import shlex
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
+from itertools import cycle
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from support.commands import visioncal as visioncal_command
 from support.fuzz.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
+from support.marks import slow
 
 import visioncal
 from visioncal.calibration.guess import guess_reading
@@ -62,7 +64,8 @@ def test_a_planted_mistake_is_named(name, mount):
 
 def test_rows_in_reverse_or_sorted_as_text_are_named():
     poses, named = cell_poses("eye-in-hand"), set()
-    for seed in range(24):
+    # The first seeds of each of five orders.
+    for seed in (0, 1, 2, 11, 12):
         planted = MISTAKES["rows in another order"](poses, np.random.default_rng(seed))
         guess = guessed(planted)
         assert is_named(guess, planted), guess.sentence
@@ -70,10 +73,16 @@ def test_rows_in_reverse_or_sorted_as_text_are_named():
     assert len(named) == 5
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("is_measured", [True, False])
 @pytest.mark.parametrize(
-    "name", ["", "inverse poses", "another unit", "rows shifted by one", "matrices transposed"]
+    ("name", "is_measured", "mount"),
+    [
+        ("", True, "eye-in-hand"),
+        ("", False, "eye-to-hand"),
+        ("inverse poses", True, "eye-to-hand"),
+        ("another unit", False, "eye-in-hand"),
+        ("rows shifted by one", True, "eye-in-hand"),
+        ("matrices transposed", False, "eye-to-hand"),
+    ],
 )
 def test_a_mount_that_is_not_given_is_that_of_the_likelier_cell(name, is_measured, mount):
     poses = cell_poses(mount)
@@ -185,8 +194,7 @@ SOUND = {
 }
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("world", SOUND)
+@pytest.mark.parametrize(("world", "mount"), zip(SOUND, cycle(MOUNTS)))
 def test_sound_poses_are_not_accused(world, mount):
     poses = seen_in(simulate(replace(CellOptions(mount=mount, views=12), **SOUND[world])))
     for is_measured in (True, False):
@@ -312,7 +320,8 @@ def pairs_session(poses):
 
 
 @pytest.mark.parametrize(
-    "name", ["board's size in mm", "two rows exchanged", "inverse poses", "the other mount"]
+    "name",
+    ["board's size in mm", slow("two rows exchanged"), slow("inverse poses"), "the other mount"],
 )
 def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
     planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))

@@ -71,7 +71,7 @@ def test_an_unknown_instrument_is_refused(arguments, words):
 def test_errors_follow_their_covariance_and_reach_their_bound(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
     by_sigma, by_bound = [], []
-    for seed in range(20):
+    for seed in range(10):
         shop = tracked(replace(options, seed=seed))
         known = solved_of(session_of(shop))
         error, covariance = (
@@ -80,8 +80,8 @@ def test_errors_follow_their_covariance_and_reach_their_bound(options):
         )
         by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
         by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
-    # The mean of 20 chi-squares of 9 or 12 degrees of freedom over these has a sigma of 0.1.
-    assert np.mean(by_sigma) == pytest.approx(1.0, abs=0.3)
+    # The mean of 10 chi-squares of 9 or 12 degrees of freedom over these has a sigma of 0.14.
+    assert np.mean(by_sigma) == pytest.approx(1.0, abs=0.42)
     assert np.sqrt(np.mean(by_bound)) < 1.1
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.marks import slow
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
@@ -37,7 +38,7 @@ def cell_with(camera, seed, **changes):
 
 @pytest.mark.parametrize(
     ("camera", "model"),
-    [(wide_camera(), "brown"), (RATIONAL, "brown"), (fisheye_camera(), "fisheye")],
+    [(wide_camera(), "brown"), slow(RATIONAL, "brown"), (fisheye_camera(), "fisheye")],
     ids=["brown 5", "brown 8", "fisheye"],
 )
 def test_errors_follow_the_stated_covariance(camera, model, monkeypatch):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, error_of, known_of
+from support.marks import slow
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.run_state import RunState
@@ -65,9 +66,7 @@ def run(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunState:
     return known
 
 
-@pytest.mark.parametrize(
-    "name", ["flange_from_cam", "flange_from_cam_hand", "flange_a_from_cam_hand"]
-)
+@pytest.mark.parametrize("name", ["flange_from_cam_hand", "flange_a_from_cam_hand"])
 def test_the_one_camera_and_robot_may_have_names(name):
     plain = calibrate(scara(0, {"flange_from_cam": PRIOR}))
     session = scara(0, {name: PRIOR})
@@ -86,7 +85,7 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
         calibrate(scara(0, {}))
     assert "measure that offset for [prior.flange_from_cam]" in refused.value.next_step
     squares = []
-    for seed in range(10):
+    for seed in range(5):
         wrong = SIGMA_M * np.random.default_rng(100 + seed).standard_normal()
         prior = {"z_m": float(X[2, 3] + wrong), "sigma_m": SIGMA_M}
         found = calibrate(scara(seed, {"flange_from_cam": prior}))
@@ -103,8 +102,9 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
         height = X[2, :3] @ covariance[3:, 3:] @ X[2, :3]
         assert np.sqrt(height) == pytest.approx(SIGMA_M, rel=0.05)
         squares.append(off @ np.linalg.solve(covariance, off))
-    # Sixty squares: a mean of 1 to within 0.18; the noise is itself estimated from each session.
-    assert 0.6 < np.mean(squares) / 6.0 < 1.6
+    # Thirty squares, beyond which chance leaves one in a thousand on either side; the noise is
+    # itself estimated from each session, to a tenth.
+    assert 0.35 < np.mean(squares) / 6.0 < 2.2
 
 
 def test_a_board_of_several_may_be_known_whole():
@@ -224,8 +224,9 @@ def test_a_plan_counts_what_was_measured():
     assert np.sqrt(np.diag(covariance)[3:6]).max() < 1.05 * SIGMA_M
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("scale", [1.0, 1.01, 0.995])
+@pytest.mark.parametrize(
+    ("scale", "mount"), [(1.0, "eye-in-hand"), (1.01, "eye-to-hand"), (0.995, "eye-in-hand")]
+)
 def test_measured_distances_of_another_scale_are_named(mount, scale):
     cell = simulate(CellOptions(mount=mount, views=16, board_scale=scale, seed=2))
     verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
@@ -241,7 +242,7 @@ def test_measured_distances_of_another_scale_are_named(mount, scale):
     assert factor == pytest.approx(scale, abs=4e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, slow(2), slow(3)])
 def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
     verdict = calibrate(cell_session(simulate(arm), "measured", seen="poses")).verdict

@@ -99,6 +99,7 @@ def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     assert 1e3 * np.linalg.norm(away) < 3 * result.edges["flange_from_cam"].sigma_mm
 
 
+@pytest.mark.slow
 def test_an_arm_that_errs_by_posture_does_not_overrule_a_stated_board(real_data):
     # Its motion would have the board 4.5 % smaller; beside such errors that is known to 2.3 %.
     result = visioncal.calibrate(real_data / "sessions/kuka_checkerboard_in_hand")

@@ -240,10 +240,9 @@ def test_what_joints_cannot_be_is_refused(late):
         reread(foreign, replace(best, hypothesis=inverse))
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_the_mount_of_samples_that_do_not_say_it(tmp_path, mount, seed):
-    options = CellOptions(mount=mount, views=12, seed=seed)
+def test_the_mount_of_samples_that_do_not_say_it(tmp_path, mount):
+    options = CellOptions(mount=mount, views=12)
     sound = Session.load(write_session(simulate(options), tmp_path / "cell", images=False))
     robot, camera = (
         np.array([getattr(view, name)().as_matrix() for view in sound.views])

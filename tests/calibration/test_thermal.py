@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from support.commands import visioncal as run
 from support.drawn import column
+from support.marks import slow
 from support.pages import Page
 from support.warmed import CELL, drift_of, warmed
 
@@ -375,7 +376,7 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
     assert "looks like kelvin" in refused.err
 
 
-@pytest.mark.parametrize("points", [THREE[:1], THREE])
+@pytest.mark.parametrize("points", [THREE[:1], slow(THREE)])
 def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth

@@ -25,14 +25,6 @@ def test_noise_that_chance_makes_of_a_good_arms_is_no_doubt():
     assert judge(changed(SOUND, **loud, lower_bounds=(0.05, 0.021))).status == "check"
 
 
-def test_sound_findings_are_good_and_say_how_good():
-    verdict = judge(SOUND)
-    assert verdict.status == "good"
-    assert len(verdict.reasons) == 1
-    assert "All 20 used views agree" in verdict.reasons[0]
-    assert "0.11 mm" in verdict.reasons[0]
-
-
 @pytest.mark.parametrize(
     ("changes", "status", "words"),
     [

@@ -68,11 +68,11 @@ def place(request):
 
 def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     rng = np.random.default_rng(0)
-    found = [checked(place, rng) for _ in range(8)]
+    found = [checked(place, rng) for _ in range(4)]
     assert all(value.passed and not value.named for value in found)
-    # Chi-square of thirty directions; the mean of eight is known to 2.7, and the noise's scale to
+    # Chi-square of thirty directions; the mean of four is known to 3.9, and the noise's scale to
     # a tenth, which is three more.
-    assert np.mean([value.misfit for value in found]) == pytest.approx(30.0, abs=12.0)
+    assert np.mean([value.misfit for value in found]) == pytest.approx(30.0, abs=15.0)
 
 
 def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
@@ -236,7 +236,7 @@ def test_a_bent_arm_under_its_loads_is_no_change(weighed):
 
 
 def test_one_of_two_boards_that_moved_is_named():
-    cell = simulate(replace(ANYHOW, second=Second(turn_rad=0.6, tilt_rad=0.2), views=40, seed=2))
+    cell = simulate(replace(ANYHOW, second=Second(turn_rad=0.6, tilt_rad=0.2), views=24, seed=2))
     calibration = result_of(calibrated(cell))
     prior_calibration = CalibrationPrior.of(calibration)
     assert len(prior_calibration.boards) == 2
@@ -247,7 +247,7 @@ def test_one_of_two_boards_that_moved_is_named():
     assert shown.max() == 1
     moved = predict_detected(known, prior_calibration)
     # Some stops show both.
-    assert len(moved.problem) > moved.stops == 40
+    assert len(moved.problem) > moved.stops == 24
     mine = np.array([shown[views[0]] for views in moved.views]) == 1
     seen = moved.problem.observations
     measured = np.where(mine[:, None, None], seen.measured @ exp(pushed), seen.measured)

@@ -120,7 +120,7 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
     stated = {0.0: [], 3e-4: []}
     errors_sq = []
     for bow_m, sigmas_sq in stated.items():
-        for seed in range(4):
+        for seed in range(2):
             options = replace(FINE, state_intrinsics=given, seed=seed, board_bow_m=bow_m)
             known = calibrated(simulate(options))
             assert any("not flat" in warning.reason for warning in known.warnings) == (bow_m > 0.0)
@@ -183,9 +183,15 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("scale", [0.97, 1.01])
-@pytest.mark.parametrize("joints", [True, False])
+@pytest.mark.parametrize(
+    ("joints", "scale", "mount"),
+    [
+        (True, 0.97, "eye-to-hand"),
+        (True, 1.01, "eye-in-hand"),
+        (False, 0.97, "eye-in-hand"),
+        (False, 1.01, "eye-to-hand"),
+    ],
+)
 def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scale, joints):
     """As after printing with `fit to page`: the robot's measure is all that is left."""
     cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=scale))

@@ -52,7 +52,7 @@ def of_fit(test, result):
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_creeping_base_is_noticed_and_its_way_told(mount):
-    for seed in range(4):
+    for seed in range(2):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         result, _ = answered(cell)
         assert of_fit(drift, result) is None
@@ -81,7 +81,7 @@ def test_a_bump_is_told_from_a_creep(mount):
 def test_a_bump_is_in_the_covariance(mount):
     """The answer is between both places, and as far from each as it says."""
     squares = []
-    for seed in range(4):
+    for seed in range(2):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         on_flange = next(
             transform for name, transform in cell.transforms.items() if name.startswith("flange")
@@ -259,7 +259,7 @@ def test_few_corners_say_nothing_of_a_field():
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
     squared, away, without, named = [], [], [], 0
-    for seed in range(6):
+    for seed in range(3):
         cell = simulate(replace(FINE, mount=mount, seed=seed, robot_sigma_m=1e-5))
         cell = through_a_wavy_lens(cell, 0.25, np.random.default_rng(seed))
         known = calibrated(cell, joints=False)
@@ -269,12 +269,12 @@ def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(refine, "estimate_levels", lambda *_: LensLevels())
             without.append(error_of(cell, calibrated(cell, joints=False))[3:6])
-    # 18 components: a mean squared error over the covariance of 2.5 is one in a thousand.
-    assert np.mean(squared) / 3 < 2.5
+    # 9 components: a mean squared error over the covariance of 3.1 is one in a thousand.
+    assert np.mean(squared) / 3 < 3.1
     # What the field explains is not left to the place: a third of the error without it (0.3).
     assert np.sum(np.square(away)) < 0.25 * np.sum(np.square(without))
     # A field of 2.5 times the noise; a board that fills a part of the image shows a part of it.
-    assert named >= 4
+    assert named >= 2
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])

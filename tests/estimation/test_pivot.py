@@ -52,7 +52,7 @@ def test_exact_touches_give_the_exact_tool(job):
 
 def test_three_touches_that_agree_by_chance_are_not_believed():
     squares = []
-    for seed in range(100):
+    for seed in range(40):
         fit = fit_pivot(touched(Job(tips=3), seed).touches)
         error = fit.flange_from_tool[:3, 3] - TIP
         squares.append(error @ np.linalg.solve(fit.covariance[3:, 3:], error))
@@ -116,7 +116,7 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
 )
 def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
     squared, errors, least = [], [], []
-    for seed in range(60):
+    for seed in range(30):
         made = touched(job, seed)
         fit = fit_pivot(made.touches, job.noise)
         free = np.arange(0 if job.axes else 3, 6)
@@ -130,9 +130,9 @@ def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
     size = len(free)
     # An F distribution over 24 degrees of freedom or more: 9 % over its size on average, and its
     # standard deviation is at most 1.2 sqrt(2 size); four standard errors of the mean.
-    assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 60)
-    # The mean of 60 squared errors of three components: 11 % standard error, taken four times.
-    assert abs(np.mean(errors) / np.mean(least) - 1) < 0.45
+    assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 30)
+    # The mean of 30 squared errors of three components: 15 % standard error, taken four times.
+    assert abs(np.mean(errors) / np.mean(least) - 1) < 0.6
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -189,10 +189,10 @@ def test_two_touches_that_contradict_each_other_grossly_are_refused_by_name():
 def test_sound_touches_are_kept():
     lost = [
         seed
-        for seed in range(40)
+        for seed in range(20)
         if not fit_pivot(touched(Job(), seed).touches).agreement.mask.all()
     ]
-    # One in a thousand loses one by design: more than one of 40 has a probability of 8e-4.
+    # One in a thousand loses one by design: more than one of 20 has a probability of 2e-4.
     assert len(lost) <= 1
 
 

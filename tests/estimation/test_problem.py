@@ -191,7 +191,7 @@ def test_repeats_share_errors_that_a_step_does_not_pass_for():
 def test_steps_are_as_likely_as_their_evidence_says():
     """Half of the cells have one, of the sizes that steps have; robots hide the smallest."""
     frame, found = "target_b", []
-    for seed in range(90):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         cell = replace(world(rng, 14), robot_sigmas={"a": (1e-3, 1e-3), "b": (1e-3, 1e-3)})
         steps = rng.random() < 0.5
@@ -209,7 +209,7 @@ def test_steps_are_as_likely_as_their_evidence_says():
     assert 1.0 < spread < 4.0
     assert abs(np.sum(stepped - likely)) < 3.0 * spread
     assert stepped[likely > 0.99].all()
-    assert np.sum(likely > 0.99) > 25
+    assert np.sum(likely > 0.99) > 16
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():

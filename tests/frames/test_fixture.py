@@ -122,7 +122,7 @@ def test_the_error_over_its_sigma_is_as_it_should_be(features):
     kinds = KINDS * 2 if features else ("",) * len(local)
     known = {"robot_rotation_deg": np.rad2deg(noise.robots[0, 0]), "robot_translation_mm": 0.03}
     calibration = replace(made_up(5).calibration, noise=known)
-    for seed in range(100):
+    for seed in range(50):
         rng = np.random.default_rng(seed)
         off = made.FLANGE_FROM_TOOL[:3, :3] @ TIP_SIGMA @ rng.normal(size=3)
         poses = touching(local, rng, NOISE_M, TIP + off)
@@ -137,8 +137,8 @@ def test_the_error_over_its_sigma_is_as_it_should_be(features):
         error = away(frame.edge.matrix, FRAME)
         squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
     # Six, a little more since the noise's level is estimated from some 20 residuals; the mean of
-    # 100 has a standard deviation of 0.4.
-    assert 5.0 < np.mean(squares) < 7.8
+    # 50 has a standard deviation of 0.5.
+    assert 4.6 < np.mean(squares) < 8.2
 
 
 def test_touches_that_scatter_by_the_tip_are_not_called_wrong():
@@ -190,7 +190,7 @@ def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
 
 def test_three_drawn_points_that_agree_by_chance_are_not_believed():
     squares = []
-    for seed in range(100):
+    for seed in range(40):
         frame = drawn(CAD_MM[:3], NAMES[:3], seed=seed)
         error = away(frame.edge.matrix, FRAME)
         squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
@@ -410,14 +410,6 @@ def test_the_fixture_goes_into_a_file_beside_the_tool(tmp_path, tool_file):
     assert fixture(tmp_path, tool_file, "-o", tool_file, "--name=jig", "--force").status == 0
 
 
-def test_json_is_the_frame(tmp_path, tool_file):
-    done = fixture(tmp_path, tool_file, "--json")
-    document = json.loads(done.out)["base_from_fixture"]
-    assert done.status == 0
-    assert document["verdict"]["status"] == "good"
-    assert np.abs(np.array(document["matrix"]) - FRAME).max() < 5e-4
-
-
 MIRRORED = CAD_MM * [1, -1, 1]
 LINE = np.outer(np.arange(8), [50, 0, 0])
 
@@ -449,30 +441,6 @@ def test_a_drawing_on_a_line_is_refused(tmp_path, tool_file):
     done = visioncal("fixture", touches, "--cad", cad, "--tool", tool_file)
     assert done.status == 2
     assert "the fixture's rotation about the fixture's x is not determined at all" in done.err
-
-
-def test_copied_rows_are_refused(tmp_path, tool_file):
-    touches = touches_file(tmp_path / "touches.csv")
-    lines = touches.read_text().splitlines()
-    touches.write_text("\n".join([*lines, lines[3].replace("2,P3", "8,P3")]))
-    cad = cad_file(tmp_path / "cad.csv")
-    done = visioncal("fixture", touches, "--cad", cad, "--tool", tool_file)
-    assert done.status == 2
-    assert "touches.csv, line 4 and touches.csv, line 10 have the very same pose" in done.err
-
-
-def test_degrees_for_radians_are_refused_and_read_when_said(tmp_path, tool_file):
-    poses = touching(1e-3 * CAD_MM, np.random.default_rng(1), NOISE_M)
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec(degrees=True)
-    rows = np.hstack([poses[:, :3, 3], turns]).tolist()
-    names = ("x", "y", "z", "rx", "ry", "rz")
-    touches = write_table(tmp_path / "touches.csv", names, rows, {"point": NAMES})
-    command = ("fixture", touches, "--cad", cad_file(tmp_path / "cad.csv"), "--tool", tool_file)
-    done = visioncal(*command)
-    assert done.status == 2
-    assert "too large for radians" in done.err
-    assert "--guess" not in done.err
-    assert visioncal(*command, "--robot-form", "rotation-vector-deg").status == 0
 
 
 def test_features_need_their_kinds(tmp_path, tool_file):

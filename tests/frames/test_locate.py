@@ -221,7 +221,7 @@ def test_exact_sights_give_exact_places(exact_cell):
 )
 def test_the_region_holds_the_true_place(options):
     plane, target = [], []
-    for seed in range(12):
+    for seed in range(8):
         cell = simulate(replace(options, seed=seed))
         calibration = calibration_of(cell)
         rng = np.random.default_rng(seed)
@@ -233,16 +233,16 @@ def test_the_region_holds_the_true_place(options):
             1e3 * np.linalg.norm(pick.truth - pick.located.p_base) <= pick.located.radius95_mm
             for pick in picks
         ]
-        # Of 120 picks 95 %, with a standard deviation of 2 %; picks of one cell share its
+        # Of 80 picks 95 %, with a standard deviation of 2.4 %; picks of one cell share its
         # calibration, so that they count for fewer: four times that. A region that was too wide by
         # half would hold every one of them.
-        assert held == pytest.approx(0.95, abs=0.08)
-        assert np.mean(near) == pytest.approx(0.95, abs=0.08)
+        assert held == pytest.approx(0.95, abs=0.1)
+        assert np.mean(near) == pytest.approx(0.95, abs=0.1)
 
 
 def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
     point, surprises, shares = np.array([0.13, 0.09, 0.0]), [], []
-    for seed in range(5):
+    for seed in range(3):
         known = lot(replace(ANYHOW, seed=seed), 4)
         cell, calibration = known.cell, known.calibration
         base_from_target = cell.transforms["base_from_target"]
@@ -258,8 +258,8 @@ def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
             error = by_joints.p_base - truth
             surprises.append(error @ np.linalg.solve(by_joints.covariance, error))
     # Chi-square of three degrees of freedom a cell, whose picks share its calibration: the mean of
-    # five has a standard deviation of 1.1.
-    assert np.mean(surprises) == pytest.approx(3.0, abs=2.5)
+    # three has a standard deviation of 1.4.
+    assert np.mean(surprises) == pytest.approx(3.0, abs=2.8)
     assert np.median(shares) < 0.5
 
 

@@ -129,11 +129,10 @@ def test_a_driven_arm_hovers_above_each_point(proved, known, located, monkeypatc
     with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
         with closing(UrArm(controller.host)) as arm:
             hovering = Hovering.of(arm, known, session.target, located, 0.05, Consent(None))
-            for point in points[:2]:
-                hovering.bring(above(point, 0.05), point.name)
-                away = invert(above(point, 0.05)) @ arm.state().base_from_flange
-                # A tenth of the least gap that can be read.
-                assert np.linalg.norm(away[:3, 3]) < 1e-5
+            hovering.bring(above(points[0], 0.05), points[0].name)
+            away = invert(above(points[0], 0.05)) @ arm.state().base_from_flange
+            # A tenth of the least gap that can be read.
+            assert np.linalg.norm(away[:3, 3]) < 1e-5
             # Through the board leads no way.
             with pytest.raises(DataError, match=r"no clear way|above the board|mm apart"):
                 hovering.bring(above(points[1], -0.03), points[1].name)

@@ -286,7 +286,7 @@ def test_from_a_bad_guess_nine_of_ten_stops_see_the_whole_board(mount):
     """Both edges are off by 5 cm and 10 degrees; what is said of the guesses is that."""
     true = cell_of(CellOptions(robot="ur10e", mount=mount))
     shares = []
-    for seed in range(5):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         turn, shift = rng.standard_normal((2, 2, 3))
         turn *= np.deg2rad(10.0) / np.linalg.norm(turn, axis=1, keepdims=True)

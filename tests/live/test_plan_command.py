@@ -11,6 +11,7 @@ import pytest
 import rerun as rr
 from support.commands import Done, visioncal
 from support.drawn import column
+from support.marks import slow
 
 from visioncal.calibration.pipeline.running import with_proposal
 from visioncal.cli.show import find_recording
@@ -313,7 +314,7 @@ def test_what_keeps_picks_from_a_need_is_named(tmp_path):
         assert short["need"]["probability"] <= short["need"]["probability_of_all_candidates"] < 0.95
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_what_was_recorded_meets_a_need_as_its_calibration_says(mount, tmp_path):
     options = CellOptions(robot="ur5e", views=10, mount=mount, seed=3)
     session = write_session(simulate(options), tmp_path / "s")

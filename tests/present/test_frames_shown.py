@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from scipy.spatial.transform import Rotation
 from support.kept import assert_same_evidence
 from support.pages import Page, section
 from support.samples import (
@@ -179,23 +178,6 @@ def test_frames_hang_where_they_belong(recorded, child, parent, expected):
     np.testing.assert_allclose(place_m, expected.translation, atol=1e-6)
     np.testing.assert_allclose(turn, expected.rotation.as_matrix(), atol=1e-6)
     assert static(recorded, entity, "CoordinateFrame:frame").tolist() == [child]
-
-
-def test_ellipsoids_of_frames_are_their_covariances(sample, recorded):
-    entities = {str(chunk.entity_path) for chunk in RrdReader(recorded).stream()}
-    for name, frame in sample.calibration.frames.items():
-        (entity,) = (
-            entity
-            for entity in entities
-            if re.search(rf"{name}_95_percent_magnified_\d+x$", entity)
-        )
-        factor = int(re.search(r"_(\d+)x$", entity)[1])
-        half = static(recorded, entity, "Ellipsoids3D:half_sizes")[0]
-        turn = Rotation.from_quat(static(recorded, entity, "Ellipsoids3D:quaternions")[0])
-        axes = turn.as_matrix() * half / (SIGMAS_95 * factor)
-        expected = frame.edge.covariance[3:, 3:]
-        # The drawing has single precision.
-        np.testing.assert_allclose(axes @ axes.T, expected, atol=1e-5 * np.trace(expected))
 
 
 def test_the_ellipsoid_holds_95_percent():

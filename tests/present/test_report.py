@@ -17,12 +17,10 @@ from support.samples import REJECTED, Sample, made_up
 from visioncal.calibration.pipeline import Run, run
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import matched, significant
-from visioncal.core.transforms import log
 from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
-from visioncal.present.placements import placement
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report.page import render, write_report
@@ -36,7 +34,6 @@ from visioncal.results import (
     VerdictStatus,
 )
 from visioncal.results.views import worst_view
-from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.vision.finders.imaging import decode_image
@@ -181,24 +178,6 @@ def test_joint_angles_get_a_plot_where_there_are_any(sample: Sample, html: str) 
     )
     without = render(sample.calibration, replace(sample.session, views=views), sample.evidence)
     assert "Residuals over joint angles" not in Page(without).words
-
-
-def test_an_error_of_one_joint_is_a_slope_in_its_column(sample: Sample) -> None:
-    # The joint's offset turns the arm's tip about the joint: the residual grows with the offset.
-    offset_rad = np.deg2rad(0.5)
-    q = np.array([view.joints_rad for view in sample.session.views])
-    wrong = load_robot("ur10e").base_from_flange(q + offset_rad * np.eye(6)[3])
-    residuals = [
-        log(placement(sample.calibration, replace(view, base_from_flange=pose)))
-        for view, pose in zip(sample.evidence, wrong, strict=True)
-        if view.cam_from_target is not None
-    ]
-    # Without the error, rounding alone is left.
-    exact = [log(placement(sample.calibration, view)) for view in sample.evidence if view.corners]
-    np.testing.assert_allclose(exact, 0.0, atol=1e-9)
-    # Every residual turns by the joint's error, whatever the pose.
-    turned_rad = np.linalg.norm(np.array(residuals)[:, :3], axis=1)
-    np.testing.assert_allclose(turned_rad, offset_rad, rtol=1e-6)
 
 
 def test_the_solver_that_gave_the_result_is_named(sample: Sample, html: str) -> None:

@@ -96,13 +96,6 @@ def test_the_condition_goes_with_every_output(result, tmp_path):
         assert condition.sentence not in " ".join(document(result, form, Selection()).warnings)
 
 
-def test_the_file_states_it_and_reads_back(result, tmp_path):
-    result.save(tmp_path / "calibration.json")
-    again = Calibration.load(tmp_path / "calibration.json")
-    assert again.conditions == result.conditions
-    assert again.verdict.good_for_mm_uncorrected == result.verdict.good_for_mm_uncorrected
-
-
 def test_a_nominal_arm_has_no_condition():
     plain = result_of(calibrated(simulate(replace(SURE, views=12)), joints=False))
     assert plain.conditions == ()

@@ -9,14 +9,8 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from support.aligned_cells import made_up_cell
-from support.arm_documents import with_holdout
-from support.findings import sick, with_findings
 from support.made_schema import calibration_schema
 from support.result_schema import SHIPPED, faults
-from support.samples import made_up, with_frames
-
-from visioncal.results import to_document
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -39,19 +33,6 @@ def test_what_is_shipped_is_what_the_types_say():
 @pytest.mark.parametrize("name", ["elastic", "warm", "pick"])
 def test_stored_files_keep_it(name):
     assert faults(stored(name)) == []
-
-
-@pytest.mark.parametrize(
-    "calibration",
-    [
-        with_frames(made_up(5)).calibration,
-        with_findings(made_up(5), sick() | {"kinematics": with_holdout()}),
-        made_up_cell(1),
-    ],
-    ids=["frames", "findings", "cell"],
-)
-def test_what_is_written_keeps_it(calibration):
-    assert faults(json.loads(json.dumps(to_document(calibration)))) == []
 
 
 def test_what_is_wrong_does_not():

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from visioncal.core.errors import DataError
 from visioncal.results import Calibration, to_document
 
 DATA = Path(__file__).parents[1] / "data"
@@ -57,30 +56,3 @@ def test_sections_have_types_and_none_where_nothing_was_computed():
     assert part.uncertainty.noise_95.keys() == {"robot_translation_mm", "robot_rotation_deg"}
     assert part.budget is None
     assert np.isfinite(part.noise_dof)
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "words"),
-    [
-        (("joints", 2, "tau_s"), "x", r"thermal\.joints\[2\]\.tau_s is 'x'; a number is needed"),
-        (("joints", 2, "tau_s"), True, r"thermal\.joints\[2\]\.tau_s is True; a number is needed"),
-        (("joints", 2, "tau_s"), None, r"thermal\.joints\[2\]\.tau_s is None; a number"),
-        (("covariance",), [[1.0], [2.0, 3.0]], r"thermal\.covariance is \[\[1.0\].*n x n numbers"),
-        (("rises_k", 1), "1", r"thermal\.rises_k\[1\] is '1'; a number is needed"),
-        (("lengths_m",), [[0.0, 1.0]], r"thermal\.lengths_m is .* an array of n x 3 numbers"),
-        (("heated_by",), "sun", r"heated_by is 'sun'; one of 'temperatures', 'currents' is needed"),
-        (("not_determined",), "all", r"thermal\.not_determined is 'all'; a list is needed"),
-        (("views", 0), 1, r"thermal\.views\[0\] is 1; a table is needed"),
-        (("views", 0, "view"), 1.5, r"thermal\.views\[0\]\.view is 1\.5; a whole number is needed"),
-        (("residual_mm",), {"without": 0.1}, r"thermal\.residual_mm\.with is missing"),
-    ],
-)
-def test_the_place_of_what_is_wrong_is_named(place, value, words):
-    document = json.loads(stored("warm"))
-    inner = document["thermal"]
-    for key in place[:-1]:
-        inner = inner[key]
-    inner[place[-1]] = value
-    with pytest.raises(DataError, match=words) as error:
-        Calibration.from_json(json.dumps(document), "changed.json")
-    assert error.value.message.startswith("changed.json: ")

@@ -85,7 +85,7 @@ def test_centres_are_as_exact_as_the_image(target, shot, most_px):
     assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
 
 
-@pytest.mark.parametrize("table", [30, 220])
+@pytest.mark.parametrize("table", [30, slow(220)])
 def test_light_circles_on_dark_are_as_exact(table):
     """A board printed in negative lies on a dark or a light table."""
     shot = Shot(square_px=60, uneven=0.3)

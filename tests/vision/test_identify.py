@@ -72,7 +72,7 @@ def test_a_print_is_named(target):
         assert_share(identity, target)
 
 
-@pytest.mark.parametrize("tilt_rad", [(0.05, 0.3), (0.6, 0.8), (0.9, 1.05)], ids=str)
+@pytest.mark.parametrize("tilt_rad", [(0.05, 0.3), slow((0.6, 0.8)), (0.9, 1.05)], ids=str)
 @pytest.mark.parametrize("name", ["charuco_9x6_30mm", "legacy", "least"])
 def test_a_tilted_board_is_named(name, tilt_rad):
     target = (MARKED | ODD)[name]
