@@ -11,12 +11,19 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from markupsafe import Markup, escape
 from support.result_schema import faults_below
 
 from visioncal.live.drivers import ur, ur_net
 from visioncal.simulation import CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+# Whose tests read a report's words, if anything: figures are plotted, and not rendered, which takes
+# most of the time of writing a result. A module that looks at them says `DRAWS = True`.
+UNDRAWN = {
+    "calibration", "cli", "core", "frames", "interchange", "live", "results", "session",
+    "simulation",
+}  # fmt: skip
 
 # The same examples everywhere, and none fails because a computer is busy.
 settings.register_profile(
@@ -46,6 +53,21 @@ def calibrations_are_as_their_schema_says(tmp_path_factory):
     """Checks the files that tests wrote, when the last of them has run."""
     yield
     assert faults_below(tmp_path_factory.getbasetemp()) == []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def figures(request):
+    """Leaves out matplotlib's rendering where no test looks at a figure."""
+    if getattr(request.module, "DRAWS", request.path.parent.name not in UNDRAWN):
+        yield
+        return
+
+    def described(_, words):
+        return Markup(f'<svg role="img" aria-label="{escape(words)}"></svg>')
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("visioncal.present.report.plotting._svg", described)
+        yield
 
 
 @pytest.fixture

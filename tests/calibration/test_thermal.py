@@ -29,6 +29,9 @@ from visioncal.session.streams import Stream
 from visioncal.simulation import Heat, Round, WarmUpOptions, cell_session, simulate_warm_up
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 
+# Texts of figures are read.
+DRAWS = True
+
 ROBOT = load_robot("ur5e")
 GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6
 Q = np.random.default_rng(3).uniform(-2.0, 2.0, (7, 6))

@@ -103,8 +103,7 @@ def test_of_what_is_given_in_the_wrong_place(place, name):
 
 
 def test_of_verify(place):
-    cell = simulate(CellOptions(views=20, seed=5))
-    whole = Session.load(write_session(cell, place / "all", images=False))
+    whole = Session.load(write_session(simulate(CellOptions(views=20, seed=5)), place / "all"))
     replace(whole, views=whole.views[:15]).save(place / "fit")
     assert visioncal("calibrate", "fit", "-o", "out").status == 0
     for name, last, change in (

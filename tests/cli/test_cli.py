@@ -48,6 +48,9 @@ from visioncal.simulation import (
 )
 from visioncal.vision.targets import target_names
 
+# As a user has it.
+DRAWS = True
+
 
 @pytest.fixture(scope="module")
 def poor(tmp_path_factory) -> Path:

@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 from support.commands import visioncal
 
+# Names are in figures, too.
+DRAWS = True
+
 COMMANDS = (
     ("calibrate", "{}", "-o", "out"),
     ("convert", "{}", "out"),
