@@ -20,7 +20,6 @@ from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import progress
 from visioncal.cli.app import app
-from visioncal.cli.lazy import LazyGroup
 from visioncal.core.choices import (
     EXPORT_NAMES,
     FOREIGN_NAMES,
@@ -297,17 +296,6 @@ def test_ctrl_c_is_status_130_and_says_what_is_left_behind(tmp_path, monkeypatch
     assert (done.status, done.out) == (130, "")
     left = f"written so far: {cell / 'views.csv'}" if keeps else "nothing was written"
     assert done.err == f"stopped by Ctrl-C; {left}\n"
-
-
-@pytest.mark.parametrize("path", [(), ("dynamics",)])
-def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
-    group = get_command(app)
-    for name in path:
-        group = group.imported(name)
-    assert isinstance(group, LazyGroup)
-    listed = dict(group.listed)
-    own = {name: group.imported(name).help.split("\n\n")[0] for name in listed}
-    assert listed == {name: " ".join(words.split()) for name, words in own.items()}
 
 
 @pytest.mark.parametrize("columns", [80, 200])

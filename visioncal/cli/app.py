@@ -24,14 +24,7 @@ class _Dynamics(LazyGroup):
 
     prefix = "dynamics_"
     records = ("visioncal.cli.dynamics_options",)
-    listed: ClassVar = {
-        "plan": "Plan the motions that determine an arm's inertias and friction.",
-        "record": "Record angles, speeds and motor currents at the controller's full rate.",
-        "identify": "Identify an arm's inertias and friction from the torques of its motions.",
-        "validate": "Predict the torques of other motions, and say how near that comes.",
-        "payload": "Weigh what the arm carries, by how much more its drives gave than without it.",
-        "gains": "Find how much torque a drive's current makes, by a body that is known.",
-    }
+    listed = ("plan", "record", "identify", "validate", "payload", "gains")
     homes: ClassVar = dict.fromkeys(listed, "dynamics")
 
 
@@ -48,12 +41,7 @@ class _Target(LazyGroup):
 
     prefix = "target_"
     records = ("visioncal.cli.session_options",)
-    listed: ClassVar = {
-        "make": "Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its "
-        "NAME.toml.",
-        "check": "Name the board in a photograph without further options, and print its "
-        "description.",
-    }
+    listed = ("make", "check")
     homes: ClassVar = dict.fromkeys(listed, "target")
 
 
@@ -71,27 +59,11 @@ class _Commands(LazyGroup):
     records = ("visioncal.cli.session_options", "visioncal.cli.result_options")
     homes: ClassVar = {"tcp": "framing", "fixture": "framing"}
     groups: ClassVar = {"target": target_app, "dynamics": dynamics_app}
-    listed: ClassVar = {
-        "demo": "Simulate a UR cell, calibrate it from its images, and compare with the truth.",
-        "plan": "Propose the most informative robot stops, or those to add to a session.",
-        "record": "Record a session: drive the stops of a plan, or follow an arm guided by hand.",
-        "calibrate": "Turn a session into a hand-eye calibration, with reasons to trust it or not.",
-        "doctor": "Say what is wrong with a session before it is calibrated, and what to type.",
-        "batch": "Calibrate many sessions at once, and report which stand out of their fleet.",
-        "show": "Show an earlier result: its report, its recording, or its certificate.",
-        "verify": "Check whether a calibration still holds, and what has changed if it does not.",
-        "diff": "Show what changed between two calibrations, and what is only noise.",
-        "convert": "Write a session as a folder or a recording, or make one of another program's.",
-        "export": "Write a result, or the calibrated arm, in another program's or robot's format.",
-        "tcp": "Find a tool's tip, and its rotation, from touches of fixed points; or from images.",
-        "locate": "Locate what an image shows in the robot's base, with its uncertainty.",
-        "fixture": "Find a fixture in the base, from touches of it or of a drawing's points.",
-        "touch-test": "Prove a calibration: touch what the camera locates, and enter the gaps.",
-        "correct": "Correct targets so that the arm reaches them by its nominal controller.",
-        "simulate": "Write a simulated session, and its truth in a file beside it.",
-        "target": "Print a board at its exact size, or name the one in a photograph.",
-        "dynamics": "Identify an arm's inertias and friction, and weigh what it carries.",
-    }
+    listed = (
+        *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "diff"),
+        *("convert", "export", "tcp", "locate", "fixture", "touch-test", "correct", "simulate"),
+        *("target", "dynamics"),
+    )
 
 
 app = typer.Typer(

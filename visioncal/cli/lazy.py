@@ -106,7 +106,7 @@ class LazyGroup(TyperGroup):
     is its help, and is the function `dynamics_plan_command` of the module `dynamics_plan`.
     """
 
-    listed: ClassVar[Mapping[str, str]]  # First paragraphs of the commands' help, by name.
+    listed: ClassVar[Sequence[str]]  # Names of its commands, as they are listed.
     records: ClassVar[Sequence[str]]  # Modules of the records, which import nothing heavy.
     homes: ClassVar[Mapping[str, str]] = {}  # Modules with another name than their command's.
     prefix: ClassVar[str] = ""
@@ -114,13 +114,18 @@ class LazyGroup(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:  # noqa: ANN401 - typer's
         super().__init__(**attributes)
-        for name, words in self.listed.items():
-            self.add_command(TyperCommand(name, help=words))
+        for name in self.listed:
+            group = self.groups.get(name)
+            words = group.info.help if group else inspect.getdoc(self.record_of(name))
+            self.add_command(TyperCommand(name, help=str(words).partition("\n\n")[0]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002 - typer's
         """Writes the listing without typer's truncation."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(self.listed.items()))
+            shown = [
+                (name, " ".join(str(self.commands[name].help).split())) for name in self.listed
+            ]
+            formatter.write_dl(shown)
 
     def resolve_command(self, *arguments: Any) -> Any:  # noqa: ANN401 - of typer's own types
         """Imports the command that the first argument names."""
@@ -128,14 +133,18 @@ class LazyGroup(TyperGroup):
         return name, command and self.imported(str(name)), rest
 
     @classmethod
+    def record_of(cls, name: str) -> Any:  # noqa: ANN401 - a class
+        """The record of a command's options."""
+        stem = f"{cls.prefix}{name}".replace("-", "_").title().replace("_", "")
+        modules = map(import_module, cls.records)
+        return next(filter(None, (getattr(module, f"{stem}Options", None) for module in modules)))
+
+    @classmethod
     def imported(cls, name: str) -> Any:  # noqa: ANN401 - a command of typer's
         """A command of this group, with its parameters."""
         if name in cls.groups:
             return get_group(cls.groups[name])
-        stem = f"{cls.prefix}{name}".replace("-", "_")
-        record_name = f"{stem.title().replace('_', '')}Options"
-        modules = map(import_module, cls.records)
-        record = next(filter(None, (getattr(module, record_name, None) for module in modules)))
+        stem, record = f"{cls.prefix}{name}".replace("-", "_"), cls.record_of(name)
 
         def command(context: typer.Context, **values: Any) -> None:  # noqa: ANN401 - of any type
             home = import_module(f"visioncal.cli.{cls.homes.get(name, stem)}")
