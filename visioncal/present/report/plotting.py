@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis, XAxis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
@@ -31,6 +32,8 @@ _VARIABLES = {
 SMALL = 8.0
 # Widths at which the text of a figure matches the page's [inches].
 WIDE_IN, MIDDLE_IN, NARROW_IN = 9.2, 5.0, 3.7
+# Resolution of bitmaps in vectors.
+_RASTER_DPI = 144.0
 # Above this number of marks a bitmap is smaller than vectors.
 _MANY_MARKS = 2500
 _STYLE: Any = {
@@ -39,7 +42,8 @@ _STYLE: Any = {
     "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": LINE, "xtick.color": LINE,
     "ytick.color": LINE, "xtick.labelcolor": MUTED, "ytick.labelcolor": MUTED, "grid.color": LINE,
     "grid.linewidth": 0.6, "axes.grid": True, "axes.axisbelow": True, "axes.spines.top": False,
-    "axes.spines.right": False, "legend.frameon": False, "figure.dpi": 72.0, "savefig.dpi": 144.0,
+    "axes.spines.right": False, "legend.frameon": False, "figure.dpi": 72.0,
+    "figure.facecolor": "none", "axes.facecolor": "none",
     "axes.xmargin": 0.06, "axes.ymargin": 0.06, "image.cmap": "plasma",
     "text.parse_math": False, "axes.formatter.useoffset": False,
 }  # fmt: skip
@@ -67,9 +71,11 @@ def drawn(
 
 def _svg(figure: Figure, words: str) -> Markup:
     buffer = io.StringIO()
+    figure.set_dpi(_RASTER_DPI)
     # Identifiers come from content and salt: the same everywhere, and other ones in each figure.
     with mpl.rc_context({"svg.hashsalt": words}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+        # `Figure.savefig` would draw twice.
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     # Numbered names of groups would be there once a figure; none is referred to.
