@@ -81,6 +81,7 @@ def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
     write_outputs(tmp_path / "out", session, first)
     frames = with_frames(sample).calibration.frames
     rewrite_result(tmp_path / "out", replace(first.calibration, frames=frames))
+    assert not Session.load(tmp_path / "out" / "recording.rrd").warnings
     again = run(tmp_path / "out" / "recording.rrd").calibration
     assert again.session_sha256 == first.calibration.session_sha256
     for name, edge in first.calibration.edges.items():

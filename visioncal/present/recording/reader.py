@@ -88,9 +88,12 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
     kept = _ELSEWHERE.get(records.header.images)
     if kept is None:
         return images
-    digests = {records.image_name(index): records.rows[index].image_sha256 for index in complete}
+    digests = {
+        records.image_name(index): digest
+        for index in complete
+        if (digest := records.rows[index].image_sha256)
+    }
     pictures = {name: partial(images.read, name) for name in images.places}
-    digests = {name: digest for name, digest in digests.items() if digest}
     return ExternalImages(path, kept, digests, pictures, records.searches or {})
 
 
@@ -278,7 +281,8 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
 def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
     """Sentences about what was lost from the recording."""
     name, announced = scanned.path.name, records.header.rows
-    if records.header.images and not records.searches:
+    has_images = any(row.image_sha256 for row in records.rows.values())
+    if records.header.images and has_images and not records.searches:
         yield f"{name}: the images are elsewhere, and only their digests are kept."
     if records.closed is not None:
         if scanned.cut:
