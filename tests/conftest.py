@@ -21,7 +21,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 # Whose tests read a report's words, if anything: figures are plotted, and not rendered, which takes
 # most of the time of writing a result. A module that looks at them says `DRAWS = True`.
 UNDRAWN = {
-    "calibration", "cli", "core", "frames", "interchange", "live", "results", "session",
+    "calibration", "cli", "core", "dynamics", "frames", "interchange", "live", "results", "session",
     "simulation",
 }  # fmt: skip
 

@@ -8,6 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, showing
+from support.marks import slow
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.result import result_of
@@ -204,7 +205,7 @@ def test_every_output_shows_all_boards(tmp_path):
         detect_session_target(session, written.calibration, "base")
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
+@pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])
 def test_what_is_written_of_the_fit_is_read_back(given):
     """Further boards are written relative to the first."""
     known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))

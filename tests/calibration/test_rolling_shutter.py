@@ -32,7 +32,6 @@ from visioncal.vision.targets import numbered_positions
 READOUT_S = 0.0124
 # 12 s at 30 Hz, at up to 0.2 m/s and 0.5 rad/s.
 HURRIED = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=READOUT_S)
-MOUNTED = pytest.mark.parametrize("mount", MOUNTS)
 
 
 def swept(seed: int, how: SweepOptions = HURRIED, **options) -> SimulatedCell:
@@ -49,7 +48,7 @@ def distance(error: np.ndarray, covariance: np.ndarray) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-@MOUNTED
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_a_target_moves_in_front_of_the_camera_as_finite_motion_has_it(mount):
     rng, step_s = np.random.default_rng(0), 1e-4
     x, z = (exp(rng.normal(size=6) * [0.3, 0.3, 0.3, 0.1, 0.1, 0.1]) for _ in range(2))
@@ -103,8 +102,9 @@ def test_the_simulation_takes_every_row_at_its_own_time():
     assert max(away_px) > 2.0
 
 
-@MOUNTED
-@pytest.mark.parametrize("seed", [1, slow(2)])
+@pytest.mark.parametrize(
+    ("seed", "mount"), [(1, MOUNTS[0]), *(slow(*item) for item in ((1, MOUNTS[1]), (2, MOUNTS[0])))]
+)
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     moved = swept(seed, mount=mount)
     known = calibrated_sweep(moved)

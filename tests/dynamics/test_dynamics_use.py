@@ -31,6 +31,9 @@ from visioncal.session import Session
 from visioncal.simulation.dynamics import LinkBody, drive_torques, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record, slow_sweep
 
+# Figures are counted.
+DRAWS = True
+
 # The rotors of the simulated arm are not among what the maker tells.
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=3e-4)
 LOAD = LinkBody(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))

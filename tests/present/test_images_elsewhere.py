@@ -16,6 +16,8 @@ from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 
+DRAWS = False
+
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
