@@ -3,12 +3,14 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
+
+# Kinds that need an address, with its form.
+_ADDRESSES = {"ur": "ur:HOST, as ur:192.168.0.10", "folder": "folder:PATH"}
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,6 @@ class ArmSetup:
     answers: bool = True  # Whether a person types, who can be asked again, unlike a file.
 
 
-ArmOpener: TypeAlias = Callable[[ArmSetup], Arm]
-CameraOpener: TypeAlias = Callable[[str, DeviceSetup], CameraDevice]
 _Opener = TypeVar("_Opener")
 
 
@@ -38,8 +38,8 @@ def open_arm(words: str, wish: ArmSetup) -> Arm:
         DataError: There is no such kind.
         DriverError: It cannot be opened.
     """
-    kind, _, address = words.partition(":")
-    return _opener(kind, ARMS, "--arm")(replace(wish, address=address))
+    opener, address = _opener(words, ARMS, "--arm")
+    return opener(replace(wish, address=address))
 
 
 def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
@@ -49,8 +49,8 @@ def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
         DataError: There is no such kind.
         DriverError: It cannot be opened.
     """
-    kind, _, address = words.partition(":")
-    return _opener(kind, CAMERAS, "--camera")(address, requested)
+    opener, address = _opener(words, CAMERAS, "--camera")
+    return opener(address, requested)
 
 
 def is_folder(words: str) -> bool:
@@ -58,20 +58,17 @@ def is_folder(words: str) -> bool:
     return words.partition(":")[0] == "folder"
 
 
-def _opener(kind: str, openers: Mapping[str, _Opener], option: str) -> _Opener:
+def _opener(words: str, openers: Mapping[str, _Opener], option: str) -> tuple[_Opener, str]:
+    kind, _, address = words.partition(":")
     if kind not in openers:
         raise DataError(
             f"{option}: {kind[:80]!r} is no kind of device; {', '.join(openers)} are.",
             culprits=[option],
             next_step=did_you_mean(kind, openers),
         )
-    return openers[kind]
-
-
-def _needs(address: str, words: str) -> str:
-    if not address:
-        raise DataError(f"{words.split(':')[0]} needs an address: {words}.")
-    return address
+    if not address and kind in _ADDRESSES:
+        raise DataError(f"{kind} needs an address: {_ADDRESSES[kind]}.")
+    return openers[kind], address
 
 
 # Drivers and their client libraries are imported only when a device is opened.
@@ -80,7 +77,7 @@ def _needs(address: str, words: str) -> str:
 def _ur(wish: ArmSetup) -> Arm:
     from visioncal.live.drivers.ur import UrArm
 
-    return UrArm(_needs(wish.address, "ur:HOST, as ur:192.168.0.10"), watch_only=wish.watch_only)
+    return UrArm(wish.address, watch_only=wish.watch_only)
 
 
 def _manual(wish: ArmSetup) -> Arm:
@@ -104,10 +101,12 @@ def _uvc(address: str, requested: DeviceSetup) -> CameraDevice:
 def _folder(address: str, _: DeviceSetup) -> CameraDevice:
     from visioncal.live.drivers.images import FolderCamera
 
-    return FolderCamera(Path(_needs(address, "folder:PATH")))
+    return FolderCamera(Path(address))
 
 
-ARMS: Mapping[str, ArmOpener] = MappingProxyType({"ur": _ur, "manual": _manual})
-CAMERAS: Mapping[str, CameraOpener] = MappingProxyType(
-    {"oak": _oak, "uvc": _uvc, "folder": _folder}
-)
+ARMS: Mapping[str, Callable[[ArmSetup], Arm]] = {"ur": _ur, "manual": _manual}
+CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
+    "oak": _oak,
+    "uvc": _uvc,
+    "folder": _folder,
+}

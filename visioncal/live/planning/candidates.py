@@ -11,7 +11,6 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collision_model
 from visioncal.live.planning.visibility import BoardViews, Occlusion
-from visioncal.robot import Robot
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
 
@@ -107,7 +106,6 @@ def candidates(
     search = _CandidateSearch(cell, count, seed)
     search.run(progress)
     if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
-        search.explain_unreached()
         raise search.error()
     q = _unwind(cell, search.collisions, np.array([posture for posture, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
@@ -120,7 +118,7 @@ class _CandidateSearch:
     def __init__(self, cell: PlanCell, count: int, seed: int) -> None:
         self.kept: list[tuple[FloatArray, float]] = []
         self.losses = Losses()
-        self._least_share, self._distances_narrowed = _SHARES[0], False
+        self._least_share = _SHARES[0]
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
         self._sight = BoardViews(cell, seed)
@@ -131,6 +129,7 @@ class _CandidateSearch:
 
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""
+        narrowed = False
         in_views = self._cell.robot.joint_count >= _FULL_JOINTS
         draw = self._from_views if in_views else self._from_postures
         for self._least_share in _SHARES:
@@ -139,7 +138,11 @@ class _CandidateSearch:
                 if len(self.kept) >= self._count or (poor and draws >= _FIRST_DRAWS):
                     break
                 self._keep(*draw())
-                self._narrow_distances()
+                if not narrowed and len(self.kept) >= min(_SAMPLE, self._count):
+                    # Further draws are at the distances of the stops found.
+                    q = np.array([q for q, _ in self.kept])
+                    self._sight = self._sight.nearer_to(self._cell.cam_from_target(q))
+                    narrowed = True
                 if progress is not None:
                     progress("candidates", min(len(self.kept), self._count), self._count)
             doubted = self.losses.lost[GUESS] >= _DOUBTED * self.losses.tried[GUESS]
@@ -147,38 +150,37 @@ class _CandidateSearch:
                 break
         del self.kept[self._count :]
 
-    def _narrow_distances(self) -> None:
-        """Restricts drawing to the distances of the stops found, once there are enough."""
-        if not self._distances_narrowed and len(self.kept) >= min(_SAMPLE, self._count):
-            q = np.array([q for q, _ in self.kept])
-            self._sight = self._sight.nearer_to(self._cell.cam_from_target(q))
-            self._distances_narrowed = True
-
     def error(self) -> DataError:
         """Error of a search with too few stops."""
-        error, cell = self.losses.error(len(self.kept), self._count), self._cell
-        if (
-            cell.mount == "eye-in-hand"
-            or cell.limits.distance_m is not None
-            or self.losses.worst() not in (AWAY, REACH)
-        ):
-            return error
-        # A fixed camera may be farther away than the distance at which its board fills the image.
-        near, far = (1e3 * distance for distance in self._sight.distance_m)
-        return DataError(
-            error.message,
-            culprits=error.culprits,
-            next_step=f"Allow other distances than those at which the board fills the image, "
-            f"{near:.0f} to {far:.0f} mm (--distance-mm), bring camera and arm nearer to each "
-            "other, or look whether the guesses are right.",
-        )
-
-    def explain_unreached(self) -> None:
-        """Names the joints whose limits alone kept the arm from unreached views."""
-        zeros = np.zeros(self._cell.robot.joint_count)
+        # Joints whose limits alone kept the arm from unreached views are named.
+        cell, losses = self._cell, self.losses
+        zeros = np.zeros(cell.robot.joint_count)
         solutions = [self._inverse.solve(flange, zeros) for flange in self._unreached]
-        self.losses.blame(
+        losses.blame(
             REACH, [f"limits of {name}" for solution in solutions for name in solution.beyond]
+        )
+        worst, counts = losses.worst(), losses.counts()
+        named = {name: count for name, count in counts.items() if name.startswith(f"{worst} (")}
+        culprit = max(named, key=lambda name: named[name], default=worst)
+        words = some_of([f"{times} to {what}" for what, times in counts.items()], _NAMED)
+        share = 100.0 * losses.lost[worst] / losses.tried[worst]
+        advice = _ADVICE[worst]
+        is_fixed = cell.mount != "eye-in-hand" and cell.limits.distance_m is None
+        if is_fixed and worst in (AWAY, REACH):
+            # A fixed camera may be farther away than the distance at which its board fills the
+            # image.
+            near, far = (1e3 * distance for distance in self._sight.distance_m)
+            advice = (
+                "Allow other distances than those at which the board fills the image, "
+                f"{near:.0f} to {far:.0f} mm (--distance-mm), bring camera and arm nearer to each "
+                "other, or look whether the guesses are right."
+            )
+        return DataError(
+            f"plan: {len(self.kept)} of {self._count} possible stops were found in "
+            f"{max(losses.tried.values())} tries. Lost were {words}. Most in the way is {culprit}: "
+            f"{worst} kept out {share:.1f} % of the {losses.tried[worst]} that came so far.",
+            culprits=[culprit],
+            next_step=advice,
         )
 
     def _from_views(self) -> tuple[FloatArray, FloatArray]:
@@ -189,7 +191,12 @@ class _CandidateSearch:
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
         flange = flange[self._not_behind_boxes(self._shade.behind_boxes(flange))]
-        flange = flange[passed(AWAY, _within(robot, flange))]
+        if not robot.chain.prismatic.any():
+            # No farther than the outstretched arm.
+            places = robot.chain.placements
+            longest = float(np.linalg.norm(places[1:, :3, 3], axis=1).sum())
+            distance = np.linalg.norm(flange[:, :3, 3] - places[0][:3, 3], axis=1)
+            flange = flange[passed(AWAY, np.asarray(distance <= longest))]
         share = sight.share(flange, self._least_share)
         likely = passed(GUESS, share >= self._least_share)
         # Not many more than are still needed are solved.
@@ -251,16 +258,6 @@ class _CandidateSearch:
         self.kept += zip(q[clear], share[clear].tolist(), strict=True)
 
 
-def _within(robot: Robot, flange: FloatArray) -> Mask:
-    """Whether poses (k, 4, 4) are no farther than the outstretched arm."""
-    chain = robot.chain
-    if chain.prismatic.any():
-        return np.ones(len(flange), dtype=bool)
-    longest = float(np.linalg.norm(chain.placements[1:, :3, 3], axis=1).sum())
-    distance = np.linalg.norm(flange[:, :3, 3] - chain.placements[0][:3, 3], axis=1)
-    return np.asarray(distance <= longest)
-
-
 def _unwind(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray:
     """Shifts joints of postures (k, n) by full turns, so that straight paths are possible."""
     # A joint cannot pass a wide range of angles in which no stop has it and most postures collide,
@@ -319,21 +316,3 @@ class Losses:
         """The limit that lets the smallest share through."""
         tried = {limit: times for limit, times in self.tried.items() if times}
         return min(tried, key=lambda limit: 1.0 - self.lost[limit] / tried[limit])
-
-    def error(self, found: int, wished: int) -> DataError:
-        """Error of a search with too few stops."""
-        worst = self.worst()
-        named = {
-            name: count for name, count in self.counts().items() if name.startswith(f"{worst} (")
-        }
-        culprit = max(named, key=lambda name: named[name], default=worst)
-        tried = max(self.tried.values())
-        losses = some_of([f"{times} to {what}" for what, times in self.counts().items()], _NAMED)
-        share = 100.0 * self.lost[worst] / self.tried[worst]
-        return DataError(
-            f"plan: {found} of {wished} possible stops were found in {tried} tries. Lost were "
-            f"{losses}. Most in the way is {culprit}: {worst} kept out {share:.1f} % of the "
-            f"{self.tried[worst]} that came so far.",
-            culprits=[culprit],
-            next_step=_ADVICE[worst],
-        )

@@ -406,44 +406,27 @@ def _workspace_weights(
     cell: PlanCell, purpose: Purpose, workspace: Box | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weights for the pose of what the arm carries, relative to what is fixed in the base."""
-    q = _workspace_postures(cell, workspace)
-    position = _mean_square(_workspace_jacobian(cell, purpose, q))
-    rotation = _mean_square(_arm_jacobian(cell, purpose, q)[2][:, :3])
-    return position, position, rotation
-
-
-def _workspace_jacobian(cell: PlanCell, purpose: Purpose, q: FloatArray) -> FloatArray:
-    """Jacobian (w, 3, 12 + a) of the carried positions in edges and errors of the arm."""
-    pair, poses, jacobian = _arm_jacobian(cell, purpose, q)
-    return pair.place_jacobian(poses, jacobian, corner_positions(cell.target).mean(axis=0))
-
-
-def _arm_jacobian(
-    cell: PlanCell, purpose: Purpose, q: FloatArray
-) -> tuple[ArmPair, FloatArray, FloatArray]:
-    """Camera-board pair, with its (w, 4, 4) poses and their Jacobian (w, 6, 12 + a)."""
-    model, flange = _arm_model(cell.robot, purpose), cell.robot.base_from_flange(q)
+    q = postures(cell.robot) if workspace is None else postures(cell.robot, _TRIED)
+    flange = cell.robot.base_from_flange(q)
+    if workspace is not None:
+        carried = flange @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
+        position = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
+        within = np.all(np.abs(position) <= np.asarray(workspace.size_m) / 2, axis=1)
+        if not within.any():
+            raise DataError(
+                f"workspace {workspace.name}: none of {len(q)} postures all over the "
+                f"{cell.robot.name}'s reach brings what it carries into the box.",
+                culprits=[f"workspace {workspace.name}"],
+                next_step="Give its centre in the base frame and its full lengths [m].",
+            )
+        q, flange = q[within][:_POSTURES], flange[within][:_POSTURES]
     problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
     pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
-    return pair, *pair.jacobian(flange, model.basis(q))
-
-
-def _workspace_postures(cell: PlanCell, workspace: Box | None) -> FloatArray:
-    """Postures (w, n) that sample the workspace [rad]."""
-    if workspace is None:
-        return postures(cell.robot)
-    q = postures(cell.robot, _TRIED)
-    carried = cell.robot.base_from_flange(q) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
-    position = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
-    within = np.all(np.abs(position) <= np.asarray(workspace.size_m) / 2, axis=1)
-    if not within.any():
-        raise DataError(
-            f"workspace {workspace.name}: none of {len(q)} postures all over the {cell.robot.name}"
-            "'s reach brings what it carries into the box.",
-            culprits=[f"workspace {workspace.name}"],
-            next_step="Give its centre in the base frame and its full lengths [m].",
-        )
-    return q[within][:_POSTURES]
+    # (w, 4, 4) poses of the camera-board pair, and their Jacobian (w, 6, 12 + a).
+    poses, jacobian = pair.jacobian(flange, _arm_model(cell.robot, purpose).basis(q))
+    middle = corner_positions(cell.target).mean(axis=0)
+    position = _mean_square(pair.place_jacobian(poses, jacobian, middle))
+    return position, position, _mean_square(jacobian[:, :3])
 
 
 def _mean_square(jacobian: FloatArray) -> FloatArray:
