@@ -1,22 +1,36 @@
-"""Recording a live cell: what is taken, what is refused, and what is told of failures."""
+"""Recording a live cell, driven or guided: what is taken, refused, told, and left on the disk."""
 
+import errno
+import shutil
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from support.live_cell import FakeArm, fake_devices, fake_plan
-from support.recorded import QUICK, REPEATABILITY_M, errors_m, recorded
+from support.killed import kill_and_resume
+from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of, recorded
 
 from visioncal.calibration.pipeline import run
+from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
-from visioncal.live.capture.assessment import JointPoseCheck
+from visioncal.core.types import Corners
+from visioncal.live.capture import journal as journal_module
+from visioncal.live.capture.assessment import Coach, JointPoseCheck
 from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.gate import JointPace
+from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.recording import checked_path, missed_stops, motion_summary
-from visioncal.live.capture.take import image_motion_px
+from visioncal.live.capture.recording import (
+    Capture,
+    CaptureEvent,
+    ask_and_take,
+    checked_path,
+    follow,
+    missed_stops,
+    motion_summary,
+)
+from visioncal.live.capture.take import TakenView, image_motion_px
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
@@ -227,13 +241,6 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
     assert "4 joints, and ur5e has 6" in told.why_not(few)
 
 
-def test_motion_takes_its_time():
-    pace = JointPace(0.5, 1.0)
-    # 1 rad at 0.5 rad/s and 1 rad/s^2: half a second up, half a second down, 1.5 s in between.
-    assert pace.travel_s(np.zeros(2), np.array([1.0, 0.2])) == pytest.approx(2.5)
-    assert pace.travel_s(np.zeros(1), np.array([0.01])) == pytest.approx(0.2)
-
-
 def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):
     arm, camera = fake_devices(plan)
     arm.moving = lambda: arm.clock.sleep(0.01) or True
@@ -282,3 +289,228 @@ def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():
     camera.noise = 2.0
     # Fresh noise of two levels moves the median point by far less than what is taken for still.
     assert image_motion_px(camera.frame().image, camera.frame().image) < 0.05
+
+
+def test_ctrl_c_halts_and_a_resumed_recording_is_complete(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    state, asked = arm.state, []
+
+    def interrupted():
+        asked.append(1)
+        if len(asked) == 400:
+            raise KeyboardInterrupt
+        return state()
+
+    arm.state = interrupted
+    with pytest.raises(DriverError, match=r"Ctrl-C or a signal; the arm was halted\. . views? "):
+        recorded(tmp_path / "live", plan, arm, camera)
+    assert arm.halted == 1
+    some = len(Session.load(tmp_path / "live").views)
+    assert 0 < some < len(plan.stops)
+    arm, camera = fake_devices(plan)
+    steps = recorded(tmp_path / "live", plan, arm, camera, resume=True)
+    assert len(steps) == len(plan.stops) - some
+    numbers = [view.number for view in Session.load(tmp_path / "live").views]
+    assert sorted(numbers) == [stop.view for stop in plan.stops]
+
+
+def test_a_full_disk_is_told_and_leaves_the_session(plan, tmp_path, monkeypatch):
+    arm, camera = fake_devices(plan)
+    usage, write, written = shutil.disk_usage, journal_module.write_atomically, []
+
+    def room(folder):
+        free = 1000 if len(written) > 8 else usage(folder).free
+        return usage(folder)._replace(free=free)
+
+    def counted(path, data):
+        written.append(path)
+        write(path, data)
+
+    monkeypatch.setattr(journal_module, "write_atomically", counted)
+    monkeypatch.setattr(journal_module.shutil, "disk_usage", room)
+    # It is told on the way, not when the next view is there.
+    words = r"live: too little room: 0\.0 MB are free.* for the next view"
+    with pytest.raises(DataError, match=words):
+        recorded(tmp_path / "live", plan, arm, camera)
+    assert arm.halted == 1
+    assert len(Session.load(tmp_path / "live").views) >= 3
+
+
+def test_a_disk_that_fills_while_it_is_written_leaves_the_session(plan, tmp_path, monkeypatch):
+    arm, camera = fake_devices(plan)
+    write = journal_module.write_atomically
+
+    def full(path, data):
+        if path.name == "003.png":
+            error = DataError("cannot be written")
+            raise error from OSError(errno.ENOSPC, "No space left on device")
+        write(path, data)
+
+    monkeypatch.setattr(journal_module, "write_atomically", full)
+    with pytest.raises(DataError, match=r"too little room.* for 003\.png"):
+        recorded(tmp_path / "live", plan, arm, camera)
+    assert len(Session.load(tmp_path / "live").views) == 2
+
+
+def test_a_killed_recording_loses_nothing(tmp_path):
+    # The moments are random, and on a busy machine some kills come before the first view: what is
+    # asserted holds for any of them.
+    ends = kill_and_resume(tmp_path / "live", stops=8, kills=2, seed=7, most_s=0.6)
+    assert ends
+
+
+def test_what_a_killed_process_left_is_removed(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    camera.hidden_at = (5,)
+    folder = tmp_path / "live"
+    recorded(folder, plan, arm, camera)
+    leftovers = [folder / f".{32 * '1'}.tmp", folder / "images" / f".{32 * '2'}.tmp"]
+    for file in leftovers:
+        file.write_bytes(b"half")
+    # An image whose row did not come is written again.
+    (folder / "images" / "005.png").write_bytes(b"half")
+    recorded(folder, plan, *fake_devices(plan), resume=True)
+    assert not any(leftover.exists() for leftover in leftovers)
+    assert len(Session.load(folder).views) == len(plan.stops)
+
+
+def test_folders_of_something_else_are_left_alone(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    folder = tmp_path / "live"
+    recorded(folder, plan, arm, camera)
+    with pytest.raises(DataError, match="exists and is not empty") as caught:
+        recorded(folder, plan, arm, camera)
+    assert "--resume" in caught.value.next_step
+    camera.name, arm.name = "another camera", "fake ur10e"
+    with pytest.raises(DataError, match='arm was "fake ur5e" and is "fake ur10e"; camera was'):
+        recorded(folder, plan, arm, camera, resume=True)
+    arm, camera = fake_devices(plan)
+    with pytest.raises(DataError, match=r"plan was 00000000\.\.\. and is 11111111\.\.\."):
+        recorded(folder, replace(plan, digest="1" * 64), arm, camera, resume=True)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(DataError, match="exists and is not empty"):
+        recorded(tmp_path / "mine", plan, arm, camera, resume=True)
+
+
+def test_a_disk_without_room_for_all_views_is_told_before_anything_moves(
+    plan, tmp_path, monkeypatch
+):
+    arm, camera = fake_devices(plan)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(
+        journal_module.shutil, "disk_usage", lambda _: usage._replace(free=1_000_000)
+    )
+    with pytest.raises(DataError, match=r"1\.5 MB are needed for 5 views"):
+        recorded(tmp_path / "live", plan, arm, camera)
+    assert arm.moves == 0
+    # With room made, it begins.
+    monkeypatch.undo()
+    recorded(tmp_path / "live", plan, arm, camera)
+
+
+def test_the_coach_asks_for_what_is_missing(plan):
+    lens = fake_devices(plan)[1].lens
+    coach = Coach(plan.cell.target, lens.resolution, lens)
+    assert coach.advice() == "another place, with the board large in the image"
+    ids = np.arange(40)
+    board = np.stack(np.meshgrid(np.arange(8), np.arange(5)), axis=-1).reshape(-1, 2)
+    for view in range(3):
+        # Straight from above, in the upper left of the image.
+        coach.add(Corners(view, ids, 20.0 + 25.0 * board + view, 0.7))
+    assert "steepest view leans by 0 deg only" in coach.advice()
+    assert coach.words().startswith("coverage 15 %, tilts to 0 deg")
+    for view, stop in enumerate(plan.stops):
+        arm, camera = fake_devices(plan)
+        arm.q0 = stop.q
+        found, _ = find_corners(camera.frame().image, plan.cell.target, view)
+        coach.add(found)
+    assert "right" in coach.advice() or "bottom" in coach.advice()
+
+
+class Hand:
+    """Leads an arm to the next place as soon as a view is there; in the end it presses Ctrl-C."""
+
+    def __init__(self, arm: FakeArm, places: list[np.ndarray]) -> None:
+        self.arm, self.places = arm, iter(places)
+
+    def stepped(self, _: CaptureEvent) -> None:
+        """Leads it on."""
+        place = next(self.places, None)
+        if place is None:
+            raise KeyboardInterrupt
+        self.arm.start_move(place, speed=2.0, acceleration=4.0)
+
+
+def test_a_guided_arm_gives_a_view_wherever_it_rests(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    capture = _capture(tmp_path / "live", plan, arm, camera)
+    # It begins at the first of them.
+    places = [stop.q for stop in plan.stops[1:]]
+    capture.watchers = (Hand(arm, places),)
+    steps = follow(capture, len(plan.stops))
+    assert len(steps) == len(plan.stops)
+    session = Session.load(tmp_path / "live")
+    assert [view.number for view in session.views] == list(range(1, len(plan.stops) + 1))
+    assert max(errors_m(session, camera)) < REPEATABILITY_M
+
+
+def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    capture = _capture(tmp_path / "live", plan, arm, camera)
+    frame = camera.frame
+
+    def led(**words):
+        # The first frame of all: the hand goes on to another place, and from there to a third.
+        if camera.frames == 0:
+            arm.start_move(plan.stops[1].q, speed=2.0, acceleration=4.0)
+        return frame(**words)
+
+    camera.frame = led
+    capture.watchers = (Hand(arm, [plan.stops[1].q + 0.001, plan.stops[2].q]),)
+    state, last = arm.state, plan.stops[2].q
+
+    def led_on():
+        # After some seconds at the place that has its view it goes to a third.
+        if arm.moves == 2 and arm.clock.now() - arm.begun > 5.0:
+            arm.start_move(last, speed=2.0, acceleration=4.0)
+        return state()
+
+    arm.state = led_on
+    follow(capture, 2)
+    poses = [view.base_from_flange().translation for view in Session.load(tmp_path / "live").views]
+    assert np.linalg.norm(poses[1] - poses[0]) > 0.02
+
+
+def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    capture = _capture(tmp_path / "live", plan, arm, camera)
+    capture.watchers = (Hand(arm, [plan.stops[1].q]),)
+    assert len(follow(capture, 0)) == 2
+    assert len(Session.load(tmp_path / "live").views) == 2
+
+
+def test_typed_poses_make_a_session(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    capture = _capture(tmp_path / "live", plan, arm, camera)
+    answers, asked = iter(["", "", "", "q"]), []
+    places = iter(plan.stops)
+
+    def ask(question: str) -> str:
+        asked.append(question)
+        answer = next(answers)
+        if answer == "":
+            arm.q0 = next(places).q
+        return answer
+
+    steps = ask_and_take(capture, arm, 0, ask)
+    assert all(isinstance(step.found, TakenView) for step in steps)
+    assert "View 1 (another place" in asked[0]
+    assert len(Session.load(tmp_path / "live").views) == 3
+
+
+def _capture(folder, plan: PlanFile, arm: FakeArm, camera: FakeCamera) -> Capture:
+    journal = Journal.begin(folder, facts_of(plan, arm, camera), arm.clock.unix_offset_s(), 0)
+    cell = LiveCell(arm, (camera,), arm.clock)
+    planned = plan.cell
+    return Capture(cell, planned.target, planned.robot, camera.lens, journal, QUICK, None)

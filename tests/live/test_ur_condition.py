@@ -1,4 +1,4 @@
-"""What a UR controller tells over plain connections: its condition and its tool."""
+"""What a UR controller tells over plain connections: its condition and its tool; and stalls."""
 
 import socket
 import sys
@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from visioncal.core.errors import DriverError
+from visioncal.live.drivers.protocols import Stopwatch
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.drivers.ur_net import (
     check_states_come,
@@ -141,3 +142,12 @@ def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monk
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
     with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
         UrArm("127.0.0.1")
+
+
+def test_what_a_stall_takes_is_left_out():
+    times = iter([100.0, 100.05, 100.1, 107.0, 107.05, 200.0, 200.1])
+    watch = Stopwatch(lambda: next(times))
+    # Two steps as they are, the stall as 0.2 s.
+    assert [round(watch.read(), 6) for _ in range(4)] == [0.05, 0.1, 0.3, 0.35]
+    watch.restart()
+    assert round(watch.read(), 6) == 0.1

@@ -74,8 +74,13 @@ class CaptureFacts:
             camera["distortion"] = lens.distortion.tolist()
         document["camera"] = camera
         if robot is not None:
-            shipped = (name for name in robot_names() if _is_shipped(robot, name))
-            model = next(shipped, "")
+            arms = {name: load_robot(name) for name in robot_names()}
+            same = (
+                name
+                for name, arm in arms.items()
+                if arm.name == robot.name and dict(arm.document) == dict(robot.document)
+            )
+            model = next(same, "")
             if not model:
                 named = "robot.json" if "kind" in robot.document else ""
                 model, text = robot_file(robot.document, named)
@@ -129,11 +134,6 @@ class CaptureFacts:
             texts["exposure_ms"] = f"{1e3 * frame.exposure_s:.3f}"
         texts |= {f"device_{name}": str(value) for name, value in self.settings.items()}
         return View(number, image=image, numbers=numbers, text=texts)
-
-
-def _is_shipped(robot: Robot, name: str) -> bool:
-    shipped = load_robot(name)
-    return shipped.name == robot.name and dict(shipped.document) == dict(robot.document)
 
 
 def state_of(view: View) -> ArmState | None:
@@ -214,7 +214,18 @@ class Journal:
             with named_errors(folder), suppress(FileNotFoundError):
                 (folder / _IMAGES).rmdir()
             return cls.begin(folder, facts, unix_offset_s, views)
-        _check_same(read_toml(path, str(path)), facts, folder)
+        before, now = read_toml(path, str(path)), facts.provenance()
+        differ = [name for name, value in now.items() if before.get(name) != value]
+        if differ:
+            words = "; ".join(
+                f"{name} was {_short(before.get(name))} and is {_short(now[name])}"
+                for name in differ
+            )
+            raise DataError(
+                f"{folder} was recorded of something else: {words}.",
+                culprits=[f"{path}: {name}" for name in differ],
+                next_step="Go on with the same, or record into a new folder.",
+            )
         journal = cls(folder, facts, unix_offset_s)
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
@@ -283,22 +294,6 @@ class Journal:
             culprits=[str(self.folder)],
             next_step="Make room on that disk and go on with --resume.",
         )
-
-
-def _check_same(before: dict[str, Any], facts: CaptureFacts, folder: Path) -> None:
-    """Refuses to resume a recording of other devices or another plan."""
-    now = facts.provenance()
-    differ = [name for name, value in now.items() if before.get(name) != value]
-    if not differ:
-        return
-    words = "; ".join(
-        f"{name} was {_short(before.get(name))} and is {_short(now[name])}" for name in differ
-    )
-    raise DataError(
-        f"{folder} was recorded of something else: {words}.",
-        culprits=[f"{folder / PROVENANCE}: {name}" for name in differ],
-        next_step="Go on with the same, or record into a new folder.",
-    )
 
 
 def _short(value: object) -> str:

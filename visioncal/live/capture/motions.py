@@ -55,27 +55,16 @@ def record_motion(
         if _moves(sample):
             moved_s = sample.stamp_s
     report(f"it has come to rest after {moved_s - samples[0].stamp_s:.1f} s")
-    return _stream(
-        [joint_sample for joint_sample in samples if joint_sample.stamp_s <= moved_s + _LEAD_S]
-    )
+    samples = [one for one in samples if one.stamp_s <= moved_s + _LEAD_S]
+    stamps_s = np.array([one.stamp_s for one in samples])
+    # Some are sent twice.
+    ascending = np.concatenate([[True], np.diff(stamps_s) > 0.0])
+    forms = {"q{}_rad": "q", "dq{}_rad_s": "dq", "current{}_a": "currents_a"}
+    joints = range(1, len(first.q) + 1)
+    columns = [form.format(joint) for form in forms for joint in joints]
+    parts = [np.array([getattr(one, name) for one in samples]) for name in forms.values()]
+    return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[ascending])
 
 
 def _moves(sample: JointSample) -> bool:
     return bool(np.abs(sample.dq).max() > _MOVING_RAD_S)
-
-
-def _stream(samples: list[JointSample]) -> Stream:
-    """Samples as a stream, without those that were sent twice."""
-    stamps_s = np.array([sample.stamp_s for sample in samples])
-    ascending = np.concatenate([[True], np.diff(stamps_s) > 0.0])
-    count = len(samples[0].q)
-    parts = [
-        np.array([getattr(sample, name) for sample in samples])
-        for name in ("q", "dq", "currents_a")
-    ]
-    columns = [
-        name.format(joint)
-        for name in ("q{}_rad", "dq{}_rad_s", "current{}_a")
-        for joint in range(1, count + 1)
-    ]
-    return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[ascending])

@@ -207,7 +207,9 @@ def cell_of_calibration(
     x, z = calibration.edges.values()
     sigma_m = max(1e-3 * x.sigma_mm, 1e-3 * z.sigma_mm) / np.sqrt(3.0)
     sigma_rad = np.deg2rad(max(x.sigma_deg, z.sigma_deg)) / np.sqrt(3.0)
-    noise, pixel_px = _noise(calibration)
+    noise = robot_noise(calibration)
+    # Few stops may underestimate the noise by chance.
+    noise = replace(noise, robots=np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots))
     budget = calibration.budget
     return PlanCell(
         calibration.mount,
@@ -219,18 +221,11 @@ def cell_of_calibration(
         max(float(sigma_rad), _TOUCHED_RAD),
         max(float(sigma_m), _TOUCHED_M),
         noise,
-        pixel_px,
+        calibration.noise.get("pixel_px", TYPICAL_PX),
         limits,
         boxes,
         observed_distances_m=None if budget is None else (budget.distance_m, budget.distance_m),
     )
-
-
-def _noise(calibration: Calibration) -> tuple[Noise, float]:
-    noise = robot_noise(calibration)
-    # Few stops may underestimate the noise by chance.
-    floored = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
-    return replace(noise, robots=floored), calibration.noise.get("pixel_px", TYPICAL_PX)
 
 
 def collision_model(cell: PlanCell) -> Collisions:
@@ -243,14 +238,18 @@ def collision_model(cell: PlanCell) -> Collisions:
     flange = cell.robot.chain.placements[-1]
     held, fixed = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
     unsure_m = _KEEP_OFF_SIGMAS * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
-    held_body, fixed_body = (_camera, _board) if in_hand else (_board, _camera)
-    carried = held_body(cell.target, hand, flange @ held, unsure_m)
+    if in_hand:
+        carried = camera_body(hand, flange @ held, unsure_m)
+        standing = _board(cell.target, 0, fixed, unsure_m)
+    else:
+        carried = _board(cell.target, hand, flange @ held, unsure_m)
+        standing = camera_body(0, fixed, unsure_m)
     middle = carried.link_from_body[:3, 3]
     bodies = [
         *arm_bodies(cell.robot),
         capsule("holder", hand, flange[:3, 3], middle, _HOLDER_RADIUS_M, unsure_m=unsure_m),
         carried,
-        fixed_body(cell.target, 0, fixed, unsure_m),
+        standing,
         *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),
     ]
     return Collisions(cell.robot, bodies, cell.limits.clearance_m, cell.limits.floor_m)
@@ -290,10 +289,6 @@ def board_size_m(target: Target) -> float:
     """The diagonal of the print [m]."""
     low, high = extent_m(target)
     return float(np.linalg.norm(high - low))
-
-
-def _camera(_: Target, link: int, link_from_cam: FloatArray, unsure_m: float) -> Body:
-    return camera_body(link, link_from_cam, unsure_m)
 
 
 def _board(target: Target, link: int, link_from_target: FloatArray, unsure_m: float) -> Body:

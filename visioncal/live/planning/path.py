@@ -163,16 +163,19 @@ def order_stops(
             f"clearance is {1e3 * cell.limits.clearance_m:.0f} mm.",
         )
     detours = _Detours(cell, collisions, seed)
-    best = _Tour(detours, start_q, q)
+    best: _Tour | None = None
     first = int(np.linalg.norm(q - np.median(q, axis=0), axis=1).argmax()) if len(q) else 0
     for _ in range(1 if start_q is not None else _STARTS):
         order = _short_order(start_q, q, first)
         tour = _Tour(detours, start_q, q)
         tour.walk(order)
-        best = max(best, tour, key=lambda one: len(one.order))
+        if best is None or len(tour.order) > len(best.order):
+            best = tour
         if len(best.order) > _MOST * len(q):
             break
         first = next((row for row in order if row not in best.order), first)
+    if best is None:
+        return Route((), (), 0.0, {})
     return best.route(collisions)
 
 

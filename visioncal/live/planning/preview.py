@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.live.planning.messages import looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
@@ -70,9 +69,10 @@ def _plan_note(plan: Plan, name: str) -> str:
 def motion_preview(plan: MotionPlan) -> MotionPreview:
     """Builds the preview of a plan of motions."""
     allowed, excitation = plan.allowed, plan.excitation
-    parts = [_part(plan, "excitation", excitation.series.sampled(_EXCITATION_HZ))]
+    motions = {"excitation": excitation.series.sampled(_EXCITATION_HZ)}
     if plan.sweeps is not None:
-        parts.append(_part(plan, "sweeps", plan.sweeps.sampled(_SWEEPS_HZ)))
+        motions["sweeps"] = plan.sweeps.sampled(_SWEEPS_HZ)
+    parts = [MotionPart(name, motion, allowed.torques(motion)) for name, motion in motions.items()]
     boxes = [
         Obstacle(body.name, body.link_from_body, body.size_m)
         for body in allowed.bodies
@@ -81,7 +81,3 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     name = f"motions for {allowed.robot.name}"
     note = "\n\n".join([f"# {name}", *(f"- {word}" for word in plan_words(plan))])
     return MotionPreview(name, allowed.robot, parts, boxes, allowed.share.floor_m, note)
-
-
-def _part(plan: MotionPlan, name: str, motion: JointMotion) -> MotionPart:
-    return MotionPart(name, motion, plan.allowed.torques(motion))

@@ -29,7 +29,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
-from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import extent_m, first_corners
 
@@ -138,9 +137,15 @@ def start_from_session(
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
         raise _too_vague_error(run, len(start.views))
+    # Up to the frame of the reported poses, calibrated where possible.
+    arm, joints = robot, start.arm.joints_rad
+    if start.arm.model is not None:
+        arm = start.arm.model.robot
+    elif joints is not None:
+        arm = ArmModel.of(robot, joints, start.arm.poses).robot
     cell = PlanCell(
         run.session.mount,
-        _arm(start.arm, robot),
+        arm,
         start.free.appearance.camera,
         targets[start.board],
         edges[0],
@@ -174,25 +179,34 @@ def _recorded_stops(
     run: RunState, start: "_RecordedStart", edges: FloatArray, first_corner: int
 ) -> RecordedStops:
     """The session's information at the plan's edges."""
-    arm, misfits = (
-        start.arm,
-        () if run.assessment_or_none is None else run.assessment_or_none.residual_tests.values(),
+    arm = start.arm
+    # With few stops, error sizes that noise alone explains are mostly chance.
+    is_likely = arm.is_modelled and arm.errors is not None and arm.errors.is_likely
+    recorded = RecordedStops(
+        *(start.problem, edges, start.free, arm.joints_rad, start.noise, first_corner),
+        arm.errors if is_likely else None,
     )
-    alike = [misfit.neighbours for misfit in misfits if misfit.neighbours is not None]
-    factors = (neighbours.factor for neighbours in alike if neighbours.is_significant)
-    return RecordedStops(
-        start.problem,
-        edges,
-        start.free,
-        arm.joints_rad,
-        start.noise,
-        first_corner,
-        # With few stops, error sizes that noise alone explains are mostly chance.
-        arm.errors if arm.is_modelled and arm.errors and arm.errors.is_likely else None,
-        max(factors, default=1.0),
-        _edge_error_root(run, start),
-        _held_gradient(run, start.problem),
-    )
+    assessment = run.assessment_or_none
+    if assessment is None:
+        return recorded
+    alike = [misfit.neighbours for misfit in assessment.residual_tests.values()]
+    factors = (value.factor for value in alike if value is not None and value.is_significant)
+    # Gradient at held parameters of lens and boards.
+    problem = assessment.problem
+    gradient = normal_equations(problem, assessment.state, assessment.noise)[1]
+    gradient = gradient * (problem.counted & ~problem.moving)
+    columns = [problem.effect_columns[effect.name] for effect in start.problem.effects]
+    held = np.concatenate([np.zeros(0), *(gradient[part.start : part.stop] for part in columns)])
+    recorded = replace(recorded, inflation=max(factors, default=1.0), held=held[:, None])
+    by_arm = assessment.covariance_by_source.get("arm")
+    if arm.is_modelled or by_arm is None:
+        return recorded
+    # Errors of an arm without joint angles.
+    columns = [problem.edge_columns(name) for name in tuple(start.problem.unknown)[:2]]
+    index = np.concatenate([np.arange(part.start, part.stop) for part in columns])
+    values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
+    root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
+    return replace(recorded, edge_error_root=root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,54 +294,25 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     )
 
 
-def _held_gradient(run: RunState, problem: Problem) -> FloatArray:
-    """Gradient (k, 1) at held parameters of lens and boards, if any."""
-    if run.assessment_or_none is None:
-        return np.zeros((0, 0))
-    fitted, state, noise = (
-        run.assessment_or_none.problem,
-        run.assessment_or_none.state,
-        run.assessment_or_none.noise,
-    )
-    gradient = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
-    columns = (fitted.effect_columns[effect.name] for effect in problem.effects)
-    parts = [np.zeros(0), *(gradient[column.start : column.stop] for column in columns)]
-    return np.concatenate(parts)[:, None]
-
-
-def _edge_error_root(run: RunState, start: "_RecordedStart") -> FloatArray:
-    """Root (12, c) of the edges' covariance from errors of an arm without joint angles, if any."""
-    if (
-        run.assessment_or_none is None
-        or start.arm.is_modelled
-        or "arm" not in run.assessment_or_none.covariance_by_source
-    ):
-        return np.zeros((12, 0))
-    columns = map(run.assessment.problem.edge_columns, tuple(start.problem.unknown)[:2])
-    index = np.concatenate([np.arange(column.start, column.stop) for column in columns])
-    values, vectors = np.linalg.eigh(
-        run.assessment_or_none.covariance_by_source["arm"][np.ix_(index, index)]
-    )
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
-
-
-def _arm(arm: RobotArm, robot: Robot) -> Robot:
-    """Robot up to the frame of the reported poses, calibrated where possible."""
-    if arm.model is not None:
-        return arm.model.robot
-    return robot if arm.joints_rad is None else ArmModel.of(robot, arm.joints_rad, arm.poses).robot
-
-
 def _posterior_edges(
     problem: Problem, state: State, noise: Noise, mount: Mount, guess: RoughEdges | None
 ) -> tuple[FloatArray, FloatArray]:
     """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
+    prior = np.full((2, 2, 3), 1e-6)
+    if guess is not None:
+        prior[:] = np.array([[guess.sigma_rad**-2.0], [guess.sigma_m**-2.0]])
+    else:
+        prior[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
     weights = np.zeros((problem.size, problem.size))
-    weights[:12, :12] = np.diag(_prior_weights(mount, guess))
+    weights[:12, :12] = np.diag(prior.ravel())
     for _ in range(_STEPS):
         information, gradient = normal_equations(problem, state, noise)
-        distance = np.zeros(problem.size)
-        distance[:12] = _prior_residual(state.edges[:2], guess)
+        # Twists from the prior to the edges.
+        distance, edges = np.zeros(problem.size), state.edges[:2]
+        if guess is not None:
+            distance[:12] = log(invert(np.stack([guess.x, guess.z])) @ edges).ravel()
+        else:
+            distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges)
         step = -covariance_among(information + weights, problem.moving) @ (
             gradient + weights @ distance
         )
@@ -338,22 +323,6 @@ def _posterior_edges(
         fisher_information(problem, state, noise) + weights, problem.counted
     )
     return state.edges, covariance[:12, :12]
-
-
-def _prior_weights(mount: Mount, guess: RoughEdges | None) -> FloatArray:
-    if guess is not None:
-        return np.tile(np.repeat([guess.sigma_rad**-2.0, guess.sigma_m**-2.0], 3), 2)
-    weights = np.full((2, 2, 3), 1e-6)
-    weights[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
-    return weights.ravel()
-
-
-def _prior_residual(edges: FloatArray, guess: RoughEdges | None) -> FloatArray:
-    """Twists (12,) from the prior to the edges (2, 4, 4)."""
-    if guess is not None:
-        return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())
-    local = [edge[:3, :3].T @ edge[:3, 3] for edge in edges]
-    return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 
 def _missing_input_error(run: RunState) -> DataError:
