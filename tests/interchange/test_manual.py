@@ -13,7 +13,8 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
 from visioncal.interchange.exports import export
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.columns import foreign_from, read_fields
+from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import Arm
 from visioncal.results import Edge

@@ -246,17 +246,15 @@ def _write(
                 # A full disk is no bug, and is reported like a result that cannot be written.
                 if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
                     raise
-                undrawn.append(FailedDrawing(folder / name, _cause(error)))
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                where = f"{Path(place.filename).name}:{place.lineno}"
+                cause = f"{type(error).__name__} at {where}: {error}"
+                undrawn.append(FailedDrawing(folder / name, cause))
 
     # The result last: the other files belong to it.
     written = [*results, *drawings]
     names = [*(other for other in (*others, *without) if other not in written), *reversed(written)]
     return Written(write_generation(folder, names, write), tuple(undrawn))
-
-
-def _cause(error: Exception) -> str:
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"
 
 
 def _text(content: str) -> _Writer:

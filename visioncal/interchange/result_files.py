@@ -103,11 +103,14 @@ def load_result_or_frames(path: Path, robot: str | None = None) -> Calibration |
     Raises:
         DataError: There is neither, or it cannot be read.
     """
-    alone = path.is_dir() and not (path / CALIBRATION).exists() and (path / FRAMES).is_file()
+    return _frames_at(path) or load_calibration(path, Choice(robot=robot), ARM)
+
+
+def _frames_at(path: Path) -> FrameFile | None:
+    """The file of frames of a path, or in a folder without a calibration.json; None for another."""
+    alone = path.is_dir() and not (path / CALIBRATION).exists()
     file = path / FRAMES if alone else path
-    if _holds_frames(file):
-        return FrameFile.load(file)
-    return load_calibration(path, Choice(robot=robot), ARM)
+    return FrameFile.load(file) if _holds_frames(file) else None
 
 
 def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
@@ -127,10 +130,7 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
     file = path / DYNAMICS_FILE if alone and (path / DYNAMICS_FILE).is_file() else path
     if "base" in content_of(file) and "transforms" not in content_of(file):
         return Identified.load(file)
-    frames = path / FRAMES if alone else path
-    if _holds_frames(frames):
-        return FrameFile.load(frames)
-    return load_result(path)
+    return _frames_at(path) or load_result(path)
 
 
 def _holds_frames(path: Path) -> bool:
@@ -173,15 +173,16 @@ def load_stored(path: Path) -> Stored:
     if path.suffix.lower() == ".rrd":
         return _with_recording(calibration, path)
     recording = (path if path.is_dir() else path.parent) / RECORDING
-    if not recording.is_file():
-        return _alone(calibration, f"There is no {RECORDING} beside this result.")
-    try:
-        recorded = load_result(recording)
-        if to_document(recorded) != to_document(calibration):
-            return _alone(calibration, f"The {RECORDING} beside this result holds another one.")
-        return _with_recording(calibration, recording)
-    except DataError as error:
-        return _alone(calibration, error.message)
+    why = f"There is no {RECORDING} beside this result."
+    if recording.is_file():
+        try:
+            if to_document(load_result(recording)) == to_document(calibration):
+                return _with_recording(calibration, recording)
+            why = f"The {RECORDING} beside this result holds another one."
+        except DataError as error:
+            why = error.message
+    words = f"{why} Pictures, coverage and joint angles are left out here."
+    return Stored(calibration, None, (), words)
 
 
 def _with_recording(calibration: Calibration, recording: Path) -> Stored:
@@ -189,12 +190,6 @@ def _with_recording(calibration: Calibration, recording: Path) -> Stored:
 
     session, evidence = read_session(recording), read_evidence(recording)
     return Stored(calibration, session, evidence, review=review_command(recording))
-
-
-def _alone(calibration: Calibration, why: str) -> Stored:
-    return Stored(
-        calibration, None, (), f"{why} Pictures, coverage and joint angles are left out here."
-    )
 
 
 def rewrite_result(folder: Path, calibration: Calibration) -> Written:

@@ -165,11 +165,21 @@ def _content(
             "[rad] of each view.",
             culprits=["q"],
         )
+    camera: Camera | Mapping[str, Any] | None = cell.get("camera")
+    if camera is None:
+        camera = {} if resolution is None else {"resolution": resolution}
+    elif isinstance(camera, Camera):
+        camera = {
+            "resolution": camera.resolution,
+            "model": camera.model,
+            "matrix": camera.matrix,
+            "distortion": camera.distortion,
+        }
     document: dict[str, Any] = {
         "schema": 1,
         "name": cell.get("name", "session"),
         "mount": cell.get("mount", "eye-in-hand"),
-        "camera": _camera(cell.get("camera"), resolution),
+        "camera": {name: np.asarray(value).tolist() for name, value in camera.items()},
     }
     document["target"] = "target.toml" if isinstance(board, Target) else board
     transforms = RigidTransform.from_matrix(matrices)
@@ -189,19 +199,4 @@ def _content(
         "images": images,
         "target_document": target_document(board) if isinstance(board, Target) else None,
         "corners": None,
-    }
-
-
-def _camera(
-    camera: Camera | Mapping[str, Any] | None, resolution: tuple[int, int] | None
-) -> dict[str, Any]:
-    if camera is None:
-        return {} if resolution is None else {"resolution": list(resolution)}
-    if isinstance(camera, Mapping):
-        return {k: np.asarray(value).tolist() for k, value in camera.items()}
-    return {
-        "resolution": list(camera.resolution),
-        "model": camera.model,
-        "matrix": camera.matrix.tolist(),
-        "distortion": camera.distortion.tolist(),
     }

@@ -43,17 +43,7 @@ ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
 }
 # Names of position columns other than in metres.
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
-_PLAIN_NUMBERS = frozenset(
-    {
-        "stamp_s",
-        "ambient_c",
-        *LOAD,
-        *POSE,
-        *MEASURED_CAM_POSE,
-        *INSTRUMENT_POSITION,
-        *INSTRUMENT_QUATERNION,
-    }
-)
+_PLAIN_NUMBERS = frozenset({"stamp_s", "ambient_c", *LOAD}.union(*WHOLE_GROUPS))
 _NUMBERED = re.compile(r"(q[1-9]\d*_rad|tau[1-9]\d*_nm|current[1-9]\d*_a|temp[1-9]\d*_c)", re.ASCII)
 _JOINT, _JOINT_DEG = re.compile(r"q([1-9][0-9]*)_rad"), re.compile(r"q[1-9][0-9]*_deg")
 _TEXTS = frozenset(

@@ -128,20 +128,17 @@ def parse_corners(text: str) -> CornerTable:
     px = reader.numbers(*(Column(name, is_needed=True) for name in _NEEDED[2:]))
     sigmas = None
     if any(reader.texts(_SIGMA)):
-        sigmas = reader.numbers(Column(_SIGMA, _LEAST_PX, _MOST_PX, _no_sigma))[:, 0]
+        words = (
+            "{:g} px is no standard deviation of a corner, which lies between "
+            f"{_LEAST_PX:g} and {_MOST_PX:g} px; leave out the rows of corners that do not count"
+        )
+        sigmas = reader.numbers(Column(_SIGMA, _LEAST_PX, _MOST_PX, words.format))[:, 0]
         empty = np.flatnonzero(np.isnan(sigmas)).tolist()
         if empty and reader.is_sound(empty[0]):
             reader.report(empty[0], _SIGMA, "it is empty; all rows state it, or none")
     reader.check()
     lines = np.array(table.lines, dtype=np.int64)
     return CornerTable(views, points, px, tuple(reader.texts(COLUMN)), sigmas, lines=lines)
-
-
-def _no_sigma(value: float) -> str:
-    return (
-        f"{value:g} px is no standard deviation of a corner, which lies between {_LEAST_PX:g} and "
-        f"{_MOST_PX:g} px; leave out the rows of corners that do not count"
-    )
 
 
 def write_corners(table: CornerTable) -> str:
@@ -193,11 +190,8 @@ def with_corners(
         raise problems_error(problems)
     if not names:
         has = set(table.views.tolist())
-        return (
-            columns,
-            tuple(replace(view, has_corners=view.number in has) for view in views),
-            table,
-        )
+        marked = tuple(replace(view, has_corners=view.number in has) for view in views)
+        return columns, marked, table
     shown = [stated or by_view for stated, by_view in zip(table.targets, named, strict=True)]
     numbers = table.views.copy()
     added: list[View] = []
@@ -366,7 +360,11 @@ def corners_by_view(
     cuts = np.flatnonzero(np.diff(table.views[order])) + 1
     rows_of = {int(table.views[part[0]]): part for part in np.split(order, cuts) if len(part)}
     camera_of = {view.number: name_of(declaration, "camera", view) for view in views}
-    medians_px = _median_sigmas_px(table, rows_of, camera_of)
+    sigmas, by_camera = table.sigmas_px, dict[str, list[FloatArray]]()
+    for view, camera in camera_of.items():
+        if sigmas is not None and view in rows_of:
+            by_camera.setdefault(camera, []).append(sigmas[rows_of[view]])
+    medians_px = {name: float(np.median(np.concatenate(px))) for name, px in by_camera.items()}
     index_of = {
         target: {number: at for at, number in enumerate(point_numbers(target))}
         for target in dict.fromkeys(board_of.values())
@@ -378,20 +376,6 @@ def corners_by_view(
         ids = np.array([index[point] for point in table.points[rows].tolist()], np.int64)
         order = np.argsort(ids)
         rows, stated_px = rows[order], medians_px.get(camera_of[view])
-        sigmas = table.sigmas_px
         weights = None if sigmas is None or stated_px is None else stated_px / sigmas[rows]
         corners[view] = Corners(view, ids[order], table.px[rows], 0.0, weights, stated_px)
     return corners
-
-
-def _median_sigmas_px(
-    table: CornerTable, rows_of: Mapping[int, IntArray], camera_of: Mapping[int, str]
-) -> dict[str, float]:
-    """Median of the stated standard deviations of each camera's corners [px]."""
-    if table.sigmas_px is None:
-        return {}
-    by_camera: dict[str, list[FloatArray]] = {}
-    for view, camera in camera_of.items():
-        if view in rows_of:
-            by_camera.setdefault(camera, []).append(table.sigmas_px[rows_of[view]])
-    return {camera: float(np.median(np.concatenate(group))) for camera, group in by_camera.items()}

@@ -256,20 +256,16 @@ def read_declaration(
         problems = list(_contradictions(declaration, observed))
         hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
     if problems:
+        given = str(document.get("mount", ""))
+        spelt = given.lower().replace("_", "-").replace(" ", "-")
+        if spelt in get_args(CameraMount) and spelt != given:
+            hints = [f'In {label}, write mount = "{spelt}".']
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
             culprits=[f"{label}: {field}" for field, _ in problems],
-            next_step=_nearest_mount(document, label) or " ".join(hints),
+            next_step=" ".join(hints),
         )
     return declaration
-
-
-def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
-    """Remedy for a mount in another spelling; else empty."""
-    given = str(document.get("mount", ""))
-    spelt = given.lower().replace("_", "-").replace(" ", "-")
-    is_misspelt = spelt in get_args(CameraMount) and spelt != given
-    return f'In {label}, write mount = "{spelt}".' if is_misspelt else ""
 
 
 def _type_errors(
@@ -359,6 +355,9 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
         yield from _camera_contradictions(one, f"cameras.{name}")
     for kind in KINDS:
         yield from _plural_contradictions(declaration, kind)
+    for name in declaration.clocks:
+        if name not in declaration.cameras:
+            yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
     yield from _prior_contradictions(declaration)
     need = declaration.need
     if need is not None and need.mm is None and need.deg is None and not need.corrected:
@@ -368,9 +367,6 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
 
 
 def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
-    for name in declaration.clocks:
-        if name not in declaration.cameras:
-            yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
     for edge, prior in declaration.prior.items():
         turn, places = prior.quaternion_xyzw, (prior.x_m, prior.y_m, prior.z_m)
         if not any(place is not None for place in places):
@@ -384,20 +380,15 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
             yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
         if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
             yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
-        yield from _prior_range_errors(edge, prior)
-
-
-def _prior_range_errors(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
-    on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
-    most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
-    for name in ("x_m", "y_m", "z_m"):
-        value = getattr(prior, name)
-        if value is not None and abs(value) > most:
-            yield (
-                f"prior.{edge}.{name}",
-                f"is {value:g}, but is in metres, at most {most:g} {where}: write "
-                f"{1e-3 * value:g} for {value:g} mm",
-            )
+        on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
+        most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
+        for axis, place in zip("xyz", places, strict=True):
+            if place is not None and abs(place) > most:
+                yield (
+                    f"prior.{edge}.{axis}_m",
+                    f"is {place:g}, but is in metres, at most {most:g} {where}: write "
+                    f"{1e-3 * place:g} for {place:g} mm",
+                )
 
 
 def _plural_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:

@@ -5,7 +5,7 @@ its children; each flange is a child of its base, through the robot; cameras, bo
 be children of a flange.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -92,16 +92,13 @@ def frame_of_object(frames: Iterable[str], kind: str, name: str) -> str:
 
 def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[str, ...]:
     """Names of the robots between two frames, whose motion moves them relative to each other."""
-    ancestors = [set(_ancestors(frames, frame)) for frame in (first, second)]
-    not_shared = ancestors[0] ^ ancestors[1]
+    not_shared: set[str] = set()
+    for frame in (first, second):
+        while frame != CELL:
+            not_shared ^= {frame}
+            frame = frames[frame]  # noqa: PLW2901 - up to the cell
     flanges = sorted(name for name in not_shared if _is_flange(name))
     return tuple(flange.removeprefix("flange").removeprefix("_") for flange in flanges)
-
-
-def _ancestors(frames: Mapping[str, str], frame: str) -> Iterator[str]:
-    while frame != CELL:
-        yield frame
-        frame = frames[frame]
 
 
 def _is_flange(frame: str) -> bool:
@@ -119,30 +116,22 @@ class _DeclaredTree:
     @cached_property
     def frames(self) -> dict[str, tuple[str, str]]:
         """All frames but the cell, with their kinds and names."""
-        listed = [("base", robot) for robot in self.robots] + [
-            ("flange", robot) for robot in self.robots
-        ]
-        for kind in ("camera", "target", "instrument"):
-            listed += [(kind, name) for name in self._names(kind)]
+        listed = [(kind, robot) for kind in ("base", "flange") for robot in self.robots]
+        kinds: tuple[Kind, ...] = ("camera", "target", "instrument")
+        for kind in kinds:
+            test = is_instrument_reading if kind == "instrument" else is_camera_observation
+            # One without a name, where rows are of the kind and none is declared.
+            unnamed = [""] if any(map(test, self.views)) else []
+            listed += [(kind, name) for name in [*self.declaration.named(kind)] or unnamed]
         points = dict.fromkeys(view.point for view in self.views if is_instrument_reading(view))
         listed += [("point", name) for name in points]
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
-
-    def _names(self, kind: Kind) -> tuple[str, ...]:
-        """Names of a kind; one without a name where rows are of it and none is declared."""
-        test = is_instrument_reading if kind == "instrument" else is_camera_observation
-        declared = tuple(self.declaration.named(kind))
-        return declared or (("",) if any(test(view) for view in self.views) else ())
 
     @cached_property
     def fixtures(self) -> tuple[str, ...]:
         """Fixtures that `[frames]` introduces."""
         words = [*self.declaration.frames, *map(str, self.declaration.frames.values())]
-        return tuple(
-            dict.fromkeys(
-                word for word in words if word == _FIXTURE or word.startswith(f"{_FIXTURE}_")
-            )
-        )
+        return frames_of_kind(dict.fromkeys(words), _FIXTURE)
 
     @cached_property
     def declared(self) -> dict[str, str]:
@@ -157,7 +146,14 @@ class _DeclaredTree:
                 )
             for frame in (child, parent):
                 if frame not in known:
-                    raise _unknown_frame(frame, child, known)
+                    what = f"{frame!r}" if frame == child else f"{child} hangs on {frame!r}, which"
+                    raise _contradiction(
+                        f"{what} is no frame of this session; those are {', '.join(known)}",
+                        child,
+                        did_you_mean(str(frame), known)
+                        or "A fixture is named fixture_NAME; cameras, robots, targets and "
+                        "instruments as their tables.",
+                    )
             declared[child] = parent
         for robot in self.robots:
             base, flange = frame_name("base", robot), frame_name("flange", robot)
@@ -172,11 +168,18 @@ class _DeclaredTree:
                 f"{CELL} hangs on {declared[CELL]}, but all else stands in it: it hangs on nothing",
                 CELL,
             )
-        _check_cycles(declared)
-        self._check_mount(declared)
+        self._check(declared)
         return declared
 
-    def _check_mount(self, declared: Mapping[str, str]) -> None:
+    def _check(self, declared: Mapping[str, str]) -> None:
+        """Refuses frames that are their own ancestors, or contradict `mount`."""
+        for start in declared:
+            chain = [start]
+            while (above := declared.get(chain[-1])) is not None:
+                if above in chain:
+                    cycle = [*chain[chain.index(above) :], above]
+                    raise _contradiction(f"it goes round in a circle: {' on '.join(cycle)}", above)
+                chain.append(above)
         mount = self.declaration.mount
         for child in self.declaration.frames if mount is not None else ():
             parent = _carrier(declared, child, self)
@@ -208,31 +211,28 @@ class _DeclaredTree:
 
     def _inferred_parent(self, frame: str, parents: Mapping[str, str]) -> str | None:
         """Inferred parent of a frame; None where ambiguous."""
-        kind, _ = self.frames[frame]
+        kind, name = self.frames[frame]
         if kind == "instrument":
             return CELL
         if kind == "point":
-            return self._parent_of_point(frame)
+            # The flange of the robot in its rows; fixed where rows have no pose.
+            read = [row for row in self.views if is_instrument_reading(row) and row.point == name]
+            moved = [row for row in read if has_robot_state(row)]
+            if moved:
+                return self._flange_of(frame) if len(moved) == len(read) else None
+            is_alone = len(self.robots) < 2 and not self.declaration.is_network
+            return self._flange_of(frame) if is_alone else CELL
         moves = {"eye-in-hand": "camera", "eye-to-hand": "target"}.get(self.declaration.mount or "")
         if moves is not None:
             return self._flange_of(frame) if kind == moves else CELL
         if len(self.robots) == 1:
-            flange, others = frame_name("flange", self.robots[0]), self._observation_partners(frame)
+            seen = [view for view in self.views if is_camera_observation(view)]
+            pairs = [observed(self.declaration, view) for view in seen if not view.is_of_lens]
+            others = {other for pair in pairs if frame in pair for other in pair} - {frame}
             carriers = {_carrier(parents, other, self) for other in others if other in parents}
             # Camera and board are not on the same flange: they would not move relatively.
-            return CELL if flange in carriers else None
+            return CELL if frame_name("flange", self.robots[0]) in carriers else None
         return None
-
-    def _parent_of_point(self, frame: str) -> str | None:
-        """Parent of a point: the flange of the robot in its rows; fixed where rows have no pose."""
-        _, name = self.frames[frame]
-        rows = [view for view in self.views if is_instrument_reading(view) and view.point == name]
-        moved = [row for row in rows if has_robot_state(row)]
-        if not moved and len(self.robots) < 2:
-            return CELL if self.declaration.is_network else self._flange_of(frame)
-        if not moved:
-            return CELL
-        return self._flange_of(frame) if len(moved) == len(rows) else None
 
     def _flange_of(self, frame: str) -> str | None:
         """Flange of the only robot, or of the only one in the rows of a frame."""
@@ -244,15 +244,6 @@ class _DeclaredTree:
             if has_robot_state(view) and frame in observed(self.declaration, view)
         }
         return frame_name("flange", named.pop()) if len(named) == 1 else None
-
-    def _observation_partners(self, frame: str) -> set[str]:
-        """Frames that a camera observes, or that observe a target."""
-        pairs = [
-            observed(self.declaration, view)
-            for view in self.views
-            if is_camera_observation(view) and not view.is_of_lens
-        ]
-        return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
     def _undetermined_error(self, missing: Sequence[str]) -> DataError:
         mount = self.declaration.mount
@@ -300,31 +291,9 @@ def _carrier(parents: Mapping[str, str], frame: str, tree: _DeclaredTree) -> str
     return parent
 
 
-def _check_cycles(parents: Mapping[str, str]) -> None:
-    for start in parents:
-        chain = [start]
-        while (parent := parents.get(chain[-1])) is not None:
-            if parent in chain:
-                cycle = [*chain[chain.index(parent) :], parent]
-                raise _contradiction(f"it goes round in a circle: {' on '.join(cycle)}", parent)
-            chain.append(parent)
-
-
 def _contradiction(words: str, frame: str, next_step: str = "") -> DataError:
     return DataError(
         f"session.toml, [frames]: {words}.",
         culprits=[f"{_WHERE}.{frame}"],
         next_step=next_step or "Correct [frames].",
-    )
-
-
-def _unknown_frame(frame: object, child: str, known: Sequence[str]) -> DataError:
-    what = f"{frame!r}" if frame == child else f"{child} hangs on {frame!r}, which"
-    return DataError(
-        f"session.toml, [frames]: {what} is no frame of this session; those are "
-        f"{', '.join(known)}.",
-        culprits=[f"{_WHERE}.{child}"],
-        next_step=did_you_mean(str(frame), known)
-        or "A fixture is named fixture_NAME; cameras, robots, targets and instruments as their "
-        "tables.",
     )

@@ -36,14 +36,6 @@ class Observation:
     missing_robots: tuple[str, ...] = ()  # The robots between the two without a pose at this stop.
 
 
-@dataclass(frozen=True, eq=False)
-class _StopRows:
-    """The rows of one stop, and for each robot the row with the majority's pose."""
-
-    rows: tuple[View, ...]
-    robot_rows: Mapping[str, View]
-
-
 def observations_of(
     declaration: Declaration, views: Sequence[View], frames: Mapping[str, str]
 ) -> tuple[Observation, ...]:
@@ -53,13 +45,13 @@ def observations_of(
     """
     index_of = {view.number: at for at, view in enumerate(views)}
     observations, station = [], 0
-    for stop in _stops(declaration, views):
+    for rows, robot_rows in _stops(declaration, views):
         # Rows that contradict the majority's pose are of another state of the cell.
         states: dict[tuple[int, ...], int] = {}
-        for view in stop.rows:
+        for view in rows:
             own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
-            strays = {name: row for name, row in own.items() if _differ(row, stop.robot_rows[name])}
-            by_robot = {**stop.robot_rows, **strays}
+            strays = {name: row for name, row in own.items() if _differ(row, robot_rows[name])}
+            by_robot = {**robot_rows, **strays}
             key = tuple(by_robot[name].number for name in sorted(by_robot))
             seer, seen = observed(declaration, view)
             if not seer:
@@ -77,20 +69,23 @@ def robot_rows_at_stops(
     declaration: Declaration, views: Sequence[View]
 ) -> dict[int, Mapping[str, View]]:
     """Rows with the robots' poses at each row's stop: by view number, then by robot."""
-    robot_rows: dict[int, Mapping[str, View]] = {}
-    for stop in _stops(declaration, views):
-        robot_rows |= dict.fromkeys((row.number for row in stop.rows), stop.robot_rows)
-    return robot_rows
+    return {
+        row.number: robot_rows for rows, robot_rows in _stops(declaration, views) for row in rows
+    }
 
 
 def _still_since(views: Iterable[View]) -> dict[int, int]:
     """First view of each run of one robot's rows in which it stood still, by view number."""
     run_starts: dict[int, int] = {}
-    first = last = None
+    first: View | None = None
+    last_s: float | None = None
     for view in views:
-        if first is None or last is None or _moved(first, view) or _long_between(last, view):
+        both = view.stamp_s is not None and last_s is not None
+        # So far apart in time, the robot may have moved in between.
+        is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > LONG_S
+        if first is None or _moved(first, view) or is_late:
             first = view
-        last, run_starts[view.number] = view, first.number
+        last_s, run_starts[view.number] = view.stamp_s, first.number
     return run_starts
 
 
@@ -112,29 +107,28 @@ def _moved(first: View, second: View) -> bool:
     return bool(np.abs(joints[0] - joints[1]).max() > _STILL_RAD)
 
 
-def _long_between(first: View, second: View) -> bool:
-    """Whether two rows are so far apart in time that the robot may have moved between them."""
-    if first.stamp_s is None or second.stamp_s is None:
-        return False
-    return abs(second.stamp_s - first.stamp_s) > LONG_S
-
-
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
     """Warnings of rows whose pose of a robot contradicts their stop."""
-    for stop in _stops(declaration, views):
-        for view in stop.rows:
+    for rows, robot_rows in _stops(declaration, views):
+        for view in rows:
             robot = name_of(declaration, "robot", view)
-            if has_robot_state(view) and _differ(view, stop.robot_rows[robot]):
+            if has_robot_state(view) and _differ(view, robot_rows[robot]):
                 of = f" of robot {robot}" if robot else ""
                 yield (
                     f"views.csv: view {view.number} has another pose{of} than view "
-                    f"{stop.robot_rows[robot].number} of the same stop {view.stop}. One of the two "
+                    f"{robot_rows[robot].number} of the same stop {view.stop}. One of the two "
                     "belongs to another stop."
                 )
 
 
-def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
-    """Groups rows by stop number; without one, by runs in which their robot stood still."""
+def _stops(
+    declaration: Declaration, views: Sequence[View]
+) -> list[tuple[Sequence[View], dict[str, View]]]:
+    """Groups rows by stop number; without one, by runs in which their robot stood still.
+
+    Returns:
+        The rows of each stop, and for each robot the row with the pose that most of them agree on.
+    """
     groups: dict[tuple[int, int], list[View]] = {}
     rows_of: dict[str, list[View]] = {}
     for view in views:
@@ -145,21 +139,18 @@ def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
         groups.setdefault(key, []).append(view)
-    return [_StopRows(tuple(rows), _robot_rows(declaration, rows)) for rows in groups.values()]
+    return [(rows, _robot_rows(declaration, rows)) for rows in groups.values()]
 
 
 def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
-    """For each robot, the row with the pose that most rows of a stop agree on."""
     rows_of: dict[str, list[View]] = {}
     for view in rows:
         if has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
     majority = {}
     for robot, own in rows_of.items():
-        counts, first = (
-            Counter(map(_pose_cells, own)),
-            {_pose_cells(view): view for view in own[::-1]},
-        )
+        counts = Counter(map(_pose_cells, own))
+        first = {_pose_cells(view): view for view in own[::-1]}
         votes = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )

@@ -1,22 +1,27 @@
-"""Atomic writing of a session as a self-contained folder."""
+"""Storage of a session: atomic writing as a self-contained folder, and digest of its content."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import date, time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256, temporary_folder, write_atomically
 from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES, robot_file
-from visioncal.session.corners import CornerTable
-from visioncal.session.document import Declaration
-from visioncal.session.images import ImageStore, inside_path
-from visioncal.session.streams import Stream
-from visioncal.session.table import View
+from visioncal.session.corners import FILE as CORNERS
+from visioncal.session.corners import write_corners
+from visioncal.session.document import RobotTable, TargetTable
+from visioncal.session.images import inside_path
+from visioncal.session.streams import FOLDER as STREAMS
+from visioncal.session.streams import write_stream
+from visioncal.session.table import write_csv
 from visioncal.vision.targets import rig_csv
+
+if TYPE_CHECKING:
+    from visioncal.session.session import Session
 
 
 def refuse_filled(folder: Path) -> None:
@@ -33,23 +38,25 @@ def refuse_filled(folder: Path) -> None:
         )
 
 
-def write_folder(
-    folder: Path, texts: Mapping[str, str], images: ImageStore, paths: Sequence[str]
-) -> None:
-    """Writes texts by path, and images that are not missing, into a new or empty folder.
-
-    Raises:
-        DataError: The folder exists and is not empty, or cannot be written; or only the digest of
-            an image is available.
-    """
+def save_session(session: "Session", folder: Path) -> None:
+    """Writes a session atomically; see `Session.save`."""
     folder = folder.absolute()
+    document, texts = _placed_files(session)
+    texts["session.toml"] = tomli_w.dumps(document)
+    if session.views or not session.streams:
+        texts["views.csv"] = write_csv(session.columns, session.views)
+    if session.corner_table is not None:
+        texts[CORNERS] = write_corners(session.corner_table)
+    for name, stream in session.streams.items():
+        texts[f"{STREAMS}/{name}.csv"] = write_stream(stream)
+    images = session.images
     refuse_filled(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(folder.parent) as (aside, _):
             new = aside / "new"
             new.mkdir()
-            for path in paths:
+            for path in dict.fromkeys(view.image for view in session.views if view.image):
                 # Reading fails for an image of which only the digest is available.
                 if images.exists(path) or images.sha256(path):
                     _write_below(new, path, images.read(path))
@@ -64,73 +71,52 @@ def write_folder(
         ) from error
 
 
-def placed_files(
-    declaration: Declaration,
-    document: Mapping[str, Any],
-    target_document: Mapping[str, Any] | None,
-    robot_document: Mapping[str, Any] | None,
-) -> tuple[dict[str, Any], dict[str, str]]:
+def _write_below(folder: Path, path: str, data: bytes | str) -> None:
+    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / path, data)
+
+
+def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
     """Moves target and robot files into the session's folder.
 
     Returns:
         The content of session.toml with paths in the folder, and the files' texts by these paths.
         Built-in names are kept.
     """
-    placed = dict(document)
-    texts = {} if target_document is None else _place_targets(declaration, placed, target_document)
-    if robot_document is not None:
-        texts |= _place_robots(declaration, placed, robot_document)
+    declaration, placed, texts = session.declaration, dict(session.document), dict[str, str]()
+    target_document, robot_document = session.target_document, session.robot_document
+    for name, entry in declaration.named("target").items():
+        stated = entry.target if isinstance(entry, TargetTable) else ""
+        if target_document is None or not is_file(stated):
+            continue
+        path = _place_inside(stated, f"target_{name}.toml" if name else "target.toml")
+        content = target_document[name] if len(declaration.targets) > 1 else target_document
+        points = content.get("points")
+        if content.get("kind") == "points" and isinstance(points, Mapping):
+            table = Path(path).with_suffix(".points.csv")
+            content = {**content, "points": table.name}
+            texts[table.as_posix()] = rig_csv(points)
+        texts[path] = tomli_w.dumps(content)
+        if name:
+            kept = {**entry.model_dump(), "target": path}
+            placed["targets"] = {**placed["targets"], name: kept}
+        else:
+            placed["target"] = path
+    for name, robot in declaration.named("robot").items():
+        model = robot.model if isinstance(robot, RobotTable) else None
+        several = len(declaration.robots) > 1
+        described = (robot_document or {}).get(name) if several else robot_document
+        if model is None or not is_file(model) or described is None:
+            continue
+        file, text = robot_file(described, model)
+        path = _place_inside(model, f"{name}_{file}" if name else file)
+        texts[path] = text
+        if name:
+            kept = {**robot.model_dump(exclude_none=True), "model": path}
+            placed["robots"] = {**placed["robots"], name: kept}
+        else:
+            placed["robot"] = {**placed["robot"], "model": path}
     return placed, texts
-
-
-def _place_targets(
-    declaration: Declaration, document: dict[str, Any], contents: Mapping[str, Any]
-) -> dict[str, str]:
-    if is_file(declaration.target):
-        document["target"] = _place_inside(str(declaration.target), "target.toml")
-        return _target_texts(document["target"], contents)
-    texts: dict[str, str] = {}
-    several = len(declaration.targets) > 1
-    for name, table in declaration.targets.items():
-        if is_file(table.target):
-            path = _place_inside(table.target, f"target_{name}.toml")
-            kept = {**table.model_dump(), "target": path}
-            document["targets"] = {**document["targets"], name: kept}
-            texts |= _target_texts(path, contents[name] if several else contents)
-    return texts
-
-
-def _target_texts(path: str, content: Mapping[str, Any]) -> dict[str, str]:
-    """Text of a target's file, and of the table of a rig's points, by path."""
-    points = content.get("points")
-    if content.get("kind") != "points" or not isinstance(points, Mapping):
-        return {path: tomli_w.dumps(content)}
-    table = Path(path).with_suffix(".points.csv")
-    return {
-        path: tomli_w.dumps({**content, "points": table.name}),
-        table.as_posix(): rig_csv(points),
-    }
-
-
-def _place_robots(
-    declaration: Declaration, document: dict[str, Any], contents: Mapping[str, Any]
-) -> dict[str, str]:
-    only = declaration.robot
-    if only is not None and only.model is not None and is_file(only.model):
-        name, content = robot_file(contents, only.model)
-        model = _place_inside(only.model, name)
-        document["robot"] = {**document["robot"], "model": model}
-        return {model: content}
-    texts, several = {}, len(declaration.robots) > 1
-    for robot, table in declaration.robots.items():
-        model_document = contents.get(robot) if several else contents
-        if table.model is not None and is_file(table.model) and model_document is not None:
-            name, content = robot_file(model_document, table.model)
-            path = _place_inside(table.model, f"{robot}_{name}")
-            kept = {**table.model_dump(exclude_none=True), "model": path}
-            document["robots"] = {**document["robots"], robot: kept}
-            texts[path] = content
-    return texts
 
 
 def _place_inside(path: str, fallback: str) -> str:
@@ -141,76 +127,53 @@ def _place_inside(path: str, fallback: str) -> str:
         return fallback
 
 
-def _write_below(folder: Path, path: str, data: bytes | str) -> None:
-    (folder / path).parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / path, data)
+def digest_of(session: "Session") -> str:
+    """Computes the SHA-256 digest of a session's canonical content; see `Session.digest`.
 
-
-def digest_facts(
-    document: Mapping[str, object],
-    target_document: Mapping[str, object] | None,
-    robot_document: Mapping[str, object] | None,
-    columns: Sequence[str],
-    views: Sequence[View],
-    images: ImageStore,
-    streams: Mapping[str, Stream],
-    corners: CornerTable | None,
-) -> str:
-    """Computes the SHA-256 digest of a session's canonical content.
-
-    It depends on the contents of target and robot files, not on their names, nor on folders,
-    formatting and the spelling of numbers. The robot's link dimensions, masses and drives, and the
-    task's need, are not part of it.
+    The robot's link dimensions, masses and drives, and the task's need, are not part of it.
     """
-    digests = {path: images.sha256(path) for path in sorted({view.image for view in views} - {""})}
-    kept = {name: value for name, value in document.items() if name != "need"}
-    if is_file(kept.get("target")):
-        del kept["target"]
-    targets = kept.get("targets")
-    if isinstance(targets, Mapping):
-        kept["targets"] = {name: _pathless(entry, "target") for name, entry in targets.items()}
-    robot = kept.get("robot")
-    if isinstance(robot, Mapping) and is_file(robot.get("model")):
-        kept["robot"] = {key: value for key, value in robot.items() if key != "model"}
-    robots = kept.get("robots")
-    if isinstance(robots, Mapping):
-        kept["robots"] = {name: _pathless(entry, "model") for name, entry in robots.items()}
+    paths = sorted({view.image for view in session.views} - {""})
+    digests = {path: session.images.sha256(path) for path in paths}
+    document = {name: value for name, value in session.document.items() if name != "need"}
+    if is_file(document.get("target")):
+        del document["target"]
+    if "robot" in document:
+        document["robot"] = _pathless(document["robot"], "model")
+    for kind, field in (("targets", "target"), ("robots", "model")):
+        several = document.get(kind)
+        if isinstance(several, Mapping):
+            document[kind] = {name: _pathless(entry, field) for name, entry in several.items()}
+    robots, models = document.get("robots"), session.robot_document
+    if models is not None and isinstance(robots, Mapping) and len(robots) > 1:
+        items = models.items()
+        models = {name: _without_bodies(one) for name, one in items if isinstance(one, Mapping)}
+    elif models is not None:
+        models = _without_bodies(models)
     facts: dict[str, object] = {
-        "document": kept,
-        "target": target_document,
-        "robot": None if robot_document is None else _robots(document, robot_document),
-        "columns": columns,
+        "document": document,
+        "target": session.target_document,
+        "robot": models,
+        "columns": session.columns,
         # Values of numbers, independent of their spelling.
         "rows": [
             [
                 view.numbers[column] if column in view.numbers else view.cell(column)
-                for column in columns
+                for column in session.columns
             ]
-            for view in views
+            for view in session.views
         ],
         "images": {path: digest for path, digest in digests.items() if digest},
     }
-    if streams:
-        facts["streams"] = {name: stream.fact() for name, stream in streams.items()}
-    if corners is not None:
-        facts["corners"] = corners.fact()
+    if session.streams:
+        facts["streams"] = {name: stream.fact() for name, stream in session.streams.items()}
+    if session.corner_table is not None:
+        facts["corners"] = session.corner_table.fact()
     return sha256(json.dumps(_canonical(facts), sort_keys=True).encode())
 
 
 def is_file(name: object) -> bool:
     """Whether a name is a path, not a built-in name."""
     return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
-
-
-def _robots(
-    document: Mapping[str, object], robot_document: Mapping[str, object]
-) -> dict[str, object]:
-    """The robot's model, or several by name."""
-    several = document.get("robots")
-    if not isinstance(several, Mapping) or len(several) < 2:
-        return _without_bodies(robot_document)
-    models = robot_document.items()
-    return {name: _without_bodies(value) for name, value in models if isinstance(value, Mapping)}
 
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:

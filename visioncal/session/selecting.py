@@ -96,11 +96,19 @@ def choose(
             camera and target.
     """
     by_part = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
-    named = {
-        part: _frame(by_part[part], part, name, label)
-        for part in PARTS
-        if (name := choice.of(part))
-    }
+    named = {}
+    for part in PARTS:
+        if name := choice.of(part):
+            names = [object_name(frame, part) for frame in by_part[part]]
+            pairs = zip(by_part[part], names, strict=True)
+            same = [frame for frame, short in pairs if name in (frame, short)]
+            if not same:
+                raise DataError(
+                    f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
+                    culprits=[f"--{part}"],
+                    next_step=did_you_mean(name, names),
+                )
+            named[part] = same[0]
     options = [
         option
         for option in _combinations(frames, by_part, parted=robot_between)
@@ -128,19 +136,6 @@ def choose(
 
 # Kind of a part's frame: a robot is identified by its flange.
 _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
-
-
-def _frame(frames: Collection[str], part: Part, name: str, label: str) -> str:
-    """Frame of a named part."""
-    for frame in frames:
-        if name in (frame, object_name(frame, part)):
-            return frame
-    names = [object_name(word, part) for word in frames]
-    raise DataError(
-        f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
-        culprits=[f"--{part}"],
-        next_step=did_you_mean(name, names),
-    )
 
 
 def _combinations(
@@ -257,7 +252,20 @@ def select(
         return session
     if "camera" not in needs:
         chosen = replace(chosen, camera="", target="")
-    rows = dict(_rows(session, chosen))
+    robot_rows = robot_rows_at_stops(session.declaration, session.views)
+    seen = {one.view.number: (one.seer, one.seen) for one in session.observations}
+    # The selected rows, each with the robot's numbers at its stop.
+    rows: dict[int, tuple[View, Mapping[str, float]]] = {}
+    for view in session.views:
+        sees = is_camera_observation(view)
+        if chosen.camera:
+            is_selected = sees and seen.get(view.number) == (chosen.camera, chosen.target)
+        else:
+            robot = name_of(session.declaration, "robot", view)
+            is_selected = has_robot_state(view) and not sees and robot == chosen.robot
+        if is_selected:
+            robot_row = robot_rows[view.number].get(chosen.robot)
+            rows[view.number] = view, {} if robot_row is None else robot_row.numbers
     # Columns that only other robots fill, as joints of one with more axes, are dropped.
     filled = {name for _, numbers in rows.values() for name in numbers}
     columns = tuple(
@@ -318,48 +326,17 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
 
 
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
-    """The streams of one robot, and those of no robot, by name."""
-    owners = {None, robot or "robot"}
-    return {
-        name: stream
-        for name, stream in session.streams.items()
-        if _robot_of(session, name) in owners
-    }
+    """The streams of one robot, and those of no robot, by name.
 
-
-def _robot_of(session: "Session", stream: str) -> str | None:
-    """Robot of a stream, whose name it has or begins with, as `a` and `a_excite`; else None."""
-    names = (robot or "robot" for robot in session.robots)
-    fitting = [name for name in names if stream == name or stream.startswith(f"{name}_")]
-    return max(fitting, key=len, default=None)
-
-
-def _rows(
-    session: "Session", chosen: Chosen
-) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
-    """The selected rows by view number, with the robot's numbers at their stop."""
-    declaration, robot_rows = (
-        session.declaration,
-        robot_rows_at_stops(session.declaration, session.views),
-    )
-    seen = {
-        observation.view.number: (observation.seer, observation.seen)
-        for observation in session.observations
-    }
-    for view in session.views:
-        if chosen.camera:
-            is_selected = is_camera_observation(view) and seen.get(view.number) == (
-                chosen.camera,
-                chosen.target,
-            )
-        else:
-            robot = name_of(declaration, "robot", view)
-            is_selected = (
-                has_robot_state(view) and not is_camera_observation(view) and robot == chosen.robot
-            )
-        if is_selected:
-            robot_row = robot_rows[view.number].get(chosen.robot)
-            yield view.number, (view, {} if robot_row is None else robot_row.numbers)
+    A stream has the name of its robot, or begins with it, as `a` and `a_excite`.
+    """
+    names = [name or "robot" for name in session.robots]
+    streams = {}
+    for stream, series in session.streams.items():
+        fitting = [name for name in names if stream == name or stream.startswith(f"{name}_")]
+        if max(fitting, key=len, default=None) in (None, robot or "robot"):
+            streams[stream] = series
+    return streams
 
 
 def _cell(view: View, robot_row: Mapping[str, float], column: str) -> str:
@@ -383,40 +360,26 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
         ("robot", chosen.robot),
         ("target", chosen.target.partition("_")[2]),
     ):
-        table = _table(session.document, kind, name)
+        several = session.document.get(f"{kind}s", {})
+        table = several.get(name, session.document.get(kind))
+        # Short forms are expanded.
+        if name in several and kind == "target" and not isinstance(table, str):
+            table = table["target"]
+        elif name in several and kind != "target" and isinstance(table, str):
+            table = {"model": table}
         if table is not None:
             document[kind] = table
     clock = declaration.clocks.get(chosen.camera.partition("_")[2])
     if clock is not None:
         document["clock"] = clock.model_dump(exclude_unset=True)
-    if prior := dict(_priors(session, chosen)):
-        document["prior"] = prior
-    return document
-
-
-def _table(document: Mapping[str, Any], kind: str, name: str) -> Any:  # noqa: ANN401 - TOML's
-    """A kind's table in its singular form; short forms are expanded."""
-    several = document.get(f"{kind}s", {})
-    if name not in several:
-        return document.get(kind)
-    table = several[name]
-    if kind == "target":
-        return table if isinstance(table, str) else table["target"]
-    return {"model": table} if isinstance(table, str) else table
-
-
-def _priors(session: "Session", chosen: Chosen) -> Iterator[tuple[str, Any]]:
-    """Priors of the edges, by their names in the selected session."""
-    short = {
-        chosen.base: "base",
-        chosen.flange: "flange",
-        chosen.camera: "cam",
-        chosen.target: "target",
-    }
+    frames = (chosen.base, chosen.flange, chosen.camera, chosen.target)
+    short = dict(zip(frames, ("base", "flange", "cam", "target"), strict=True))
+    priors = {}
     for edge, prior in session.document.get("prior", {}).items():
         ends = [short.get(part) for part in edge.split("_from_")]
         if len(ends) == 2 and all(ends):
-            yield f"{ends[0]}_from_{ends[1]}", prior
+            priors[f"{ends[0]}_from_{ends[1]}"] = prior
+    return document | ({"prior": priors} if priors else {})
 
 
 def is_whole_cell(session: "Session") -> bool:

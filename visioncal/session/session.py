@@ -9,7 +9,6 @@ from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
-import tomli_w
 
 from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable
@@ -20,13 +19,11 @@ from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, T
 from visioncal.session import columns as cols
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
 from visioncal.session.corners import (
-    FILE,
     CornerTable,
     check_points,
     corners_by_view,
     read_corners,
     with_corners,
-    write_corners,
 )
 from visioncal.session.document import (
     CameraTable,
@@ -50,15 +47,13 @@ from visioncal.session.kinds import (
     target_warnings,
 )
 from visioncal.session.observations import Observation, observations_of, stop_warnings
-from visioncal.session.saving import digest_facts, placed_files, write_folder
+from visioncal.session.saving import digest_of, save_session
 from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import (
-    FOLDER,
     Stream,
     check_stream,
     gap_warnings,
     read_streams,
-    write_stream,
 )
 from visioncal.session.table import (
     View,
@@ -66,7 +61,6 @@ from visioncal.session.table import (
     parse_csv,
     read_views,
     view_warnings,
-    write_csv,
 )
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
@@ -396,19 +390,7 @@ class Session:
                 next_step="Save it as a folder, and convert that: visioncal convert FOLDER "
                 f"{Path(folder).name}.",
             )
-        document, texts = placed_files(
-            self.declaration, self.document, self.target_document, self.robot_document
-        )
-        texts["session.toml"] = tomli_w.dumps(document)
-        if self.views or not self.streams:
-            texts["views.csv"] = write_csv(self.columns, self.views)
-        if self.corner_table is not None:
-            texts[FILE] = write_corners(self.corner_table)
-        texts |= {
-            f"{FOLDER}/{name}.csv": write_stream(stream) for name, stream in self.streams.items()
-        }
-        paths = dict.fromkeys(view.image for view in self.views if view.image)
-        write_folder(Path(folder), texts, self.images, tuple(paths))
+        save_session(self, Path(folder))
 
     def digest(self) -> str:
         """Computes the SHA-256 digest of the session's content, independent of its storage.
@@ -416,16 +398,7 @@ class Session:
         It depends on the contents of target and robot files, not on their names, nor on folders,
         formatting and the spelling of numbers.
         """
-        return digest_facts(
-            self.document,
-            self.target_document,
-            self.robot_document,
-            self.columns,
-            self.views,
-            self.images,
-            self.streams,
-            self.corner_table,
-        )
+        return digest_of(self)
 
     @cached_property
     def corners(self) -> Mapping[int, Corners]:

@@ -4,9 +4,8 @@ More sessions cover more of the arm's joint ranges, with any camera and board. E
 its own camera, board and frames.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -82,13 +81,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     if len(sessions) == 1:
         return sessions[0]
     for at, session in enumerate(sessions):
-        _check(session, sessions[0])
-        if any(session.digest() == item.digest() for item in sessions[:at]):
-            raise DataError(
-                f"session {session.name!r} is there twice, and would count as twice the data.",
-                culprits=[session.name],
-                next_step="Name each session once.",
-            )
+        _check(session, sessions[0], sessions[:at])
     names = [f"s{at}" for at in range(1, len(sessions) + 1)]
     by_name = dict(zip(names, sessions, strict=True))
     document = {name: value for name, value in sessions[0].document.items() if name not in _OWN}
@@ -96,16 +89,25 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         "name": " + ".join(session.name for session in sessions),
         "cameras": {name: session.document.get("camera", {}) for name, session in by_name.items()},
         "targets": {name: session.document["target"] for name, session in by_name.items()},
-        "frames": dict(_frames(by_name)),
     }
-    if clocks := {
+    document["frames"] = frames = {}
+    priors = {}
+    for name, session in by_name.items():
+        in_hand = session.mount == "eye-in-hand"
+        frames[f"cam_{name}"] = "flange" if in_hand else "base"
+        frames[f"target_{name}"] = "base" if in_hand else "flange"
+        for edge, prior in session.document.get("prior", {}).items():
+            ends = [
+                f"{part}_{name}" if part in ("cam", "target") else part
+                for part in edge.split("_from_")
+            ]
+            priors["_from_".join(ends)] = prior
+    clocks = {
         name: session.document["clock"]
         for name, session in by_name.items()
         if "clock" in session.document
-    }:
-        document["clocks"] = clocks
-    if priors := dict(_priors(by_name)):
-        document["prior"] = priors
+    }
+    document |= {name: own for name, own in (("clocks", clocks), ("prior", priors)) if own}
     columns = list(dict.fromkeys(name for session in sessions for name in session.columns))
     columns += [name for name in ("stop", "camera", TARGET) if name not in columns]
     rows: list[list[str]] = []
@@ -143,7 +145,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     )
 
 
-def _check(session: Session, first: Session) -> None:
+def _check(session: Session, first: Session, earlier: Sequence[Session]) -> None:
     label = f"session {session.name!r}"
     if session.target is None and not has_several(session):
         raise DataError(
@@ -177,27 +179,12 @@ def _check(session: Session, first: Session) -> None:
             culprits=[session.name],
             next_step="Join sessions of one arm alone; visioncal batch calibrates each by itself.",
         )
-
-
-def _frames(by_name: Mapping[str, Session]) -> Iterator[tuple[str, str]]:
-    for name, session in by_name.items():
-        on = ("flange", "base") if session.mount == "eye-in-hand" else ("base", "flange")
-        yield f"cam_{name}", on[0]
-        yield f"target_{name}", on[1]
-
-
-def _priors(by_name: Mapping[str, Session]) -> Iterator[tuple[str, Any]]:
-    for name, session in by_name.items():
-        for edge, prior in session.document.get("prior", {}).items():
-            ends = [
-                f"{part}_{name}" if part in ("cam", "target") else part
-                for part in edge.split("_from_")
-            ]
-            yield "_from_".join(ends), prior
-
-
-def _stamps(views: Sequence[View]) -> list[float]:
-    return [view.stamp_s for view in views if view.stamp_s is not None]
+    if any(session.digest() == one.digest() for one in earlier):
+        raise DataError(
+            f"session {session.name!r} is there twice, and would count as twice the data.",
+            culprits=[session.name],
+            next_step="Name each session once.",
+        )
 
 
 def _joined_corners(tables: Sequence[CornerTable]) -> CornerTable:
@@ -210,3 +197,7 @@ def _joined_corners(tables: Sequence[CornerTable]) -> CornerTable:
         tuple(name for table in tables for name in table.targets),
         np.concatenate(sigmas) if len(sigmas) == len(tables) else None,
     )
+
+
+def _stamps(views: Sequence[View]) -> list[float]:
+    return [view.stamp_s for view in views if view.stamp_s is not None]

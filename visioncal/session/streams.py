@@ -3,6 +3,7 @@
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,8 +121,13 @@ def parse_stream(text: str, label: str) -> Stream:
     """
     head, _, body = text.partition("\n")
     columns = parse_table(head, label).columns
-    values, lines = None if {*";\t"} & {*head} else _read_fast(body, len(columns)), None
-    if values is None:
+    values: FloatArray | None = None
+    lines, body = None, body.replace("\r\n", "\n").strip("\n")
+    if body.strip() and "\n\n" not in body and not {*";\t"} & {*head}:
+        # Rows without empty cells are read at once.
+        with suppress(ValueError):
+            values = np.loadtxt(io.StringIO(body), delimiter=",", ndmin=2, comments=None)
+    if values is None or values.shape[1] != len(columns) or not np.isfinite(values).all():
         table = parse_table(text, label)
         columns, reader = table.columns, TableReader(table)
         values, lines = reader.numbers(*map(Column, columns)), np.array(table.lines, np.int64)
@@ -133,18 +139,6 @@ def parse_stream(text: str, label: str) -> Stream:
         )
     values.setflags(write=False)
     return Stream(columns, values, lines)
-
-
-def _read_fast(body: str, count: int) -> FloatArray | None:
-    """Fast reading of rows without empty cells; None where cells must be read one by one."""
-    body = body.replace("\r\n", "\n").strip("\n")
-    if not body.strip() or "\n\n" in body:
-        return None
-    try:
-        values = np.loadtxt(io.StringIO(body), delimiter=",", ndmin=2, comments=None)
-    except ValueError:
-        return None
-    return values if values.shape[1] == count and np.isfinite(values).all() else None
 
 
 def write_stream(stream: Stream) -> str:

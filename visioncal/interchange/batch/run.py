@@ -21,6 +21,7 @@ from importlib.util import find_spec
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from threading import Thread
+from typing import get_args
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
@@ -153,26 +154,16 @@ def _table(rows: Iterable[FleetRow]) -> bytes:
     import pyarrow as pa
     from pyarrow import parquet
 
+    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    # A literal is text; of an optional value the other type counts.
     kinds = {
-        "str": pa.string(),
-        "State": pa.string(),
-        "bool": pa.bool_(),
-        "bool | None": pa.bool_(),
-        "int | None": pa.int64(),
-        "float": pa.float64(),
-        "float | None": pa.float64(),
+        name: next((kind for kind in (hint, *get_args(hint)) if kind in types), str)
+        for name, hint in FleetRow.__annotations__.items()
     }
-    names = {name: _kind(kind) for name, kind in FleetRow.__annotations__.items()}
-    schema = pa.schema([(name, kinds[kind]) for name, kind in names.items()])
+    schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
     buffer = io.BytesIO()
     parquet.write_table(pa.Table.from_pylist([asdict(row) for row in rows], schema=schema), buffer)
     return buffer.getvalue()
-
-
-def _kind(annotation: object) -> str:
-    if annotation in (str, int, float, bool):
-        return annotation.__name__
-    return "State" if "Literal" in str(annotation) else str(annotation)
 
 
 # Timeout of the scheduler [s].

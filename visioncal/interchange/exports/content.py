@@ -61,23 +61,6 @@ class Selection:
     # None for the calibration's own.
     lens: Path | None = None
 
-    @property
-    def given_options(self) -> tuple[Takes, ...]:
-        """The given options, other than the choice of camera, robot and target."""
-        options: Mapping[Takes, object] = {
-            "edge": self.edge,
-            "inverse": self.inverse,
-            "parent": self.parent,
-            "child": self.child,
-            "number": self.number,
-            "load": self.load,
-            "convention": self.convention,
-            "hash": self.calibration_hash,
-            "with-corrections": self.with_corrections,
-            "lens": self.lens,
-        }
-        return tuple(name for name, option in options.items() if option not in (None, False))
-
 
 @dataclass(frozen=True, eq=False)
 class Content:
@@ -96,7 +79,7 @@ class Content:
     conditions: tuple[Condition, ...] = ()  # Under which the transform holds.
     # Our name of the frame whose rotation was copied; None where it was measured.
     rotation_of: str | None = None
-    number: int | None = None
+    number: int | None = None  # Of the controller's tool or base.
     load: Load | None = None
 
     @property
@@ -122,26 +105,22 @@ class Content:
         )
 
     @property
-    def quality(self) -> str:
-        """The verdict and the sigma of the transform, in one line."""
-        position = f"verdict {self.verdict.status}; sigma {self.edge.sigma_mm:.2g} mm"
-        if self.rotation_of is None:
-            return f"{position} and {self.edge.sigma_deg:.2g} deg"
-        of = self.rotation_of if "_" in self.rotation_of else f"the {self.rotation_of}"
-        return f"{position}; rotation taken from {of}, not measured"
-
-    @property
-    def direction(self) -> str:
-        """The meaning of the transform, in one line."""
-        return f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t"
-
-    @property
     def notes(self) -> list[str]:
         """Comment lines: origin, quality, meaning of the transform, and its conditions."""
+        sigma = f"sigma {self.edge.sigma_mm:.2g} mm"
+        if self.rotation_of is None:
+            sigma += f" and {self.edge.sigma_deg:.2g} deg"
+        else:
+            of = self.rotation_of if "_" in self.rotation_of else f"the {self.rotation_of}"
+            sigma += f"; rotation taken from {of}, not measured"
         is_of_lens = self.lens is not None and any(frame.startswith("cam") for frame in self.frames)
-        holds = [f"only where: {condition.words}" for condition in self.conditions]
-        of_lens = [_OF_LENS] if is_of_lens else []
-        return [self.origin, self.quality, self.direction, *of_lens, *holds]
+        return [
+            self.origin,
+            f"verdict {self.verdict.status}; {sigma}",
+            f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t",
+            *([_OF_LENS] if is_of_lens else []),
+            *(f"only where: {condition.words}" for condition in self.conditions),
+        ]
 
 
 @dataclass(frozen=True)
@@ -165,7 +144,20 @@ class Format(Generic[_T]):
         Raises:
             DataError: An option does not apply.
         """
-        unused = [name for name in selection.given_options if name not in (*self.takes, *also)]
+        options: Mapping[Takes, object] = {
+            "edge": selection.edge,
+            "inverse": selection.inverse,
+            "parent": selection.parent,
+            "child": selection.child,
+            "number": selection.number,
+            "load": selection.load,
+            "convention": selection.convention,
+            "hash": selection.calibration_hash,
+            "with-corrections": selection.with_corrections,
+            "lens": selection.lens,
+        }
+        given = [name for name, option in options.items() if option not in (None, False)]
+        unused = [name for name in given if name not in (*self.takes, *also)]
         if unused:
             raise DataError(
                 f"{self.name} has no place for "

@@ -14,8 +14,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified, judge
 from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
-from visioncal.interchange.exports.lens import LENSES
-from visioncal.interchange.exports.matrices import MATRICES
+from visioncal.interchange.exports.files import FILES
 from visioncal.interchange.exports.other_lens import with_lens
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import ROS_FORMATS
@@ -34,8 +33,7 @@ from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ROS_FORMATS,
-    *LENSES,
-    *MATRICES,
+    *FILES,
     *ROBOTS,
     *ARMS,
 )
@@ -99,14 +97,15 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         return Document(form.write(arm), arm.calibration.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
         contents = _select_all(source, selection, form)
-        written = "" if form.write_all is None else form.write_all(contents)
-        verdicts = {content.verdict.status: content.verdict for content in contents}
-        worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
-        return Document(written, worst, _conditions(*contents))
-    content = select(source, selection, form)
-    return Document(
-        form.write(content), content.verdict, (*_conditions(content), *form.warn(content))
-    )
+        text = "" if form.write_all is None else form.write_all(contents)
+    else:
+        contents = (select(source, selection, form),)
+        text = form.write(contents[0])
+    verdicts = {content.verdict.status: content.verdict for content in contents}
+    worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
+    conditions = (condition.words for content in contents for condition in content.conditions)
+    warnings = (words for content in contents for words in form.warn(content))
+    return Document(text, worst, (*dict.fromkeys(conditions), *warnings))
 
 
 def _robot_part(
@@ -129,11 +128,6 @@ def _robot_part(
     choice = Choice(selection.camera, selection.robot, selection.target)
     part = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
     return part, replace(selection, camera=None, robot=None, target=None)
-
-
-def _conditions(*contents: Content) -> tuple[str, ...]:
-    said = (condition.words for content in contents for condition in content.conditions)
-    return tuple(dict.fromkeys(said))
 
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:

@@ -142,36 +142,28 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     Raises:
         DataError: There is no such camera, or the source is no cell.
     """
-    if isinstance(source, Calibration) and source.cell is not None:
-        return _of_cell(source, source.cell.lenses, camera)
-    if camera is not None:
+    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
+    cell = source.cell if isinstance(source, Calibration) else None
+    if cell is None and camera is not None:
         raise DataError(
             "Which camera is meant is said of a whole cell alone, and this is none.",
             culprits=["--camera"],
             next_step="Leave it out.",
         )
     if isinstance(source, FrameFile):
-        frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
         return Placements(frames, tuple(frames), "this file of frames", None, None)
-    frames = {
-        name: replace(_of_frame(frame), conditions=source.conditions)
-        for name, frame in source.frames.items()
-    }
-    origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
-    edges = {
-        name: Placement(edge, origin, source.verdict, edge.oriented, conditions=source.conditions)
-        for name, edge in source.edges.items()
-    }
-    return Placements(
-        {**edges, **frames}, tuple(frames), "this calibration", source.mount, source.camera
-    )
-
-
-def _of_cell(
-    source: Calibration, lenses: Mapping[str, CameraResult], camera: str | None
-) -> Placements:
+    if cell is None:
+        origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
+        holds = source.conditions
+        edges = {
+            name: Placement(edge, origin, source.verdict, edge.oriented, conditions=holds)
+            for name, edge in source.edges.items()
+        }
+        by_name = edges | {name: replace(one, conditions=holds) for name, one in frames.items()}
+        words = "this calibration"
+        return Placements(by_name, tuple(frames), words, source.mount, source.camera)
     # The reference and the cell are one frame; two frames would split the tree.
-    tree = source.tree
+    tree, lenses = source.tree, cell.lenses
     edges = {
         f"{parent}_from_{name}": _in_cell(source, tree.edge_of(name))
         for name, parent in tree.parents.items()
@@ -187,9 +179,7 @@ def _of_cell(
                 next_step=did_you_mean(camera, list(lenses)),
             )
         lens = lenses[frame]
-    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
-    by_name = {**edges, **frames}
-    return Placements(by_name, tuple(frames), "this cell", None, lens, source, lenses)
+    return Placements(edges | frames, tuple(frames), "this cell", None, lens, source, lenses)
 
 
 def _in_cell(source: Calibration, edge: Edge) -> Placement:

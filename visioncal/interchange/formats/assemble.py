@@ -264,14 +264,9 @@ def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str
 
 def _extra_columns(foreign: ForeignRecording) -> dict[str, tuple[str, ...]]:
     """Further columns, renamed where a session would take their names for something else."""
-    reserved = {
-        "view",
-        "image",
-        "stamp_s",
-        *session_columns.POSE,
-        *session_columns.MEASURED_CAM_POSE,
-    }
-    reserved |= set(session_columns.joint_columns(tuple(foreign.columns)))
+    reserved = {"view", "image", "stamp_s", *session_columns.POSE}
+    reserved |= {*session_columns.MEASURED_CAM_POSE}
+    reserved |= {*session_columns.joint_columns(tuple(foreign.columns))}
     columns: dict[str, tuple[str, ...]] = {}
     for name, cells in foreign.columns.items():
         unique = name if _is_meant(name, cells) else f"source_{name}"

@@ -1,7 +1,7 @@
 """Targets by shipped name, file, or a one-word description."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,27 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.types import Target
 from visioncal.vision.targets import metres, read_target, target_from_document, target_names
 
-_MM = r"([0-9]{1,5}(?:\.[0-9]{1,9})?)mm"
-_CHARUCO = re.compile(rf"charuco_([0-9]{{1,3}})x([0-9]{{1,3}})_{_MM}_{_MM}_(DICT_\w+?)(_legacy)?")
-_CHECKERBOARD = re.compile(rf"checkerboard_([0-9]{{1,3}})x([0-9]{{1,3}})_{_MM}")
-_APRILGRID = re.compile(rf"aprilgrid_([0-9]{{1,3}})x([0-9]{{1,3}})_{_MM}_(0\.[0-9]{{1,9}}|1)")
-_MARKER = re.compile(rf"marker_(DICT_\w+)_([0-9]{{1,5}})_{_MM}")
 
+def _millimetres(text: str) -> float:
+    return metres(float(text))
+
+
+_COUNTS = "(?P<columns>[0-9]{1,3})x(?P<rows>[0-9]{1,3})"
+_MM = r"[0-9]{1,5}(?:\.[0-9]{1,9})?"
+_KINDS = {
+    "charuco": rf"{_COUNTS}_(?P<square_m>{_MM})mm_(?P<marker_m>{_MM})mm_(?P<dictionary>DICT_\w+?)"
+    "(?P<legacy>_legacy)?",
+    "checkerboard": rf"{_COUNTS}_(?P<square_m>{_MM})mm",
+    "aprilgrid": rf"{_COUNTS}_(?P<size_m>{_MM})mm_(?P<spacing>0\.[0-9]{{1,9}}|1)",
+    "marker": rf"(?P<dictionary>DICT_\w+)_(?P<id>[0-9]{{1,5}})_(?P<size_m>{_MM})mm",
+}
+_READ: Mapping[str, Callable[[str], object]] = {
+    **dict.fromkeys(("columns", "rows", "id"), int),
+    **dict.fromkeys(("square_m", "marker_m", "size_m"), _millimetres),
+    "dictionary": str,
+    "spacing": float,
+    "legacy": bool,
+}
 FORMS = (
     "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250 (squares, side of a square and of a marker), "
     "checkerboard_9x6_23.6mm (inner corners), aprilgrid_6x6_88mm_0.3 (tags, their side, the white "
@@ -38,7 +53,12 @@ def read_target_description(words: str) -> Mapping[str, Any]:
         DataError: It is none of these, or describes no target.
     """
     kalibrs = words.lower().endswith((".yaml", ".yml"))
-    document = _of_kalibr(Path(words)) if kalibrs else _in_one_word(words)
+    matches = {kind: re.fullmatch(f"{kind}_{form}", words) for kind, form in _KINDS.items()}
+    document = _of_kalibr(Path(words)) if kalibrs else None
+    for kind, match in matches.items():
+        if match is not None:
+            groups = match.groupdict().items()
+            document = {"kind": kind, **{name: _READ[name](text) for name, text in groups}}
     if document is None:
         if not words.lower().endswith(".toml") and words not in target_names():
             raise DataError(
@@ -76,42 +96,6 @@ def _of_kalibr(path: Path) -> dict[str, Any]:
         | {ours: table.number(theirs) for ours, theirs in names.items()}
         | {ours: table.integer(names[ours], 1, 100) for ours in ("columns", "rows")}
     )
-
-
-def _in_one_word(words: str) -> dict[str, Any] | None:
-    if match := _CHARUCO.fullmatch(words):
-        return {
-            "kind": "charuco",
-            "columns": int(match[1]),
-            "rows": int(match[2]),
-            "square_m": metres(float(match[3])),
-            "marker_m": metres(float(match[4])),
-            "dictionary": match[5],
-            "legacy": match[6] is not None,
-        }
-    if match := _CHECKERBOARD.fullmatch(words):
-        return {
-            "kind": "checkerboard",
-            "columns": int(match[1]),
-            "rows": int(match[2]),
-            "square_m": metres(float(match[3])),
-        }
-    if match := _APRILGRID.fullmatch(words):
-        return {
-            "kind": "aprilgrid",
-            "columns": int(match[1]),
-            "rows": int(match[2]),
-            "size_m": metres(float(match[3])),
-            "spacing": float(match[4]),
-        }
-    if match := _MARKER.fullmatch(words):
-        return {
-            "kind": "marker",
-            "dictionary": match[1],
-            "id": int(match[2]),
-            "size_m": metres(float(match[3])),
-        }
-    return None
 
 
 def target_name(document: Mapping[str, Any]) -> str | None:

@@ -1,8 +1,7 @@
 """Tables, JSON and .npz with a row a view; lines of a pendant; a second file of camera poses."""
 
 import re
-from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,6 @@ import numpy as np
 from visioncal.calibration.stages.clock_offset import LEAST_CORRELATION
 from visioncal.calibration.stages.motion import slow_and_new
 from visioncal.core.conventions import PoseNumbers
-from visioncal.core.documents import read_json, read_table
-from visioncal.core.documents.arrays import read_npy, read_npz
-from visioncal.core.documents.structured import read_opencv, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
@@ -25,10 +21,6 @@ from visioncal.estimation.clock_correlation import (
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 from visioncal.interchange.formats.fields import (
     Fields,
-    fields_of_arrays,
-    fields_of_records,
-    fields_of_table,
-    flattened,
     stamp_name,
     unnamed_columns,
 )
@@ -46,16 +38,8 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
-from visioncal.interchange.formats.printed import (
-    PROGRAMS,
-    echoed_fields,
-    pendant_fields,
-    printed_fields,
-    program_fields,
-)
+from visioncal.interchange.formats.reading import ENDINGS, read_fields
 
-DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *PROGRAMS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 # Limits of the overlap of two streams [s]: a shorter one determines no offset, a longer one is no
 # calibration motion.
@@ -64,93 +48,6 @@ _SHORTEST_S, _LONGEST_S = 2.0, 3600.0
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 # Numbers of values that a pose in one field may have.
 _WHOLE_POSES = (6, 7, 12, 16)
-
-
-def read_fields(path: Path) -> Fields:
-    """Reads a table, JSON, YAML, .npz or .npy as rows of named values.
-
-    Raises:
-        DataError: It cannot be read, or holds no rows.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return fields_of_arrays(read_npz(path), path)
-    if suffix == ".npy":
-        return fields_of_arrays({"value": read_npy(path)}, path)
-    if suffix in DOCUMENTS:
-        return _fields_of_document(read_document(path), path)
-    if suffix in PROGRAMS:
-        return program_fields(path)
-    lines = pendant_fields(path) or echoed_fields(path) or printed_fields(path)
-    if lines is not None:
-        return lines
-    table = read_table(path)
-    if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
-        raise DataError(
-            f"{path} is one 4 x 4 matrix; a file a view in a folder, or a row a view, is needed.",
-            culprits=[str(path)],
-            next_step="Convert the folder.",
-        )
-    return fields_of_table(table, path)
-
-
-def read_document(path: Path) -> object:
-    """Reads JSON, YAML or OpenCV's XML.
-
-    Raises:
-        DataError: It cannot be read.
-    """
-    if path.suffix.lower() == ".json":
-        return read_json(path)
-    return read_opencv(path) if path.suffix.lower() == ".xml" else read_yaml(path)
-
-
-def _fields_of_document(document: object, path: Path) -> Fields:
-    """Rows from a list of records, the longest such lists in a mapping, or a mapping of lists."""
-    # Names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
-    if isinstance(document, Mapping):
-        numbered = _numbered(document)
-        if len(numbered) > 1:
-            places = [f"{path.name}, {index}" for index in numbered]
-            rows = [flattened(mapping) for mapping in numbered.values()]
-            return fields_of_records(rows, places, path.stem, path.parent, tuple(numbered))
-        lists = [value for value in document.values() if isinstance(value, list) and value]
-        tables = [value for value in lists if isinstance(value[0], Mapping)]
-        if (
-            not tables
-            and document
-            and all(isinstance(value, Mapping) for value in document.values())
-        ):
-            document = list(document.values())
-        elif lists:
-            count = max(len(table) for table in tables or lists)
-            columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
-            rows = [{k: v[at] for k, v in columns.items()} for at in range(count)]
-            document = next(iter(columns.values())) if tables and len(columns) == 1 else rows
-    if not isinstance(document, list) or not document:
-        raise DataError(
-            f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
-        )
-    places = [f"{path.name}, entry {at}" for at in range(len(document))]
-    records = [flattened(value) for value in document]
-    return fields_of_records(records, places, path.stem, path.parent)
-
-
-def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
-    """Groups matrices by the numbers at the end of their names, or that are their names."""
-    rows: dict[int, dict[str, object]] = defaultdict(dict)
-    for name, value in document.items():
-        if isinstance(value, Mapping) and all(
-            re.fullmatch("[0-9]{1,9}", str(number)) for number in value
-        ):
-            for at, number in value.items():
-                rows[int(at)][name] = number
-        match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", name)
-        # Columns of numbers may have names such as q1; a matrix is a list of lists.
-        nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
-        if match and (nested or isinstance(value, np.ndarray)):
-            rows[int(match[2])][match[1] or "matrix"] = value
-    return dict(sorted(rows.items()))
 
 
 def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:

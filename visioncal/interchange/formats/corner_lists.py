@@ -7,7 +7,7 @@ that was not found. Documents have a list for each image: parallel lists, as Ope
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import natural
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.columns import DOCUMENTS, read_document
 from visioncal.interchange.formats.foreign import ForeignRecording, FoundCorners
+from visioncal.interchange.formats.reading import DOCUMENTS, read_document
 
 # Names of the image, of a corner's number and of its pixel: of one corner, and of lists.
 _IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
@@ -37,14 +37,6 @@ _PIXEL_LISTS = (
 _LEVEL = "level"
 
 
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """Corners found in one image; an empty name where the file has none."""
-
-    name: str
-    corners: FoundCorners
-
-
 def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
     """Adds the corners in a file to a recording, by the images' names if possible, else in order.
 
@@ -53,14 +45,14 @@ def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
     """
     is_document = path.suffix.lower() in (*DOCUMENTS, ".npz")
     images = list(_of_document(path) if is_document else _of_table(path))
-    if not any(image.corners.ids.size for image in images):
+    if not any(corners.ids.size for _, corners in images):
         raise DataError(f"{path} holds no corners.", culprits=[str(path)])
     count = len(foreign.robot)
-    names = [Path(image.name.replace("\\", "/")).name for image in images]
+    names = [Path(name.replace("\\", "/")).name for name, _ in images]
     row_names = [None if image is None else image.name for image in foreign.images]
     notes = foreign.notes
     if all(names) and any(row_names):
-        by_name = dict(zip(names, images, strict=True))
+        by_name = dict(zip(names, (corners for _, corners in images), strict=True))
         if len(by_name) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise DataError(
@@ -77,10 +69,9 @@ def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
             )
         paired = [by_name.get(row or "") for row in row_names]
     elif len(images) == count:
-        order = (
-            sorted(images, key=lambda image: natural(Path(image.name))) if all(names) else images
-        )
-        paired = [*order]
+        if all(names):
+            images.sort(key=lambda image: natural(Path(image[0])))
+        paired = [corners for _, corners in images]
         notes = (*notes, f"The images of {path.name} are paired with the poses by their order.")
     else:
         raise DataError(
@@ -89,18 +80,16 @@ def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
             culprits=[str(path)],
             next_step="Give as many of both, or a column with each pose's image (--image-column).",
         )
-    corners = tuple(
-        image.corners if image is not None and image.corners.ids.size else None for image in paired
-    )
+    found = tuple(corners if corners and corners.ids.size else None for corners in paired)
     # Images without found corners are dropped, so that a missing file is not an error.
     pictures = tuple(
-        image if image is not None and found is not None and image.is_file() else None
-        for image, found in zip(foreign.images, corners, strict=bool(foreign.images))
+        image if image is not None and corners is not None and image.is_file() else None
+        for image, corners in zip(foreign.images, found, strict=bool(foreign.images))
     )
-    return replace(foreign, corners=corners, images=pictures if any(pictures) else (), notes=notes)
+    return replace(foreign, corners=found, images=pictures if any(pictures) else (), notes=notes)
 
 
-def _of_table(path: Path) -> Iterator[_Image]:
+def _of_table(path: Path) -> Iterator[tuple[str, FoundCorners]]:
     """Reads the images of a table in the order of their first rows."""
     columns, rows, places = _table(path)
     lower = [column.lower() for column in columns]
@@ -131,7 +120,7 @@ def _of_table(path: Path) -> Iterator[_Image]:
         image_corners.append((float(cells[0]), float(cells[1]), float(cells[2])))
     for name, corners in by_image.items():
         numbers = np.array(corners).reshape(-1, 3)
-        yield _Image(name, _checked(numbers[:, 0], numbers[:, 1:], f"{path.name}, {name}"))
+        yield name, _checked(numbers[:, 0], numbers[:, 1:], f"{path.name}, {name}")
 
 
 def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
@@ -160,7 +149,7 @@ def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence
     return columns, [cells for _, cells in rows], [place for place, _ in rows]
 
 
-def _of_document(path: Path) -> Iterator[_Image]:
+def _of_document(path: Path) -> Iterator[tuple[str, FoundCorners]]:
     document: object = read_npz(path) if path.suffix.lower() == ".npz" else read_document(path)
     if path.suffix.lower() == ".json" and isinstance(document, Mapping):
         document = read_opencv(path)
@@ -191,7 +180,7 @@ def _of_document(path: Path) -> Iterator[_Image]:
             )
         px = px.reshape(-1, 2)
         numbers = np.arange(len(px), dtype=float) if numbers is None else numbers.ravel()
-        yield _Image("" if name is None else str(name), _checked(numbers, px, where))
+        yield "" if name is None else str(name), _checked(numbers, px, where)
 
 
 def _records(document: object) -> Iterator[Mapping[str, object]]:
@@ -209,24 +198,28 @@ def _records(document: object) -> Iterator[Mapping[str, object]]:
                 yield {"image": name, **value}
             elif isinstance(value, list):
                 yield from _records(value)
-    elif not isinstance(places, list | np.ndarray) or not _is_of_images(places):
+    elif not _is_of_images(places):
         yield document
     else:
         ids, names = _value_of(document, _POINTS), _value_of(document, _IMAGES)
-        for at, place in enumerate(places):
+        for at, place in enumerate(parts := _listed(places)):
             lists = {"ids": ids, "image": names}
             fields = {
                 key: values[at]
                 for key, values in lists.items()
-                if isinstance(values, list | np.ndarray) and len(values) == len(places)
+                if isinstance(values, list | np.ndarray) and len(values) == len(parts)
             }
             yield {"corners": place, **fields}
 
 
-def _is_of_images(places: Sequence[object] | Array) -> bool:
-    """Whether a list holds lists of corners, one for each image, rather than corners."""
-    lists = (place for place in places if isinstance(place, list | np.ndarray) and len(place) > 1)
-    return any(isinstance(value[0], list | np.ndarray) for value in lists)
+def _is_of_images(places: object) -> bool:
+    """Whether places are a list of lists of corners, one for each image, rather than corners."""
+    lists = [place for place in _listed(places) if len(_listed(place)) > 1]
+    return any(isinstance(_listed(place)[0], list | np.ndarray) for place in lists)
+
+
+def _listed(value: object) -> Sequence[object] | Array:
+    return value if isinstance(value, list | np.ndarray) else ()
 
 
 def _has_pixel_list(record: Mapping[str, object]) -> bool:

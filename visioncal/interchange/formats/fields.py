@@ -300,16 +300,24 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     if not names or list(fields.texts) != names:
         return {"time": (), "robot": (), "camera": ()}
     time, robot, camera = _LAYOUTS.get(len(names), (0, 0, 0))
-    if _are_matrices(fields, names):
-        robot = 12
-    if len(names) == 7 and set(names) == set(fields.numbers):
+    is_numeric = set(names) == set(fields.numbers)
+    if is_numeric and len(names) == 12:
+        numbers = np.stack([fields.numbers[name] for name in names], axis=1)
+        lengths = np.linalg.norm(numbers.reshape(-1, 3, 4)[..., :3], axis=2)
+        if (np.abs(lengths - 1.0) < _NORM_TOLERANCE).all():
+            # The upper three rows of matrices, not two poses.
+            robot = 12
+    if is_numeric and len(names) == 7:
         last = np.stack([fields.numbers[name] for name in names[3:]])
         if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NORM_TOLERANCE).all():
             # A number or a time, and a position with three angles.
             time, robot = 1, 6
     pose = names[time : time + robot]
-    if robot == 6 and _are_rotations_first(fields, pose):
-        pose = pose[3:] + pose[:3]
+    if robot == 6 and set(pose) <= set(fields.numbers):
+        first, last = np.abs([fields.numbers[name] for name in pose]).reshape(2, -1)
+        if np.nanmax(first) <= _MOST_DEG < np.nanmax(last):
+            # The last three are too large for angles, and the first three are not.
+            pose = pose[3:] + pose[:3]
     return {
         "time": tuple(names[:time]),
         "robot": tuple(pose),
@@ -317,41 +325,18 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     }
 
 
-def _are_rotations_first(fields: Fields, names: Sequence[str]) -> bool:
-    """Whether the last three of six numbers are too large for angles, and the first three not."""
-    if not set(names) <= set(fields.numbers):
-        return False
-    first, last = np.abs([fields.numbers[name] for name in names]).reshape(2, -1)
-    return bool(np.nanmax(first) <= _MOST_DEG < np.nanmax(last))
-
-
-def _are_matrices(fields: Fields, names: Sequence[str]) -> bool:
-    """Whether twelve numbers are the upper three rows of matrices, not two poses."""
-    if len(names) != 12 or set(names) != set(fields.numbers):
-        return False
-    numbers = np.stack([fields.numbers[name] for name in names], axis=1)
-    rows = numbers.reshape(-1, 3, 4)[..., :3]
-    return bool((np.abs(np.linalg.norm(rows, axis=2) - 1.0) < _NORM_TOLERANCE).all())
-
-
 def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     """Finds the field of times, one number a row and not `taken`; else empty."""
+    unnamed = unnamed_columns(fields)
+    # In a table without a header, the poses follow the times.
+    for name in unnamed["time"] if set(unnamed["robot"]) <= set(taken) else ():
+        numbers = fields.column(name)[:, 0]
+        # Numbers that count rows, possibly with gaps, are no times.
+        if (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= _LARGEST_COUNT:
+            return name
     named = (
         name
         for name, numbers in fields.numbers.items()
         if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
     )
-    return next(iter(_unnamed_times(fields, taken)), next(named, ""))
-
-
-def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
-    """Times in a table without a header, where the poses follow them."""
-    unnamed = unnamed_columns(fields)
-    if not set(unnamed["robot"]) <= set(taken):
-        return ()
-    return tuple(name for name in unnamed["time"] if not _are_counts(fields.column(name)[:, 0]))
-
-
-def _are_counts(numbers: FloatArray) -> bool:
-    """Whether numbers count rows, possibly with gaps, rather than time."""
-    return bool((numbers % 1 == 0).all() and numbers.max(initial=0.0) < _LARGEST_COUNT)
+    return next(named, "")

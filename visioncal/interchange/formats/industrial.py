@@ -69,7 +69,13 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
         )
     notes: list[str] = []
     # The user's options replace what the source states.
-    lens = None if requested.intrinsics else _lens(document, str(file), notes)
+    lens = None
+    if "intrinsics" in document and not requested.intrinsics:
+        lens, _ = intrinsics_from(document, str(file))
+        notes.append(
+            "The intrinsics of the source have no distortion; it is taken for zero. "
+            "--intrinsics estimate leaves them out."
+        )
     target = None if requested.target else _target(document, notes)
     numbered = [number_in(place) for place in places]
     views = tuple(index for index in numbered if index is not None)
@@ -93,16 +99,6 @@ def _pose_numbers(value: object, where: str) -> list[float]:
     return [number(content.get(name), f"{where}: {name}") for name in _POSE]
 
 
-def _lens(document: Mapping[str, Any], where: str, notes: list[str]) -> dict[str, Any] | None:
-    if "intrinsics" not in document:
-        return None
-    notes.append(
-        "The intrinsics of the source have no distortion; it is taken for zero. "
-        "--intrinsics estimate leaves them out."
-    )
-    return intrinsics_from(document, where)[0]
-
-
 def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | None:
     finder = document.get("target_finder")
     if not isinstance(finder, Mapping):
@@ -111,28 +107,25 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
     if "Charuco" not in kind:
         notes.append(f"The target finder {kind[:60]!r} has no twin here; name the target.")
         return None
-    where = "target_finder"
+    where, dictionary = "target_finder", finder.get("dictionary")
+    if not isinstance(dictionary, str):
+        wanted = _integer(dictionary, f"{where}: dictionary")
+        names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        dictionary = next((name for name in names if getattr(cv2.aruco, name) == wanted), None)
+        if dictionary is None:
+            raise DataError(
+                f"{where}: dictionary is {wanted}, which OpenCV does not have.",
+                culprits=[f"{where}: dictionary"],
+            )
     return {
         "kind": "charuco",
         "columns": _integer(finder.get("cols"), f"{where}: cols"),
         "rows": _integer(finder.get("rows"), f"{where}: rows"),
         "square_m": number(finder.get("chessboard_dim"), f"{where}: chessboard_dim"),
         "marker_m": number(finder.get("aruco_marker_dim"), f"{where}: aruco_marker_dim"),
-        "dictionary": _dictionary(finder.get("dictionary"), f"{where}: dictionary"),
+        "dictionary": dictionary,
         "legacy": False,
     }
-
-
-def _dictionary(value: object, where: str) -> str:
-    """Name of OpenCV's dictionary with a number."""
-    if isinstance(value, str):
-        return value
-    wanted = _integer(value, where)
-    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    matching = [name for name in names if getattr(cv2.aruco, name) == wanted]
-    if not matching:
-        raise DataError(f"{where} is {wanted}, which OpenCV does not have.", culprits=[where])
-    return matching[0]
 
 
 def _integer(value: object, where: str) -> int:

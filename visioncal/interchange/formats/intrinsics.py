@@ -13,27 +13,13 @@ from visioncal.core.documents.structured import read_opencv, read_xml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 
-_MATRIX_KEYS: tuple[str, ...] = (
-    "camera_matrix",
-    "cameraMatrix",
-    "camera_intrinsics",
-    "intrinsic_matrix",
-    "IntrinsicMatrix",
-    "K",
-    "k",
-    "mtx",
-    "M1",
-    "intrinsic",
+_MATRIX_KEYS = (
+    *("camera_matrix", "cameraMatrix", "camera_intrinsics", "intrinsic_matrix", "IntrinsicMatrix"),
+    *("K", "k", "mtx", "M1", "intrinsic"),
 )
-_DISTORTION_KEYS: tuple[str, ...] = (
-    "distortion_coefficients",
-    "dist_coeffs",
-    "distCoeffs",
-    "distortion",
-    "dist",
-    "D",
-    "d",
-    "D1",
+_DISTORTION_KEYS = (
+    *("distortion_coefficients", "dist_coeffs", "distCoeffs", "distortion", "dist"),
+    *("D", "d", "D1"),
 )
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 # Largest skew relative to the focal length; more is another camera model.

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,57 +39,49 @@ _SIDE_WORDS = {"robot": {"robot", "arm", "effector"}, "camera": {"charuco", "aru
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 
 
-def without_unit(name: str) -> tuple[str, str]:
+def _without_unit(name: str) -> tuple[str, str]:
     """Splits a field's name from its unit: `rx(deg)`, `X [mm]`, `x_m`."""
     match = _UNIT.fullmatch(name)
     return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
 
-def pose_fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
+def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
     """Finds the fields of the robot's or the camera's poses by the words of their names.
 
     Returns:
         The name of a matrix or a whole pose, or those of position and rotation; empty where no name
         fits, or those of several poses do.
     """
-    free = {
+    sizes = {
         name: numbers.reshape(len(fields), -1).shape[1]
         for name, numbers in fields.numbers.items()
         if numbers.ndim > 1 and name not in taken
     }
-    candidates = list(dict.fromkeys([*_whole_poses(free, whose), *_split_poses(free, whose)]))
-    return candidates[0] if len(candidates) == 1 else ()
-
-
-def _whole_poses(sizes: dict[str, int], whose: str) -> Iterator[tuple[str, ...]]:
+    found: dict[tuple[str, ...], None] = {}
+    positions: dict[tuple[str, ...], str] = {}
+    rotations: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, size in sizes.items():
         words = _words(name)
         is_whole = size == 16 or (size in (6, 7, 12) and (_POSE_WORDS | _CHILD_FIRST) & {*words})
         # A single matrix without frame words is the robot's.
         is_plain = [*sizes.values()] == [16] and whose == "robot" and not _sides(words)
         if is_whole and (is_plain or _is_of(words, whose)):
-            yield (name,)
-
-
-def _split_poses(sizes: dict[str, int], whose: str) -> Iterator[tuple[str, ...]]:
-    """Pairs of position and rotation whose names share all other words."""
-    positions: dict[tuple[str, ...], str] = {}
-    rotations: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    for name, size in sizes.items():
-        words = _words(name)
+            found[(name,)] = None
         if size in (3, 4, 9) and _ROTATION_WORDS & {*words}:
             rotations[tuple(word for word in words if word not in _ROTATION_WORDS)].append(name)
         elif size == 3 and _POSITION_WORDS & {*words}:
             positions[tuple(word for word in words if word not in _POSITION_WORDS)] = name
+    # Names of position and rotation share all other words.
     for rest, position in positions.items():
         is_plain = not {*rest} - _POSE_WORDS and whose == "robot"
         if rotations[rest] and (is_plain or _is_of(rest, whose)):
             # Of several rotations the least ambiguous: a matrix, then a quaternion.
-            yield position, max(rotations[rest], key=lambda index: sizes[index])
+            found[position, max(rotations[rest], key=lambda index: sizes[index])] = None
+    return next(iter(found)) if len(found) == 1 else ()
 
 
 def _words(name: str) -> list[str]:
-    return [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
+    return [part for part in re.split(r"[\W_]+|(2)", _without_unit(name)[0].lower()) if part]
 
 
 def _is_of(words: Sequence[str], whose: str) -> bool:
@@ -186,30 +178,20 @@ def known_names(
     )
     numeric = [*numbers, *fields.shape_errors]
     textual = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
-    names = list(dict.fromkeys([*numeric, *textual]))
-    complete = _sets_of_names(names, candidates, taken)
-    return next(
-        (candidate for candidate in complete if len(candidate) > 1 or candidate[0] in numeric), ()
-    )
-
-
-def _sets_of_names(
-    names: Sequence[str], candidates: Sequence[tuple[str, ...]], taken: Collection[str]
-) -> Iterator[tuple[str, ...]]:
-    """Yields the full names of every complete candidate."""
-    free_names = [name for name in names if name not in taken]
+    free_names = [name for name in dict.fromkeys([*numeric, *textual]) if name not in taken]
     endings = Counter(name.rsplit(".", 1)[-1] for name in free_names)
     full = {end: name for name in free_names if endings[end := name.rsplit(".", 1)[-1]] == 1}
     full |= {name: name for name in free_names}
     # An exact match of a name goes before one in another case or with a unit.
-    plain = {name: without_unit(name)[0].lower() for name in full}
+    plain = {name: _without_unit(name)[0].lower() for name in full}
     counts = Counter(plain.values())
     without_units = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
     full = without_units | {word.lower(): name for word, name in full.items()} | full
     for candidate in candidates:
         matches = tuple(full.get(name, full.get(name.lower(), "")) for name in candidate)
-        if all(matches):
-            yield matches
+        if all(matches) and (len(matches) > 1 or matches[0] in numeric):
+            return matches
+    return ()
 
 
 def pose_names(
@@ -239,7 +221,7 @@ def pose_names(
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
     keys = ROBOT_KEYS if whose == "robot" else CAMERA_KEYS
-    return known_names(fields, keys, taken) or pose_fields_by_words(fields, whose, taken)
+    return known_names(fields, keys, taken) or _fields_by_words(fields, whose, taken)
 
 
 def poses_from(
@@ -264,7 +246,15 @@ def poses_from(
         DataError: There are no such fields, or their numbers are no poses.
     """
     if whose == "robot" and fields.form:
-        requested = _with_stated_form(fields, requested)
+        # The rows themselves state the form of their poses.
+        if requested.form not in (None, fields.form):
+            raise DataError(
+                f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not "
+                f"as {requested.form}.",
+                culprits=[fields.places[0]],
+                next_step="Leave --robot-form out.",
+            )
+        requested = replace(requested, form=fields.form)
     if not requested.names and len(names) == 7 and requested.is_scalar_first:
         # --form refers to the columns in their order in the file, and these were found by their
         # names.
@@ -272,11 +262,17 @@ def poses_from(
         names = (*names[:3], *sorted(names[3:], key=lambda name: order.get(name, 0)))
     blocks = [fields.column(name) for name in names]
     sizes = [block.shape[1] for block in blocks]
-    places = fields.places
+    places, flat = fields.places, np.hstack(blocks)
     if sum(sizes) in (12, 16) and 9 not in sizes:
-        numbers = PoseNumbers(*_matrices(np.hstack(blocks)), Reading("matrix"), places)
+        numbers = PoseNumbers(*_matrices(flat), Reading("matrix"), places)
         return _checked(requested.applied_to(numbers), requested, whose, ())
-    positions, rotations, rotation_names = _split(blocks, names)
+    positions, rotations, rotation_names = flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
+    if len(blocks) == 2:
+        rotation_first = sizes[1] == 3
+        if sizes[0] == sizes[1]:
+            rotation_first = _ROTATION_NAME.search(names[0]) is not None
+        positions, rotations = blocks[::-1] if rotation_first else blocks
+        rotation_names = (names[0] if rotation_first else names[1],)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
         raise DataError(
             f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
@@ -284,7 +280,7 @@ def poses_from(
             culprits=list(names),
             next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
         )
-    units = {without_unit(name)[1] for name in names}
+    units = {_without_unit(name)[1] for name in names}
     rotation, notes = _likely_rotation(
         rotations.shape[1], rotation_names, requested, whose, degrees=bool(units & {*DEGREES})
     )
@@ -293,18 +289,6 @@ def poses_from(
     if len(lengths) == 1:
         requested = replace(requested, unit=requested.unit or lengths.pop())
     return _checked(requested.applied_to(numbers), requested, whose, notes)
-
-
-def _with_stated_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOptions:
-    """Options with the pose form that the rows themselves state."""
-    if requested.form not in (None, fields.form):
-        raise DataError(
-            f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not as "
-            f"{requested.form}.",
-            culprits=[fields.places[0]],
-            next_step="Leave --robot-form out.",
-        )
-    return replace(requested, form=fields.form)
 
 
 def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
@@ -432,24 +416,6 @@ def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
         # later.
         matrices = np.where(wrong[:, None, None], 0.0, matrices)
     return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
-
-
-def _split(
-    blocks: Sequence[FloatArray], names: Sequence[str]
-) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Separates position from rotation: (positions, rotations, the rotation's names)."""
-    if len(blocks) == 2:
-        first, second = blocks
-        rotation_first = (
-            _ROTATION_NAME.search(names[0]) is not None
-            if first.shape[1] == second.shape[1]
-            else second.shape[1] == 3
-        )
-        if rotation_first:
-            return second, first, (names[0],)
-        return first, second, (names[1],)
-    flat = np.hstack(blocks)
-    return flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
 
 
 def _likely_rotation(

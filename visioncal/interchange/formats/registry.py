@@ -86,13 +86,17 @@ def convert(
     if not (is_folder and dest.is_dir()):
         same = source.exists() and dest.exists() and dest.samefile(source)
         check_free(dest, force=force, replaceable=not is_folder and not same)
-    if form is not None or not _is_session(source):
+    # Loading a result reports what it is and where its session is.
+    is_result = source.name == "calibration.json" or (source / "recording.rrd").is_file()
+    is_recording = source.is_file() and _is_recording(source)
+    is_session = is_result or is_recording or (source / "session.toml").is_file()
+    if form is not None or not is_session:
         foreign = read_foreign(source, requested, form)
         if choose is None:
             check_radians(foreign.robot, requested.robot, "robot")
             if foreign.camera is not None:
                 check_radians(foreign.camera, requested.camera, "camera")
-        if choose is not None:
+        else:
             foreign = reread(foreign, choose(foreign), mirrors_poses=mirrors_poses)
         session = assemble(foreign)
     elif requested != _DEFAULTS:
@@ -161,14 +165,6 @@ def write_session(session: Session, dest: Path) -> None:
 
 def _is_recording(path: Path) -> bool:
     return path.suffix.lower() == ".rrd"
-
-
-def _is_session(path: Path) -> bool:
-    """Whether a path is a session or a result."""
-    # Loading a result reports what it is and where its session is.
-    is_result = path.name == "calibration.json" or (path / "recording.rrd").is_file()
-    is_folder = is_result or (path / "session.toml").is_file()
-    return is_folder or (path.is_file() and _is_recording(path))
 
 
 def _foreign_format(source: Path, form: str | None) -> ForeignFormat:

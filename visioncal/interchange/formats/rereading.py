@@ -87,11 +87,8 @@ def reread(
     """
     if _mirrors(candidate) and not mirrors_poses:
         raise _not_mirrored(candidate)
-    foreign, notes, reading = (
-        with_observations_only(foreign),
-        _change_notes(candidate),
-        candidate.hypothesis,
-    )
+    foreign, reading = with_observations_only(foreign), candidate.hypothesis
+    notes = _change_notes(candidate)
     if foreign.mount is None:
         notes = (*notes, f"The mount is taken for {reading.mount}.")
     robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
@@ -146,8 +143,7 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
     Raises:
         DataError: It is no session.
     """
-    table = _other_columns(path) if path.is_dir() else None
-    plain, robot = (None, None) if table is None else (table.plain, table.robot)
+    plain, robot = _other_columns(path) or (None, None)
     file = path / "session.toml"
     name = read_toml(file, file.name).get("target") if file.is_file() else None
     stated_target = {}
@@ -179,16 +175,12 @@ def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
     return declared.score if declared.closes else np.inf
 
 
-@dataclass(frozen=True, eq=False)
-class _PoseTable:
-    """A views.csv whose poses are in columns or forms that sessions do not have."""
+def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
+    """Reads positions and rotations of other columns or forms; None where there are none.
 
-    plain: TextTable  # Its columns and rows, with the same positions and identity rotations.
-    robot: PoseNumbers  # The poses as they are written.
-
-
-def _other_columns(folder: Path) -> _PoseTable | None:
-    """Reads positions and rotations of other columns or forms; None where there are none."""
+    Returns:
+        The views.csv with the same positions and identity rotations, and the poses as written.
+    """
     if not (folder / "views.csv").is_file():
         return None
     table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
@@ -204,10 +196,10 @@ def _other_columns(folder: Path) -> _PoseTable | None:
     if not rotation_names or not {*position_names} <= {*columns}:
         return None
     cells = [dict(zip(columns, row, strict=False)) for row in table.rows]
-    numbers = [
-        [_number(row.get(name, "")) for name in (*position_names, *rotation_names)] for row in cells
-    ]
-    values = np.array(numbers).reshape(-1, len(position_names) + len(rotation_names))
+    names = (*position_names, *rotation_names)
+    texts = [row.get(name, "") for row in cells for name in names]
+    numbers = [float(text) if is_number(text) else np.nan for text in texts]
+    values = np.array(numbers).reshape(-1, len(names))
     positions, rotations = values[:, :3], values[:, 3:]
     if rotation_names == QUATERNION:
         if not np.nan_to_num(rotations[:, 3]).any():
@@ -218,7 +210,7 @@ def _other_columns(folder: Path) -> _PoseTable | None:
     if rotations.shape[1] == 3:
         largest = float(np.nanmax(np.abs(rotations), initial=0.0))
         form = "euler-xyz-deg" if largest > _LARGEST_RAD else "rotation-vector"
-    kept = [name for name in columns if name not in {*position_names, *rotation_names}]
+    kept = [name for name in columns if name not in names]
     plain = []
     for row_cells, position in zip(cells, positions, strict=True):
         has_position = np.isfinite(position).all()
@@ -226,11 +218,7 @@ def _other_columns(folder: Path) -> _PoseTable | None:
         plain.append((*(row_cells.get(name, "") for name in kept), *pose))
     places = tuple(map(table.place, range(len(table.rows))))
     robot = PoseNumbers(positions, rotations, Reading(form), places)
-    return _PoseTable(replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot)
-
-
-def _number(cell: str) -> float:
-    return float(cell) if is_number(cell) else np.nan
+    return replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot
 
 
 def reread_session(

@@ -11,10 +11,11 @@ from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.touches import TouchRows, touches_of
-from visioncal.interchange.formats.columns import foreign_from, read_fields, view_numbers
+from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.fields import Fields, unnamed_columns
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.poses import check_radians, pose_names
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
 
@@ -51,7 +52,10 @@ def read_touches(
         )
         return _rows_of(fields, path, poses, None)
     joints = requested.joints or joint_columns(tuple(fields.numbers))
-    if not named and not joints and _has_axes(fields):
+    lower = {number.lower() for number in fields.numbers}
+    suffixes = ("", *(f"_{unit}" for unit in UNITS_M))
+    has_axes = any(lower >= {f"{axis}{suffix}" for axis in "xyz"} for suffix in suffixes)
+    if not named and not joints and has_axes:
         raise DataError(
             f"{path.name} has positions without rotations, and a tip beside the flange needs both.",
             culprits=[path.name],
@@ -158,20 +162,15 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
             f"{fields.places[bad[0]]}: a coordinate is missing.",
             culprits=[fields.places[index] for index in bad],
         )
-    return NominalPoints(path.name, names, positions, _sigmas(fields, length_m))
-
-
-def _sigmas(fields: Fields, length_m: float) -> FloatArray:
-    """Standard deviation of each point (n,) [m]; zero where the table has none."""
     units = {f"sigma_{name}": length for name, length in UNITS_M.items()} | {"sigma": length_m}
-    column = next((unit for unit in units if unit in fields.numbers), None)
-    if column is None:
-        return np.zeros(len(fields))
-    sigmas = units[column] * np.nan_to_num(fields.column(column)[:, 0])
-    if (sigmas < 0).any():
-        place = fields.places[int(np.argmin(sigmas))]
+    column = next((name for name in units if name in fields.numbers), None)
+    sigmas_m = np.zeros(len(fields))
+    if column is not None:
+        sigmas_m = units[column] * np.nan_to_num(fields.column(column)[:, 0])
+    if (sigmas_m < 0).any():
+        place = fields.places[int(np.argmin(sigmas_m))]
         raise DataError(f"{place}: {column} is negative.", culprits=[place])
-    return np.asarray(sigmas)
+    return NominalPoints(path.name, names, positions, sigmas_m)
 
 
 def _axes(
@@ -203,12 +202,6 @@ def _axes(
             next_step=f"Name the columns x_mm, y_mm, z_mm, or say {option} mm.",
         )
     return unitless, UNITS_M[unit]
-
-
-def _has_axes(fields: Fields) -> bool:
-    names = {number.lower() for number in fields.numbers}
-    suffixes = ("", *(f"_{unit}" for unit in UNITS_M))
-    return any(all(f"{axis}{suffix}" in names for axis in "xyz") for suffix in suffixes)
 
 
 def _coordinates(fields: Fields, columns: Sequence[str], length_m: float) -> FloatArray:

@@ -6,7 +6,6 @@ Among them HALCON's poses: `f 0`, `r` with a rotation, `t` with a translation [m
 import re
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
+from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.fields import fields_of_records, flattened
 from visioncal.interchange.formats.file_search import (
     files_in,
@@ -27,6 +26,7 @@ from visioncal.interchange.formats.file_search import (
     series_name,
 )
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
+from visioncal.interchange.formats.reading import DOCUMENTS, ENDINGS, read_document
 
 _LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
 # Rotation forms by the code of the representation (create_pose): angles about x, y, z in the
@@ -35,28 +35,18 @@ _EULER = {0: "XYZ", 2: "xyz"}
 _RODRIGUES = 4
 
 
-@dataclass(frozen=True)
-class _Family:
-    """Files of one kind in a folder, one a view: `pose_000.txt`, `pose_001.txt`, ..."""
+def _families(folder: Path) -> list[tuple[str, dict[int, Path]]]:
+    """Groups a folder's data files by their names without the number, the largest group first.
 
-    name: str
-    files: Mapping[int, Path]
-
-
-def _families(folder: Path) -> tuple[_Family, ...]:
-    """Groups a folder's data files by their names without the number, the largest group first."""
+    A group has one file a view: `pose_000.txt`, `pose_001.txt`, ...
+    """
     groups: dict[str, dict[int, Path]] = defaultdict(dict)
     for file in files_in(folder):
         number = number_in(file.name)
         if file.suffix.lower() in ENDINGS and number is not None:
             groups[series_name(file)].setdefault(number, file)
-    families = [_Family(name.rsplit(".", 1)[0], files) for name, files in groups.items()]
-    return tuple(
-        sorted(
-            (family for family in families if len(family.files) > 1),
-            key=lambda family: -len(family.files),
-        )
-    )
+    families = [(name.rsplit(".", 1)[0], files) for name, files in groups.items() if len(files) > 1]
+    return sorted(families, key=lambda family: -len(family[1]))
 
 
 def _view_folder(path: Path) -> Path | None:
@@ -74,21 +64,19 @@ def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
     if folder is None:
         raise DataError(f"{path} has no files like pose_01.json.", culprits=[str(path)])
     families = _families(folder)
-    views = sorted({number for family in families for number in family.files})
-    records: list[dict[str, object]] = [{} for _ in views]
-    for family in families:
-        prefix = f"{family.name}." if len(families) > 1 else ""
-        for at, view in enumerate(views):
-            if view in family.files:
-                for key, value in _record(family.files[view]).items():
-                    key_name = family.name if key == "matrix" else f"{prefix}{key}"
-                    records[at][key_name or "matrix"] = value
-    places = [
-        " and ".join(family.files[view].name for family in families if view in family.files)
-        for view in views
-    ]
+    records: dict[int, dict[str, object]] = {}
+    places: dict[int, list[str]] = defaultdict(list)
+    for view in sorted({number for _, files in families for number in files}):
+        records[view] = {}
+        for kind, files in ((kind, files) for kind, files in families if view in files):
+            places[view].append(files[view].name)
+            prefix = f"{kind}." if len(families) > 1 else ""
+            for key, value in _record(files[view]).items():
+                key_name = kind if key == "matrix" else f"{prefix}{key}"
+                records[view][key_name or "matrix"] = value
     name = (path if folder == path else folder.parent).resolve().name
-    fields = fields_of_records(records, places, name, folder, tuple(views))
+    joined = [" and ".join(names) for names in places.values()]
+    fields = fields_of_records([*records.values()], joined, name, folder, tuple(records))
     folders = (file for file in (folder, path, path / "images") if is_inside(file, path))
     images = next(
         (file for file in folders if any(is_image_name(at.name) for at in files_in(file))), None
@@ -99,29 +87,20 @@ def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
 def _record(path: Path) -> dict[str, object]:
     """Reads one view's file; numbers without a name are its matrix or pose."""
     suffix = path.suffix.lower()
-    document: object
+    document: object = _halcon_pose(path) if suffix == ".dat" else None
     if suffix == ".npz":
         document = read_npz(path)
     elif suffix == ".npy":
         document = read_npy(path)
     elif suffix in DOCUMENTS:
         document = read_document(path)
-    else:
-        pose = _halcon_pose(path) if suffix == ".dat" else None
-        document = _table_record(path) if pose is None else pose
+    elif document is None:
+        table = read_table(path)
+        rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
+        document = rows[0] if len(rows) == 1 else rows
+        if table.has_header and len(rows) == 1:
+            document = dict(zip(table.columns, rows[0], strict=True))
     return flattened(document if isinstance(document, Mapping) else {"matrix": document})
-
-
-def _table_record(path: Path) -> object:
-    table = read_table(path)
-    if table.has_header and len(table.rows) == 1:
-        return dict(zip(table.columns, (_cell(row) for row in table.rows[0]), strict=True))
-    rows = [[_cell(name) for name in row] for row in table.rows]
-    return rows[0] if len(rows) == 1 else rows
-
-
-def _cell(text: str) -> object:
-    return float(text) if is_number(text) else text
 
 
 VIEWS = ForeignFormat(

@@ -12,7 +12,7 @@ from visioncal.core.documents import as_numbers, mapping
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.types import MOUNTS, FloatArray
+from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.file_search import files_in, head, images_beside, number_in
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
@@ -37,26 +37,24 @@ def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
     files = _zivid_files(path)
     if not files:
         raise DataError(f"{path} has no files like pos01.yaml.", culprits=[str(path)])
-    matrices = np.array([_matrix(file) for file in files])
+    matrices = []
+    for file in files:
+        content = mapping(read_yaml(file), str(file))
+        value = content.get("PoseState")
+        if value is None:
+            value = mapping(content.get("FloatMatrix"), f"{file}: FloatMatrix").get("Data")
+        matrices.append(as_matrix(value, f"{file}: Data"))
     numbers = [number_in(file.name) for file in files]
     views = tuple(number for number in numbers if number is not None)
     places = tuple(file.name for file in files)
     images, notes = images_beside(path, requested.images, views, places, numbered=True)
     return ForeignRecording(
         name=path.resolve().name,
-        robot=requested.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
+        robot=requested.robot.applied_to(matrix_numbers(np.array(matrices), places, unit="mm")),
         images=images,
         views=views,
         notes=notes,
     )
-
-
-def _matrix(path: Path) -> FloatArray:
-    content = mapping(read_yaml(path), str(path))
-    value = content.get("PoseState")
-    if value is None:
-        value = mapping(content.get("FloatMatrix"), f"{path}: FloatMatrix").get("Data")
-    return as_matrix(value, f"{path}: Data")
 
 
 ZIVID = ForeignFormat(
@@ -89,6 +87,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         else {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
     )
     camera = requested.camera.applied_to(_poses([camera_files.get(view) for view in views], places))
+    cameras = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
+    lens, lens_notes = read_intrinsics(cameras[0]) if cameras else (None, ())
     stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
     if stated is not None:
         notes.append(f"The mount is taken from the folder's name: {stated}.")
@@ -97,37 +97,28 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         robot=requested.robot.applied_to(_poses(files, places)),
         camera=camera if camera_files else None,
         images=images,
-        mount=(stated),
+        mount=stated,
         target=None if requested.target else _target(path, notes),
-        lens=_lens(path, notes),
+        lens=lens,
         views=views,
-        notes=(*notes, *image_notes),
+        notes=(*notes, *lens_notes, *image_notes),
     )
 
 
 def _poses(files: Sequence[Path | None], places: tuple[str, ...]) -> PoseNumbers:
-    numbers = np.array([[np.nan] * 6 if file is None else _pose(file) for file in files])
+    numbers = np.full((len(files), 6), np.nan)
+    for at, file in enumerate(files):
+        if file is None:
+            continue
+        content = mapping(read_yaml(file), str(file))
+        flat = as_numbers(content.get("data"), f"{file}: data").reshape(-1)
+        if len(flat) != 6 or not np.isfinite(flat).all():
+            raise DataError(
+                f"{file}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
+                culprits=[str(file)],
+            )
+        numbers[at] = flat
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
-
-
-def _pose(path: Path) -> list[float]:
-    content = mapping(read_yaml(path), str(path))
-    flat = as_numbers(content.get("data"), f"{path}: data").reshape(-1)
-    if len(flat) != 6 or not np.isfinite(flat).all():
-        raise DataError(
-            f"{path}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
-            culprits=[str(path)],
-        )
-    return [float(value) for value in flat]
-
-
-def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
-    cameras = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
-    if not cameras:
-        return None
-    lens, more = read_intrinsics(cameras[0])
-    notes.extend(more)
-    return lens
 
 
 def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
