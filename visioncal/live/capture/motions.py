@@ -60,8 +60,8 @@ def record_motion(
     # Some are sent twice.
     ascending = np.concatenate([[True], np.diff(stamps_s) > 0.0])
     forms = {"q{}_rad": "q", "dq{}_rad_s": "dq", "current{}_a": "currents_a"}
-    joints = range(1, len(first.q) + 1)
-    columns = [form.format(joint) for form in forms for joint in joints]
+    numbers = range(1, len(first.q) + 1)
+    columns = [form.format(joint) for form in forms for joint in numbers]
     parts = [np.array([getattr(one, name) for one in samples]) for name in forms.values()]
     return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[ascending])
 
