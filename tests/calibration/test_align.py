@@ -15,7 +15,7 @@ from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, simulate
-from visioncal.simulation.elasticity import Payload
+from visioncal.simulation.arms import Payload
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,

@@ -11,8 +11,8 @@ from visioncal.calibration.pipeline import run
 from visioncal.core.transforms import invert, log
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.optics import wide_camera
-from visioncal.simulation.options import BOARDS
 
 CAMERA = wide_camera()
 # A quarter of the pixels.

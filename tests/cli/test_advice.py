@@ -15,8 +15,7 @@ from visioncal.core.transforms import invert
 from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.simulation.dynamics import real_dynamics
-from visioncal.simulation.exercise import exercise_session, record, slow_sweep
+from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
 
 # Of each kind of advice one; the others are slow.
 QUICK = (

@@ -8,8 +8,14 @@ from visioncal.core.errors import DataError
 from visioncal.dynamics.conditioning import LowPass, condition
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
-from visioncal.simulation.dynamics import drive_torques, real_dynamics
-from visioncal.simulation.exercise import Senses, multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    Senses,
+    drive_torques,
+    multi_sine,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 RATE_HZ = 500.0
 

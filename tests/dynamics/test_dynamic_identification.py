@@ -19,8 +19,15 @@ from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.validate import fit_friction_to_known, predict, validate
 from visioncal.robot import load_robot
 from visioncal.session import Stream
-from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import Senses, multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    Senses,
+    drive_torques,
+    multi_sine,
+    nominal_dynamics,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 PANDA = Path(__file__).parents[3] / "shared" / "data" / "dyn_franka_panda"
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=SLOW_RAD_S)

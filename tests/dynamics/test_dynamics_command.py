@@ -10,8 +10,14 @@ from visioncal.core.errors import DataError
 from visioncal.dynamics.identified import Identified
 from visioncal.results import Calibration
 from visioncal.session import Session
-from visioncal.simulation.dynamics import real_dynamics
-from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    Senses,
+    exercise_session,
+    multi_sine,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 GAINS = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 

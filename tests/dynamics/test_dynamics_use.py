@@ -28,8 +28,16 @@ from visioncal.interchange.outputs import write_dynamics
 from visioncal.present.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.session import Session
-from visioncal.simulation.dynamics import LinkBody, drive_torques, real_dynamics
-from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    LinkBody,
+    Senses,
+    drive_torques,
+    exercise_session,
+    multi_sine,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 # Figures are counted.
 DRAWS = True

@@ -13,8 +13,13 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.convention_hypotheses import check_recording
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import read_recorded
-from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    multi_sine,
+    nominal_dynamics,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 TORQUE, ANGLE, SPEED = "tau{}_nm", "q{}_rad", "dq{}_rad_s"
 ALL = range(1, 7)

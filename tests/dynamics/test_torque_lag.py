@@ -12,8 +12,14 @@ from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import Options, find_lag
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
-from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import exercise_session, multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    exercise_session,
+    multi_sine,
+    nominal_dynamics,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 TERMS = Options().terms
 

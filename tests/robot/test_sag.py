@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, deflected_joints, load_robot, table_of, with_base
 from visioncal.robot.tables import table_document
 from visioncal.simulation import Payload, arm_named
-from visioncal.simulation.elasticity import elasticity_of, loaded_joints
+from visioncal.simulation.arms import loaded_joints
 
 LOAD = Payload(5.0, (0.03, -0.02, 0.11), (12.0, -30.0, 4.0))
 COMPLIANCE = (5e-5, 1e-4, 8e-5, 1.5e-4, 1.2e-4, 2e-4)
@@ -28,8 +28,7 @@ def test_the_arm_gives_way_as_it_does_in_the_simulation(name):
     q, robot, arm = postures(), load_robot(name), arm_named(name)
     # An industrial arm is fifty times as stiff.
     compliance = np.array(COMPLIANCE) * (0.02 if name.startswith("generic") else 1.0)
-    giving = elasticity_of(arm, tuple(compliance), 1.0, ())
-    sagged = loaded_joints(arm, giving, q, [LOAD] * len(q))
+    sagged = loaded_joints(arm, compliance, q, [LOAD] * len(q))
     ours = deflected_joints(robot, q, compliance, loads_of(LOAD, len(q)))
     # Three looks at the bent arm leave less than a micrometre at its end.
     assert ours == pytest.approx(sagged, abs=1e-6)

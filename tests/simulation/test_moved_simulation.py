@@ -6,8 +6,15 @@ from support.moved_arms import robot_with_bodies
 
 from visioncal.core.errors import DataError
 from visioncal.robot import body_regressor, joint_torques
-from visioncal.simulation.dynamics import LinkBody, drive_torques, nominal_dynamics, real_dynamics
-from visioncal.simulation.exercise import multi_sine, record, slow_sweep
+from visioncal.simulation.dynamics import (
+    LinkBody,
+    drive_torques,
+    multi_sine,
+    nominal_dynamics,
+    real_dynamics,
+    record,
+    slow_sweep,
+)
 
 
 def states(seed: int = 0):

@@ -14,8 +14,8 @@ import numpy as np
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.simulation import SimulatedCell, forward
+from visioncal.simulation.arms import load_torques, loaded_joints
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
-from visioncal.simulation.elasticity import elasticity_of, load_torques, loaded_joints
 from visioncal.simulation.optics import project
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
@@ -127,9 +127,8 @@ def _held(cell: SimulatedCell, q: FloatArray, view: int | None = None) -> _Held:
     if not options.compliance_rad_per_nm:
         return _Held(q, np.zeros(len(q)))
     load = () if view is None else cell.robot.loads[view : view + 1]
-    giving = elasticity_of(arm, options.compliance_rad_per_nm, options.mass_share, ())
-    standing = loaded_joints(arm, giving, q[None], load)
-    return _Held(standing[0], load_torques(arm, giving, standing, load)[0])
+    standing = loaded_joints(arm, options.compliance_rad_per_nm, q[None], load)
+    return _Held(standing[0], load_torques(arm, standing, load)[0])
 
 
 def _carried(cell: SimulatedCell, held: _Held) -> FloatArray:

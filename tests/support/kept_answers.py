@@ -33,7 +33,7 @@ from visioncal.simulation import (
     simulate,
     sweep,
 )
-from visioncal.simulation.elasticity import Payload
+from visioncal.simulation.arms import Payload
 from visioncal.simulation.layout import (
     CameraAt,
     InstrumentAt,

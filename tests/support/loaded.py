@@ -6,7 +6,7 @@ from support.tracked import known_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.types import FloatArray
 from visioncal.simulation import Payload, arm_named, forward
-from visioncal.simulation.elasticity import elasticity_of, loaded_joints
+from visioncal.simulation.arms import loaded_joints
 from visioncal.simulation.instrument_session import (
     InstrumentOptions,
     InstrumentRecord,
@@ -55,9 +55,8 @@ def loaded(
 
 def deflection_m(shop: InstrumentRecord, q: FloatArray, load: Payload) -> FloatArray:
     """(m, 3) how a load moves the real flange [m]."""
-    giving = elasticity_of(shop.true_arm, COMPLIANCE, 1.0, ())
-    hung = loaded_joints(shop.true_arm, giving, q, [load] * len(q))
-    free = loaded_joints(shop.true_arm, giving, q, [Payload()] * len(q))
+    hung = loaded_joints(shop.true_arm, COMPLIANCE, q, [load] * len(q))
+    free = loaded_joints(shop.true_arm, COMPLIANCE, q, [Payload()] * len(q))
     moved = forward(shop.true_arm, hung) - forward(shop.true_arm, free)
     return np.asarray(moved[:, :3, 3])
 

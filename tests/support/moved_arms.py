@@ -10,8 +10,7 @@ from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.reading import read_recorded
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Stream
-from visioncal.simulation.dynamics import DynamicArm
-from visioncal.simulation.exercise import Exercise, Senses, record
+from visioncal.simulation.dynamics import DynamicArm, Exercise, Senses, record
 
 _ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 

@@ -31,7 +31,7 @@ from visioncal.live.planning.plan_file import plan_document
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.simulated.cell import Bench
 from visioncal.simulation.arms import forward
-from visioncal.simulation.truth import truth_of, write_truth
+from visioncal.simulation.records import truth_of, write_truth
 
 # The default speed of a UR's program; nobody stands beside this one.
 _TAKING = CaptureOptions(speed=1.05, acceleration=1.4)

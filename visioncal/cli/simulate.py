@@ -38,9 +38,9 @@ from visioncal.simulation import (
     truth_path,
     write_session,
 )
-from visioncal.simulation.dynamics import LinkBody
-from visioncal.simulation.exercise import (
+from visioncal.simulation.dynamics import (
     ExerciseOptions,
+    LinkBody,
     Senses,
     exercise,
     seed_of,

@@ -4,7 +4,8 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 in a projection or in a kinematic chain cannot cancel out.
 """
 
-from visioncal.simulation.arms import DhArm, arm_named, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, DhArm, Payload, arm_named, forward, ur_arm
+from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import (
     InstrumentReading,
     SimulatedCell,
@@ -12,11 +13,11 @@ from visioncal.simulation.cell import (
     SimulatedSight,
 )
 from visioncal.simulation.cell_files import cell_names, read_cell
-from visioncal.simulation.elasticity import ArmOptions, Payload
 from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
+    CameraOptions,
     CellOptions,
     InstrumentAt,
     Moved,
@@ -24,6 +25,7 @@ from visioncal.simulation.layout import (
     PointAt,
     RobotAt,
     Second,
+    SweepOptions,
     Swept,
 )
 from visioncal.simulation.optics import (
@@ -34,12 +36,17 @@ from visioncal.simulation.optics import (
     rays,
     wide_camera,
 )
-from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.recordings import Round, WarmUpOptions, simulate, simulate_warm_up, sweep
-from visioncal.simulation.records import cell_session, measured_poses, write_session
+from visioncal.simulation.records import (
+    Truth,
+    cell_session,
+    measured_poses,
+    read_truth,
+    truth_path,
+    write_session,
+)
 from visioncal.simulation.render import RenderScene, prepare_scene, render
 from visioncal.simulation.touching import touch
-from visioncal.simulation.truth import Truth, read_truth, truth_path
 
 __all__ = [
     "BOARDS",

@@ -1,9 +1,10 @@
-"""Simulated arms: Universal Robots' published geometry, forward and inverse kinematics.
+"""Simulated arms: published geometry, errors, deflection, forward and inverse kinematics.
 
 The chain is implemented here in plain numpy, independent of the application's robot model, so that
 an error in the chain cannot cancel out.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,14 +13,53 @@ import numpy.typing as npt
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.transforms import cross
+from visioncal.core.transforms import cross, exp
 from visioncal.core.types import FloatArray
 
-_HALF_TURN = np.pi
+_QUARTER, _HALF_TURN = 0.5 * np.pi, np.pi
 # Ripples per turn of a strain-wave gear of ratio 100: two per turn of its wave generator.
 _TEETH = 200
 # Nodes per turn of the joints' error functions, which are linear in between.
 _NODES = 1440
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+# Iterations of deflection and torques: each changes the levers by about a hundredth.
+_ROUNDS = 8
+# Masses [kg] and centres of mass [m] in the link frames, from Universal Robots, "DH parameters for
+# calculations of kinematics and dynamics"; round numbers for the other arm.
+_BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
+    "ur3e": (
+        (1.98, (0.0, -0.02, 0.0)),
+        (3.4445, (0.13, 0.0, 0.1157)),
+        (1.437, (0.05, 0.0, 0.0238)),
+        (0.871, (0.0, 0.0, 0.01)),
+        (0.805, (0.0, 0.0, 0.01)),
+        (0.261, (0.0, 0.0, -0.02)),
+    ),
+    "ur5e": (
+        (3.761, (0.0, -0.02561, 0.00193)),
+        (8.058, (0.2125, 0.0, 0.11336)),
+        (2.846, (0.15, 0.0, 0.0265)),
+        (1.37, (0.0, -0.0018, 0.01634)),
+        (1.3, (0.0, 0.0018, 0.01634)),
+        (0.365, (0.0, 0.0, -0.001159)),
+    ),
+    "ur10e": (
+        (7.369, (0.021, 0.0, 0.027)),
+        (13.051, (0.38, 0.0, 0.158)),
+        (3.989, (0.24, 0.0, 0.068)),
+        (2.1, (0.0, 0.007, 0.018)),
+        (1.98, (0.0, 0.007, 0.018)),
+        (0.615, (0.0, 0.0, -0.026)),
+    ),
+    "generic-6r-1800": (
+        (120.0, (-0.1, 0.1, 0.0)),
+        (75.0, (-0.45, 0.0, 0.1)),
+        (60.0, (-0.05, 0.0, 0.15)),
+        (25.0, (0.0, -0.3, 0.0)),
+        (10.0, (0.0, 0.0, 0.03)),
+        (5.0, (0.0, 0.0, -0.04)),
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +84,28 @@ class DhArm:
     beyond: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class Payload:
+    """A load on the flange, and a force on it."""
+
+    kg: float = 0.0  # Mass [kg].
+    # Centre of mass in the flange frame [m].
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Force on the flange's origin, in the base frame [N].
+    force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def row(self) -> dict[str, float]:
+        """Values of a session's payload columns."""
+        centre = {
+            f"payload_{name}_m": value for name, value in zip("xyz", self.centre_m, strict=True)
+        }
+        force = {f"force_{name}_n": value for name, value in zip("xyz", self.force_n, strict=True)}
+        return {"payload_kg": self.kg} | centre | force
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ArmErrors:
-    """Standard deviations of a real arm's parameters from the nominal ones."""
+class ArmOptions:
+    """An arm, standard deviations of the real one from it, and its payloads."""
 
     dh_sigma_m: float = 0.0  # Every length a and d [m].
     dh_sigma_rad: float = 0.0  # Every alpha, beta and joint offset [rad].
@@ -57,6 +116,89 @@ class ArmErrors:
     # Further joint errors as arbitrary functions of the angle [rad].
     function_sigma_rad: float = 0.0
     function_length_rad: float = 0.06  # Correlation length of these functions [rad].
+    robot: str = "ur10e"  # `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
+    robot_sigma_m: float = 3e-5  # Repeatability of the flange's position, per axis [m].
+    robot_sigma_rad: float = 5e-5  # Repeatability of its rotation, per axis [rad].
+    # Compliance of each joint; empty for a rigid arm.
+    compliance_rad_per_nm: tuple[float, ...] = ()
+    payloads: tuple[Payload, ...] = ()  # Payloads, cycled over the stops; empty for none.
+    # Backlash of each joint; empty for none. With backlash, stops are approached from alternating
+    # sides.
+    backlash_rad: tuple[float, ...] = ()
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(6,) repeatability of the flange: rotation [rad], translation [m]."""
+        return np.repeat([self.robot_sigma_rad, self.robot_sigma_m], 3)
+
+    def loads(self, stops: int) -> tuple[Payload, ...]:
+        """Payload of each of `stops` stops; empty without payloads."""
+        loads = self.payloads
+        return tuple(loads[at % len(loads)] for at in range(stops)) if loads else ()
+
+    def approach(self, stops: int) -> FloatArray | None:
+        """(stops,) side from which stops are approached, +1 or -1; None without backlash."""
+        return np.where(np.arange(stops) % 2, 1.0, -1.0) if self.backlash_rad else None
+
+    def built(self, rng: np.random.Generator) -> DhArm:
+        """Draws the real arm.
+
+        The same generator state gives the same error directions, whatever their size.
+        """
+        arm = arm_named(self.robot)
+        draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
+        sizes = np.repeat([self.eccentricity_sigma_rad, self.ripple_sigma_rad], 2)
+        beyond = arm.beyond
+        # Drawn only if needed, so that later draws do not change.
+        if self.function_sigma_rad:
+            # Smooth periodic functions: filtered white noise on a circle.
+            angles = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
+            kernel = np.exp(-2.0 * np.sin(0.5 * angles) ** 2 / self.function_length_rad**2)
+            power = np.sqrt(np.maximum(np.fft.rfft(kernel).real, 0.0))[:, None]
+            white = np.fft.rfft(rng.standard_normal((_NODES, arm.a.size)), axis=0)
+            beyond = self.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0)
+        return replace(
+            arm,
+            a=arm.a + self.dh_sigma_m * draws[0],
+            d=arm.d + self.dh_sigma_m * draws[1],
+            alpha=arm.alpha + self.dh_sigma_rad * draws[2],
+            beta=arm.beta + self.dh_sigma_rad * draws[3],
+            offset=arm.offset + self.dh_sigma_rad * draws[4] + self.offset_sigma_rad * draws[5],
+            waves=arm.waves + sizes[:, None] * waves,
+            beyond=beyond,
+        )
+
+    def flange_at(
+        self,
+        arm: DhArm,
+        q: FloatArray,
+        payloads: Sequence[Payload] = (),
+        approach: FloatArray | None = None,
+    ) -> FloatArray:
+        """Flange poses (k, 4, 4) of a real arm, before repeatability errors.
+
+        `q` are (k, n) encoder angles [rad]. Without payloads there are none; without sides of
+        approach (k,), the arm is in the middle of its backlash.
+
+        Raises:
+            DataError: There is not one compliance or backlash per joint.
+        """
+        for name, values in (
+            ("compliance", self.compliance_rad_per_nm),
+            ("backlash", self.backlash_rad),
+        ):
+            if len(values) not in (0, q.shape[1]):
+                raise DataError(
+                    f"simulation: {len(values)} values of {name} for {q.shape[1]} joints."
+                )
+        if approach is not None and self.backlash_rad:
+            # A joint that approached from above stops short of its encoder angle.
+            q = q + 0.5 * approach[:, None] * np.array(self.backlash_rad)
+        return forward(arm, loaded_joints(arm, self.compliance_rad_per_nm, q, payloads))
+
+    def jitter(self, stops: int, rng: np.random.Generator) -> FloatArray:
+        """(stops, 4, 4) repeatability errors of the flange, in its own frame."""
+        return exp(rng.standard_normal((stops, 6)) * self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,32 +239,13 @@ def ur_arm(name: str) -> DhArm:
             next_step=did_you_mean(name, SIMULATED_ARMS) or "Name one of these.",
         )
     d1, a2, a3, d4, d5, d6 = published[name]
-    quarter = 0.5 * np.pi
     return DhArm(
         name=name,
         a=np.array([0.0, a2, a3, 0.0, 0.0, 0.0]),
         d=np.array([d1, 0.0, 0.0, d4, d5, d6]),
-        alpha=np.array([quarter, 0.0, 0.0, quarter, -quarter, 0.0]),
+        alpha=np.array([_QUARTER, 0.0, 0.0, _QUARTER, -_QUARTER, 0.0]),
         beta=np.zeros(6),
         offset=np.zeros(6),
-        waves=np.zeros((4, 6)),
-    )
-
-
-def industrial_arm() -> DhArm:
-    """Nominal arm of 1.8 m reach in the proportions of a medium industrial robot.
-
-    It is no actual model: round numbers, a shoulder with an offset from the first axis, and a
-    spherical wrist.
-    """
-    quarter = 0.5 * np.pi
-    return DhArm(
-        name="generic-6r-1800",
-        a=np.array([0.18, 0.8, 0.18, 0.0, 0.0, 0.0]),
-        d=np.array([0.5, 0.0, 0.0, 0.8, 0.0, 0.13]),
-        alpha=np.array([-quarter, 0.0, -quarter, quarter, -quarter, 0.0]),
-        beta=np.zeros(6),
-        offset=np.array([0.0, -quarter, 0.0, 0.0, 0.0, np.pi]),
         waves=np.zeros((4, 6)),
     )
 
@@ -130,40 +253,23 @@ def industrial_arm() -> DhArm:
 def arm_named(name: str) -> DhArm:
     """Nominal arm by name: Universal Robots', or `generic-6r-1800`.
 
+    The latter is no actual model: round numbers in the proportions of a medium industrial robot of
+    1.8 m reach, with a shoulder offset from the first axis and a spherical wrist.
+
     Raises:
         DataError: There is no arm of that name.
     """
-    return industrial_arm() if name == "generic-6r-1800" else ur_arm(name)
-
-
-def disturb(arm: DhArm, errors: ArmErrors, rng: np.random.Generator) -> DhArm:
-    """Draws a real arm around a nominal one.
-
-    The same generator state gives the same error directions, whatever their size.
-    """
-    draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
-    sizes = np.repeat([errors.eccentricity_sigma_rad, errors.ripple_sigma_rad], 2)
-    # Drawn only if needed, so that later draws do not change.
-    beyond = _functions(errors, arm.a.size, rng) if errors.function_sigma_rad else arm.beyond
-    return replace(
-        arm,
-        a=arm.a + errors.dh_sigma_m * draws[0],
-        d=arm.d + errors.dh_sigma_m * draws[1],
-        alpha=arm.alpha + errors.dh_sigma_rad * draws[2],
-        beta=arm.beta + errors.dh_sigma_rad * draws[3],
-        offset=arm.offset + errors.dh_sigma_rad * draws[4] + errors.offset_sigma_rad * draws[5],
-        waves=arm.waves + sizes[:, None] * waves,
-        beyond=beyond,
+    if name != "generic-6r-1800":
+        return ur_arm(name)
+    return DhArm(
+        name=name,
+        a=np.array([0.18, 0.8, 0.18, 0.0, 0.0, 0.0]),
+        d=np.array([0.5, 0.0, 0.0, 0.8, 0.0, 0.13]),
+        alpha=np.array([-_QUARTER, 0.0, -_QUARTER, _QUARTER, -_QUARTER, 0.0]),
+        beta=np.zeros(6),
+        offset=np.array([0.0, -_QUARTER, 0.0, 0.0, 0.0, np.pi]),
+        waves=np.zeros((4, 6)),
     )
-
-
-def _functions(errors: ArmErrors, joints: int, rng: np.random.Generator) -> FloatArray:
-    """(k, n) random smooth periodic functions: filtered white noise on a circle."""
-    angles = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
-    kernel = np.exp(-2.0 * np.sin(0.5 * angles) ** 2 / errors.function_length_rad**2)
-    power = np.sqrt(np.maximum(np.fft.rfft(kernel).real, 0.0))[:, None]
-    white = np.fft.rfft(rng.standard_normal((_NODES, joints)), axis=0)
-    return np.asarray(errors.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0))
 
 
 def reach_m(arm: DhArm) -> float:
@@ -187,6 +293,57 @@ def link_frames(arm: DhArm, joints: FloatArray) -> FloatArray:
 def forward(arm: DhArm, joints: FloatArray) -> FloatArray:
     """Forward kinematics: (m, n) joint angles [rad] to (m, 4, 4) `base_from_flange`."""
     return link_frames(arm, joints)[:, -1]
+
+
+def loaded_joints(
+    arm: DhArm,
+    compliance: Sequence[float],
+    joints: FloatArray,
+    payloads: Sequence[Payload] = (),
+) -> FloatArray:
+    """True joint angles under load.
+
+    Args:
+        arm: Real arm.
+        compliance: Compliance of each joint [rad/(N m)]; empty for a rigid arm.
+        joints: (m, n) encoder angles [rad].
+        payloads: m payloads, one per stop; empty for none.
+
+    Returns:
+        (m, n) equivalent angles of a rigid arm [rad].
+    """
+    sagged = joints
+    for _ in range(_ROUNDS if any(compliance) else 0):
+        sagged = joints + np.array(compliance) * load_torques(arm, sagged, payloads)
+    return sagged
+
+
+def load_torques(arm: DhArm, joints: FloatArray, payloads: Sequence[Payload]) -> FloatArray:
+    """(m, n) torques of weight and force on the joints [N m]: moments about the axes.
+
+    They are computed from the simulated arm's own frames, independent of the application's model.
+    """
+    frames = link_frames(arm, joints)
+    kg, centres = (np.array(pair) for pair in zip(*_BODIES[arm.name], strict=True))
+    weights = kg[:, None] * GRAVITY
+    lever = frames[:, 1:, :3, :3] @ centres[:, :, None]
+    places = lever[..., 0] + frames[:, 1:, :3, 3]
+    forces = np.broadcast_to(weights, places.shape)
+    if payloads:
+        tip = frames[:, -1]
+        payload_centres = np.array([payload.centre_m for payload in payloads])
+        payload_places = np.einsum("mij,mj->mi", tip[:, :3, :3], payload_centres) + tip[:, :3, 3]
+        load = np.array([payload.kg for payload in payloads])[:, None] * GRAVITY
+        flange_forces = np.array([payload.force_n for payload in payloads])
+        places = np.concatenate([places, payload_places[:, None], tip[:, None, :3, 3]], axis=1)
+        forces = np.concatenate([forces, load[:, None], flange_forces[:, None]], axis=1)
+    torques = np.empty(joints.shape)
+    for joint in range(joints.shape[1]):
+        axis, origin = frames[:, joint, :3, 2], frames[:, joint, :3, 3]
+        # Links after the joint load it; payload and force come after all links.
+        moments = np.cross(places[:, joint:] - origin[:, None], forces[:, joint:])
+        torques[:, joint] = np.einsum("mi,mki->m", axis, moments)
+    return torques
 
 
 def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:

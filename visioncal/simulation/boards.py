@@ -1,10 +1,73 @@
-"""Geometry of simulated targets: corners of a printed, scaled and bowed board."""
+"""Simulated targets, and the corners of a printed, scaled and bowed one."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.types import FloatArray, Target
+
+_APRILTAGS = "DICT_APRILTAG_36h11"
+
+
+def _tags() -> Target:
+    """Seven tags of 40 to 60 mm on a plate, with measured corners."""
+    tags = (
+        *((3, 0.000, 0.000, 0.050), (17, 0.085, 0.010, 0.040), (42, 0.160, 0.000, 0.060)),
+        *((5, 0.010, 0.075, 0.040), (101, 0.140, 0.085, 0.050), (64, 0.075, 0.070, 0.045)),
+        (9, 0.205, 0.090, 0.040),
+    )
+    points = [
+        (x + dx * side, y + dy * side, 0.0)
+        for _, x, y, side in tags
+        for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1))
+    ]
+    return Target(
+        name="tags",
+        kind="points",
+        columns=len(points),
+        rows=1,
+        square_m=0.245,
+        square_sigma_m=0.0,
+        dictionary=_APRILTAGS,
+        points_m=tuple(points),
+        point_numbers=tuple(range(len(points))),
+        point_tags=tuple((tag[0], corner) for tag in tags for corner in range(4)),
+    )
+
+
+# Boards with square sides and their sigmas [m]: a ChArUco board, a checkerboard whose colours
+# determine corner 0, an AprilGrid as on Kalibr's pages, circles of 14 mm in shifted rows, and a
+# symmetric grid of circles of 15 mm.
+_CHARUCO = Target(
+    "charuco_9x6_30mm", "charuco", 9, 6, 0.030, 3e-5, marker_m=0.022, dictionary="DICT_5X5_100"
+)
+_CHECKERBOARD = Target("checkerboard_9x6_25mm", "checkerboard", 9, 6, 0.025, 2.5e-5)
+_APRILGRID = Target(
+    name="aprilgrid_6x4_32mm",
+    kind="aprilgrid",
+    columns=6,
+    rows=4,
+    square_m=0.032,
+    square_sigma_m=3.2e-5,
+    dictionary=_APRILTAGS,
+    marker_id=0,
+    spacing=0.3,
+    border=2,
+)
+_CIRCLES = Target(
+    "circles_5x9_20mm_asymmetric", "circles", 5, 9, 0.020, 2e-5, diameter_m=0.014, asymmetric=True
+)
+_SYMMETRIC = Target("circles_8x6_30mm", "circles", 8, 6, 0.030, 3e-5, diameter_m=0.015)
+BOARDS: Mapping[str, Target] = {
+    "charuco": _CHARUCO,
+    "checkerboard": _CHECKERBOARD,
+    "aprilgrid": _APRILGRID,
+    "circles": _CIRCLES,
+    "symmetric-circles": _SYMMETRIC,
+    "tags": _tags(),
+}
+TARGETS: Mapping[str, Target] = {board.name: board for board in BOARDS.values()}
 
 
 @dataclass(frozen=True, kw_only=True)

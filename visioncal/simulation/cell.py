@@ -9,8 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream, frame_name
-from visioncal.simulation.arms import DhArm
-from visioncal.simulation.elasticity import Payload
+from visioncal.simulation.arms import DhArm, Payload
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,

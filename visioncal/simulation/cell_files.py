@@ -14,7 +14,8 @@ from visioncal.core.files import DocumentTable, find_described, parse_toml, read
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
-from visioncal.simulation.elasticity import Payload
+from visioncal.simulation.arms import Payload
+from visioncal.simulation.boards import TARGETS
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,
@@ -27,7 +28,6 @@ from visioncal.simulation.layout import (
     Swept,
 )
 from visioncal.simulation.optics import CAMERAS
-from visioncal.simulation.options import TARGETS
 
 Thing: TypeAlias = (
     RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | Payload | NetworkOptions
@@ -188,7 +188,7 @@ class _Reader:
 
 def _number(table: DocumentTable, key: str) -> float:
     """A number, checked against the range of its field."""
-    value = table.number(key, positive=key in ("scale", "mass_share", "function_length_rad"))
+    value = table.number(key, positive=key in ("scale", "function_length_rad"))
     if key == "scale" and not 0.5 <= value <= 2.0:
         raise table.refuse(key, value, "a number from 0.5 to 2")
     if key == "bow_m" and abs(value) > _MOST_BOW_M:

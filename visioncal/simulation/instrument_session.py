@@ -9,9 +9,8 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
-from visioncal.simulation.arms import DhArm, arm_named, forward
-from visioncal.simulation.elasticity import ArmOptions
-from visioncal.simulation.truth import write_truth
+from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, forward
+from visioncal.simulation.records import write_truth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,16 +1,18 @@
-"""Components of simulated cells, and their faults."""
+"""Options of simulated cells: components, faults, and independent sources of randomness."""
 
 from dataclasses import dataclass, field, fields
+from enum import IntEnum
 from typing import Any
+
+import numpy as np
 
 from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
-from visioncal.core.types import Mount, Target
-from visioncal.simulation.boards import Sheet
-from visioncal.simulation.draws import DrawOptions
-from visioncal.simulation.elasticity import ArmOptions
-from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
+from visioncal.core.types import Camera, Mount, Target
+from visioncal.session import frame_name
+from visioncal.simulation.arms import ArmOptions
+from visioncal.simulation.boards import BOARDS, Sheet
+from visioncal.simulation.optics import fine_camera, wide_camera
 from visioncal.simulation.poses import Motion, Viewpoints
 
 # Centre of the cell, which robots face [m].
@@ -20,6 +22,105 @@ CELL = "cell"
 _PACE_S = 4.0
 # Board names in the session of a cell with two boards.
 _TWO_BOARDS = ("first", "second")
+
+
+class RandomStream(IntEnum):
+    """Sources of randomness; those from 100 on are for cells with named things."""
+
+    MOUNTING = 0
+    POSES = 1
+    ARM = 2
+    ROBOT = 3
+    WRONG = 4
+    PIXELS = 5
+    IMAGES = 6
+    BACKDROP = 7
+    PAIRS = 8
+    LENS = 9
+    SWEEP = 10
+    BUMP = 11
+    TOUCHES = 12
+    MOUNTINGS = 100
+    POSTURES = 101
+    ARMS = 102
+    ROBOTS = 103
+    CORNERS = 104
+    MEASURED = 105
+    FAULTS = 106
+    SHARE = 107
+    LENS_VIEWS = 108
+    READINGS = 109
+    SWEEPS = 111
+
+
+# Sources that another draw of the same cell changes, and those that another recording keeps.
+_DRAWN_ANEW = (
+    *(RandomStream.ARM, RandomStream.ROBOT, RandomStream.PIXELS),
+    *(RandomStream.ARMS, RandomStream.ROBOTS, RandomStream.CORNERS),
+)
+_KEPT = (
+    *(RandomStream.MOUNTING, RandomStream.ARM, RandomStream.LENS),
+    *(RandomStream.MOUNTINGS, RandomStream.ARMS, RandomStream.LENS_VIEWS),
+)
+# Distinguishes a recording's randomness from a draw's.
+_RECORDING = 1000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawOptions:
+    """Random seed of a cell, and the noise of corners."""
+
+    pixel_sigma_px: float = 0.05  # Noise of simulated detections, per axis [px].
+    # Seed of everything random. Each source of randomness has its own stream, so that changing one
+    # option does not change the draws of others.
+    seed: int = 0
+    # Number of the draw of real arms and noise; the cell and the nominal postures are the same for
+    # all.
+    draw: int = 0
+    # Number of the recording of the same cell and arms, with stops and noise of its own.
+    recording: int = 0
+
+    def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:
+        """Generator of one source of randomness; `index` is of the thing or the view."""
+        extra = [self.draw] if self.draw and purpose in _DRAWN_ANEW else []
+        if self.recording and purpose not in _KEPT:
+            extra += [_RECORDING, self.recording]
+        return np.random.default_rng([self.seed, int(purpose), *extra, *index])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraOptions:
+    """A camera with its stated intrinsics and the quality of its images."""
+
+    camera: Camera = field(default_factory=wide_camera)  # True optics.
+    state_intrinsics: bool = True  # Whether the session states the intrinsics.
+    # Error of the stated intrinsics, as root mean square over the image [px].
+    lens_mismatch_px: float = 0.0
+    blur_px: float = 0.7  # Defocus of rendered images, as a Gaussian's sigma [px].
+    image_noise: float = 2.0  # Noise of rendered images [grey levels].
+    vignetting: float = 0.2  # Relative loss of light in the image's corners.
+    jpeg_quality: int | None = None  # 1 to 100; None writes lossless PNG.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Timing and noise of a sweep."""
+
+    stops: int = 12  # Number of postures on its path.
+    pace_s: float = 1.7  # Time between postures [s].
+    robot_hz: float = 125.0  # Samples of the controller per second.
+    frames_hz: float = 30.0  # Frames of the camera per second.
+    # Time from an image's first row to its last, with the stamp at the middle [s]; 0 for a global
+    # shutter.
+    readout_s: float = 0.0
+    # Offset of the camera's clock relative to the controller's [s].
+    camera_minus_robot_s: float = 0.0
+    jitter_s: float = 0.0  # Standard deviation of the camera's stamps [s].
+    encoder_sigma_rad: float = 2e-6  # Noise of the reported joint angles [rad].
+
+    def __post_init__(self) -> None:
+        if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:
+            raise DataError("simulation: a sweep needs two stops, and times and rates above 0.")
 
 
 @dataclass(frozen=True)
@@ -172,6 +273,21 @@ class NetworkOptions(DrawOptions):
     def layout(self) -> "NetworkOptions":
         """Layout of the cell, as for every cell."""
         return self
+
+    @property
+    def parents(self) -> dict[str, str]:
+        """Parent of each frame but the flanges, by its name in a session."""
+        parents = {frame_name("base", robot.name): CELL for robot in self.robots if robot.name}
+        root = CELL if parents else "base"
+        for kind, things in (
+            ("camera", self.cameras),
+            ("target", self.boards),
+            ("point", self.points),
+        ):
+            for thing in things:
+                parent = root if thing.on == CELL else frame_name("flange", thing.on)
+                parents[frame_name(kind, thing.name)] = parent
+        return parents | {frame_name("instrument", item.name): root for item in self.instruments}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,10 +9,17 @@ from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
 from visioncal.simulation.cell import SimulatedCell
-from visioncal.simulation.draws import RandomStream
+from visioncal.simulation.layout import RandomStream
 from visioncal.simulation.optics import project, rays
-from visioncal.simulation.rasters import Float32Array, Patch, between, trace
-from visioncal.simulation.render import developed, light_on, prepare_scene
+from visioncal.simulation.render import (
+    Float32Array,
+    Patch,
+    between,
+    developed,
+    light_on,
+    prepare_scene,
+    trace,
+)
 from visioncal.simulation.textures import margin_m
 
 # Image shift below the accuracy of corner detection [px].

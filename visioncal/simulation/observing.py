@@ -10,7 +10,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
 from visioncal.session import frame_name
-from visioncal.simulation import network_postures
 from visioncal.simulation.arms import DhArm, arm_named, forward, inverse
 from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
 from visioncal.simulation.cell import (
@@ -19,11 +18,9 @@ from visioncal.simulation.cell import (
     SimulatedRobot,
     SimulatedSight,
 )
-from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.heat import Heat, heated_flanges, warm_up
-from visioncal.simulation.layout import CellOptions, NetworkOptions
-from visioncal.simulation.optics import project, sees
-from visioncal.simulation.options import CameraOptions
+from visioncal.simulation.layout import CellOptions, NetworkOptions, RandomStream
+from visioncal.simulation.optics import inaccurate_camera, project, sees
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX, Viewpoints, filling_m
 
 # Corners closer to the image's edge are not detected [px].
@@ -46,15 +43,6 @@ def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> 
     share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
     visible[visible] = share >= (LEAST_SHARE if detectable_in_part(sheet.target) else 1.0)
     return np.asarray(visible)
-
-
-def visible_corners(
-    camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int
-) -> Corners:
-    """Exact corners of a sheet inside the image of one view."""
-    points = corners_m(sheet) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
-    ids = np.flatnonzero(sees(camera.camera, points, EDGE_PX)).astype(np.int64)
-    return Corners(view, ids, project(camera.camera, points[ids]), camera.blur_px)
 
 
 def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
@@ -113,11 +101,13 @@ def moved_cell(
         )
     return SimulatedCell(
         options=options,
-        parents=network_postures.parents_of(layout),
+        parents=layout.parents,
         mountings=mountings,
         robots=robots,
         stated={
-            camera.name: camera.stated(_stream(options, RandomStream.LENS, index))
+            camera.name: inaccurate_camera(
+                camera.camera, camera.lens_mismatch_px, _stream(options, RandomStream.LENS, index)
+            )
             for index, camera in enumerate(layout.cameras)
         },
         stamps_s=stamps_s if layout.pace_s else None,
@@ -136,7 +126,15 @@ def _stream(
 
 def observed(cell: SimulatedCell) -> SimulatedCell:
     """Adds the observations of cameras and instruments, stop by stop, and numbers the rows."""
-    layout, frames = cell.layout, _cell_poses(cell)
+    # (s, 4, 4) true poses of the frames in the cell at each stop.
+    layout, frames = cell.layout, parent_poses(cell)
+    flanges = {frame_name("flange", name): name for name in cell.robots}
+    for flange, name in flanges.items():
+        base = frames.get(frame_name("base", name), np.eye(4))
+        frames[flange] = base @ cell.robots[name].true_base_from_flange
+    for frame, parent in cell.parents.items():
+        if parent in flanges:
+            frames[frame] = frames[parent] @ frames[frame]
     poses = {
         (camera.name, board.name): invert(frames[frame_name("camera", camera.name)])
         @ frames[frame_name("target", board.name)]
@@ -171,7 +169,11 @@ def observed(cell: SimulatedCell) -> SimulatedCell:
 def _sight(
     cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
 ) -> SimulatedSight:
-    exact = visible_corners(cell.camera(camera), cell.board(board), pose, view)
+    """A camera's image of a board, with the exact corners inside it."""
+    lens, points = cell.camera(camera), corners_m(cell.board(board))
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    ids = np.flatnonzero(sees(lens.camera, points, EDGE_PX)).astype(np.int64)
+    exact = Corners(view, ids, project(lens.camera, points[ids]), lens.blur_px)
     return SimulatedSight(view, stop, camera, board, pose, exact, exact)
 
 
@@ -215,19 +217,6 @@ def parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
             twist, axis=1, keepdims=True
         )
         poses[push.frame][start:] = poses[push.frame][start:] @ exp(twist.ravel())
-    return poses
-
-
-def _cell_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
-    """(s, 4, 4) true poses of the frames in the cell at each stop."""
-    poses = parent_poses(cell)
-    flanges = {frame_name("flange", name): robot for name, robot in cell.robots.items()}
-    for (flange, robot), name in zip(flanges.items(), cell.robots, strict=True):
-        base = poses.get(frame_name("base", name), np.eye(4))
-        poses[flange] = base @ robot.true_base_from_flange
-    for frame, parent in cell.parents.items():
-        if parent in flanges:
-            poses[frame] = poses[parent] @ poses[frame]
     return poses
 
 
@@ -316,7 +305,8 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
     sights = list(cell.sights)
     groups: dict[tuple[str, str], list[int]] = {}
     for at, sight in enumerate(sights):
-        if sight.stop >= 0 and _moves(cell, sight):
+        camera, target = frame_name("camera", sight.camera), frame_name("target", sight.board)
+        if sight.stop >= 0 and cell.parents[camera] != cell.parents[target]:
             groups.setdefault((sight.camera, sight.board), []).append(at)
     pools = [rng.permutation(group).tolist() for group in groups.values() if len(group) > 1]
     wrong: list[int] = []
@@ -336,14 +326,6 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
         wrong.append(row)
     views = sorted(cell.sights[index].view for index in wrong)
     return replace(cell, sights=tuple(sights), wrong_views=tuple(views))
-
-
-def _moves(cell: SimulatedCell, sight: SimulatedSight) -> bool:
-    carriers = [
-        cell.parents[frame_name("camera", sight.camera)],
-        cell.parents[frame_name("target", sight.board)],
-    ]
-    return carriers[0] != carriers[1]
 
 
 def _pool(pools: list[list[int]], least: int) -> list[int]:

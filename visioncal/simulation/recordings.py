@@ -14,18 +14,24 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import apply_each, invert
+from visioncal.core.transforms import apply_each, compose, invert
 from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
-from visioncal.simulation import network_postures, one_robot
 from visioncal.simulation.arms import DhArm, forward
 from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
-from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.heat import Heat, Warming, heated_flanges, warm_up
-from visioncal.simulation.layout import CELL, CellOptions, NetworkOptions, Swept
+from visioncal.simulation.layout import (
+    CELL,
+    CameraOptions,
+    CellOptions,
+    NetworkOptions,
+    RandomStream,
+    SweepOptions,
+    Swept,
+)
 from visioncal.simulation.observing import (
     EDGE_PX,
     detected,
@@ -36,7 +42,7 @@ from visioncal.simulation.observing import (
     with_faults,
 )
 from visioncal.simulation.optics import project, sees
-from visioncal.simulation.options import CameraOptions, SweepOptions
+from visioncal.simulation.postures import mounted, mounted_single, postures_of, postures_single
 
 # Minimum number of corners, and smallest cosine of obliqueness, of a recorded frame.
 _FEWEST_OF_CELL, _FACING = 12, 0.5
@@ -58,9 +64,11 @@ class Passage:
     @classmethod
     def through(cls, stops: FloatArray, options: SweepOptions) -> "Passage":
         """A path through (s, n) postures [rad], in nearest-neighbour order."""
-        way = CubicSpline(
-            options.pace_s * np.arange(len(stops)), _nearest_order(stops), bc_type="clamped"
-        )
+        left, order = list(range(1, len(stops))), [0]
+        while left:
+            distances = [float(np.abs(stops[index] - stops[order[-1]]).max()) for index in left]
+            order.append(left.pop(int(np.argmin(distances))))
+        way = CubicSpline(options.pace_s * np.arange(len(stops)), stops[order], bc_type="clamped")
         end_s = options.pace_s * (len(stops) - 1)
         return cls(
             options,
@@ -103,16 +111,6 @@ class Passage:
             delays_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
         ids = np.flatnonzero(sees(optics, points, EDGE_PX)).astype(np.int64)
         return Corners(view, ids, px[ids], camera.blur_px)
-
-
-def _nearest_order(stops: FloatArray) -> FloatArray:
-    """Orders postures by nearest neighbours."""
-    left = list(range(1, len(stops)))
-    order = [0]
-    while left:
-        distances = [float(np.abs(stops[index] - stops[order[-1]]).max()) for index in left]
-        order.append(left.pop(int(np.argmin(distances))))
-    return stops[order]
 
 
 def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> SimulatedCell:
@@ -267,31 +265,29 @@ def simulate(
             cannot reach enough poses with a board in view.
     """
     if isinstance(options, CellOptions):
-        cell = observed(_one_robot_cell(options, postures))
+        placed = mounted_single(options)
+        if postures is None:
+            joints = postures_single(options, placed)
+        else:
+            joints = np.array(postures, dtype=float)
+            options = replace(options, views=len(joints))
+        # The camera is displaced in a random direction.
+        shift = options.stream(RandomStream.BUMP).standard_normal(3)
+        shift *= options.camera_moved_m / np.linalg.norm(shift)
+        placed["cam"] = placed["cam"] @ compose(np.eye(3), shift)
+        cell = observed(moved_cell(options, placed, {"": joints}))
         wrong = [sight.view for sight in cell.sights if sight.stop in cell.robot.wrong_stops]
         return replace(cell, wrong_views=tuple(wrong))
     if postures is not None:
         raise DataError("simulation: postures are taken by a cell of one robot alone.")
-    mountings = network_postures.mounted(options)
-    cell = observed(moved_cell(options, mountings, network_postures.postures(options, mountings)))
-    cell = with_faults(cell)
+    placed = mounted(options)
+    cell = with_faults(observed(moved_cell(options, placed, postures_of(options, placed))))
     pushed = replace(
         cell, mountings={name: array[-1] for name, array in parent_poses(cell).items()}
     )
     for swept in options.sweeps:
         cell = with_sweep(cell, swept, pushed)
     return cell
-
-
-def _one_robot_cell(options: CellOptions, postures: FloatArray | None) -> SimulatedCell:
-    """A cell of one robot and one camera, before observations."""
-    mountings = one_robot.mounted(options)
-    if postures is None:
-        joints = one_robot.postures(options, mountings)
-    else:
-        joints = np.array(postures, dtype=float)
-        options = replace(options, views=len(joints))
-    return moved_cell(options, one_robot.pushed(options, mountings), {"": joints})
 
 
 @dataclass(frozen=True, eq=False)

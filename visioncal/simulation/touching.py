@@ -17,8 +17,8 @@ from visioncal.session import frame_name
 from visioncal.session.columns import pose_row
 from visioncal.simulation.arms import forward, inverse, reach_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedRobot
-from visioncal.simulation.draws import RandomStream
-from visioncal.simulation.reach import LEAST_DEXTERITY, home_posture, lowest_m
+from visioncal.simulation.layout import RandomStream
+from visioncal.simulation.postures import LEAST_DEXTERITY, home_posture, lowest_m
 
 # Contact error per axis [m], and largest tilt of the flange from vertical [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75

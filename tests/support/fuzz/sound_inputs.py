@@ -34,8 +34,14 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.simulation.dynamics import LinkBody, real_dynamics
-from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
+from visioncal.simulation.dynamics import (
+    LinkBody,
+    Senses,
+    exercise_session,
+    multi_sine,
+    real_dynamics,
+    record,
+)
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)

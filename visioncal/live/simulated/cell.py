@@ -23,14 +23,14 @@ from visioncal.live.planning.cell import TYPICAL_NOISE, TYPICAL_PX, Limits, Plan
 from visioncal.live.simulated.controller import ControllerOptions, TrueState, spawn
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
-from visioncal.simulation.arms import ArmErrors
+from visioncal.simulation.arms import ArmOptions
 from visioncal.simulation.live import LiveView
 
 # Errors of the user's guesses of both edges, as measured by ruler and by eye [m, rad].
 GUESS_M, GUESS_RAD = 0.02, float(np.deg2rad(5.0))
 _ROBOT = "ur5e"
 # Joint offsets that have changed since the factory calibration.
-_WORN = ArmErrors(offset_sigma_rad=3e-4)
+_WORN = ArmOptions(offset_sigma_rad=3e-4)
 # Depth of the floor below base and board [m].
 _FLOOR_DEPTH_M = 0.1
 # Seed of the guesses, distinct from those of the cell and the controller.

@@ -22,7 +22,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal, NamedTuple, Self, TypeAlias
@@ -32,7 +32,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
-from visioncal.simulation.arms import ArmErrors, DhArm, disturb, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, DhArm, forward, ur_arm
 
 # `none` mends all others.
 Fault: TypeAlias = Literal[
@@ -94,8 +94,10 @@ class ControllerOptions:
     robot: str = "ur10e"  # `ur3e`, `ur5e` or `ur10e`.
     seed: int = 0
     # Errors of the true arm relative to its controller's model.
-    errors: ArmErrors = field(
-        default_factory=lambda: ArmErrors(dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4)
+    errors: ArmOptions = field(
+        default_factory=lambda: ArmOptions(
+            dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4
+        )
     )
     q: tuple[float, ...] = _HOME  # Joint angles at the start [rad].
     # Tool offset that is set: x, y, z [m] and a rotation vector [rad].
@@ -112,7 +114,8 @@ class ControllerOptions:
     @property
     def true_arm(self) -> DhArm:
         """True arm, with errors."""
-        return disturb(self.believed_arm, self.errors, np.random.default_rng([self.seed, 2]))
+        arm = replace(self.errors, robot=self.robot)
+        return arm.built(np.random.default_rng([self.seed, 2]))
 
 
 class TrueState(NamedTuple):
