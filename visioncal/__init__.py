@@ -29,11 +29,9 @@ if TYPE_CHECKING:
     from visioncal.frames.camera_chain import Plane
     from visioncal.frames.fixture import touched_fixture
     from visioncal.frames.frame_from_images import seen_frame
-    from visioncal.frames.locate import locate, locate_target
-    from visioncal.frames.located import Located
-    from visioncal.frames.picks import locate_views
-    from visioncal.frames.single_view import Sight
-    from visioncal.frames.target_pose import place_seen
+    from visioncal.frames.locate import Located, locate, locate_target
+    from visioncal.frames.session_observations import locate_views
+    from visioncal.frames.target_pose import Sight, place_seen
     from visioncal.frames.tcp import touched_tool
     from visioncal.interchange.batch import Batch, batch
     from visioncal.interchange.exports import export
@@ -65,11 +63,11 @@ _HOMES = {
     "Drawing": "visioncal.present.report.drawing",
     "DriverError": "visioncal.core.errors",
     "Loads": "visioncal.robot",
-    "Located": "visioncal.frames.located",
+    "Located": "visioncal.frames.locate",
     "OnlineCompensator": "visioncal.robot.thermal",
     "Plane": "visioncal.frames.camera_chain",
     "Session": "visioncal.session",
-    "Sight": "visioncal.frames.single_view",
+    "Sight": "visioncal.frames.target_pose",
     "Verdict": "visioncal.results",
     "VisioncalError": "visioncal.core.errors",
     "batch": "visioncal.interchange.batch",
@@ -84,7 +82,7 @@ _HOMES = {
     "join_sessions": "visioncal.session.shared_arm",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
-    "locate_views": "visioncal.frames.picks",
+    "locate_views": "visioncal.frames.session_observations",
     "make_plan": "visioncal.live.planning.plan",
     "place_seen": "visioncal.frames.target_pose",
     "seen_frame": "visioncal.frames.frame_from_images",

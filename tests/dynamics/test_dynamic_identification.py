@@ -11,12 +11,18 @@ from support.moved_arms import changed, recorded, robot_with_bodies, true_base
 from visioncal.core.errors import DegenerateError
 from visioncal.dynamics.base import BaseModel, null_space
 from visioncal.dynamics.conditioning import condition
-from visioncal.dynamics.identified import Identified, TorqueValidation
-from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
-from visioncal.dynamics.judge import judge
+from visioncal.dynamics.identified import Identified, TorqueValidation, judge
+from visioncal.dynamics.identify import (
+    SLOW_RAD_S,
+    Options,
+    block_of,
+    fit_friction_to_known,
+    identify,
+    predict,
+    validate,
+)
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
-from visioncal.dynamics.validate import fit_friction_to_known, predict, validate
 from visioncal.robot import load_robot
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import (

@@ -21,7 +21,7 @@ from visioncal.dynamics import (
     external_torques,
     friction_at,
 )
-from visioncal.dynamics.document import stribeck_rows
+from visioncal.dynamics.identified import stribeck_rows
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics

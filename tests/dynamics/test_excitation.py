@@ -14,11 +14,9 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel, smooth_condition
-from visioncal.dynamics.excitation import ExcitationRequest, Objective, excite
-from visioncal.dynamics.fourier import Harmonics, Series
+from visioncal.dynamics.excitation import ExcitationRequest, Harmonics, Objective, Series, excite
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_extremes, motion_limits
-from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm

@@ -15,11 +15,8 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
 from visioncal.estimation.problem_parts import Noise
-from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture import drawn_fixture, touched_fixture
-from visioncal.frames.fixture_fit import FitSettings
-from visioncal.frames.measured_points import Tool, touched_points
-from visioncal.frames.touches import TouchRows, check_lengths
+from visioncal.frames.fixture import FitSettings, drawn_fixture, touched_fixture
+from visioncal.frames.touches import NominalPoints, Tool, TouchRows, check_lengths, touched_points
 from visioncal.results import Edge, FrameFile, Verdict
 
 TIP = made.FLANGE_FROM_TOOL[:3, 3]

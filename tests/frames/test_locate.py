@@ -23,8 +23,7 @@ import visioncal
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.frames.camera_chain import Plane
-from visioncal.frames.locate import locate, locate_target
-from visioncal.frames.located import Located
+from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.results import Calibration, Edge, Verdict, to_document
 from visioncal.session import Session
 from visioncal.simulation import (

@@ -14,9 +14,8 @@ from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Target
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.fixture_from_markers import measure_markers
-from visioncal.frames.single_view import Sight, candidate_places
 from visioncal.frames.target_in_image import target_pose_candidates
-from visioncal.frames.target_pose import place_seen
+from visioncal.frames.target_pose import Sight, candidate_places, place_seen
 from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics, with_intrinsics
 

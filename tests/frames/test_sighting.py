@@ -11,9 +11,9 @@ from support.plates import CENTRES, CLEAR, marked_plate, plate_session
 from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.transforms import invert, log, skew
-from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_from_markers import fixture_from_marker_images
 from visioncal.frames.frame_from_images import depends_on_camera, seen_frame
+from visioncal.frames.touches import NominalPoints
 from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages

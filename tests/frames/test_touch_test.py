@@ -13,13 +13,13 @@ from support.pages import Page
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
-from visioncal.frames.measured_points import Tool
 from visioncal.frames.touch_test import (
     evaluate_gaps,
     flange_extent,
     touch_targets,
     touch_test_finding,
 )
+from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import rewrite_result
 from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.hover import Hovering

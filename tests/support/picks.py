@@ -13,8 +13,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.frames.camera_chain import Plane
-from visioncal.frames.locate import locate, locate_target
-from visioncal.frames.located import Located
+from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.results import Calibration
 from visioncal.simulation import SimulatedCell, project, rays
 from visioncal.simulation.boards import Sheet, corners_m

@@ -11,7 +11,7 @@ from support.picks import calibration_of
 
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray
-from visioncal.frames.single_view import Sight
+from visioncal.frames.target_pose import Sight
 from visioncal.results import Calibration, CameraResult
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import CellOptions, simulate

@@ -40,11 +40,16 @@ from visioncal.dynamics import (
     drive_gains,
     estimate_payload,
 )
-from visioncal.dynamics.document import stribeck_rows, to_document
 from visioncal.dynamics.excitation import ExcitationRequest, excite
-from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified
-from visioncal.dynamics.identify import SLOW_RAD_S, Options
-from visioncal.dynamics.judge import judge
+from visioncal.dynamics.identified import (
+    CLASSES,
+    UNKNOWN,
+    Identified,
+    judge,
+    stribeck_rows,
+    to_document,
+)
+from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.plan_files import MotionPlan, motion_document
 from visioncal.dynamics.run import (
@@ -57,7 +62,6 @@ from visioncal.dynamics.run import (
     validate_session,
 )
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
-from visioncal.dynamics.validate import validate
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrMotion

@@ -17,13 +17,12 @@ from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
 from visioncal.core.transforms import pose_difference
-from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.fixture_from_markers import fixture_from_marker_images
 from visioncal.frames.frame_from_images import seen_frame
-from visioncal.frames.measured_points import NO_TOOL, Tool
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.frames.tcp import touched_tool
+from visioncal.frames.touches import NO_TOOL, NominalPoints, Tool
 from visioncal.interchange.formats.touches import read_nominal, read_touches, robots_of
 from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result, load_result_or_frames, rewrite_result

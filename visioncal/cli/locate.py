@@ -17,8 +17,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
-from visioncal.frames.locate import locate, locate_target
-from visioncal.frames.located import Located
+from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.frames.session_observations import calibrated_joints, pose_of
 from visioncal.frames.target_in_image import check_image_size
 from visioncal.interchange.formats.boards import target_named
@@ -230,7 +229,7 @@ def _by_views(
 ) -> tuple[_Point, ...]:
     # Imported late, as a pixel is placed in a millisecond without it.
     from visioncal.calibration.stages.observed import by_reason
-    from visioncal.frames.picks import locate_views
+    from visioncal.frames.session_observations import locate_views
 
     views = _chosen(session, options.view)
     if target is not None and any(view.has_corners for view in views):

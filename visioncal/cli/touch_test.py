@@ -31,7 +31,6 @@ from visioncal.cli.result_options import TouchTestOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Target
-from visioncal.frames.measured_points import Tool
 from visioncal.frames.touch_test import (
     TouchPoint,
     TouchTargets,
@@ -39,6 +38,7 @@ from visioncal.frames.touch_test import (
     touch_targets,
     touch_test_finding,
 )
+from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import load_result, rewrite_result
 from visioncal.live.capture.devices import ArmSetup, open_arm
 from visioncal.live.capture.gate import Consent

@@ -18,8 +18,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import DynamicModel, JointMotion
 from visioncal.dynamics.regression import NoiseBlock
 
 # Number of random states, and their greatest speeds [rad/s] and accelerations [rad/s^2], at which

@@ -10,9 +10,14 @@ from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.dynamics.clock import StampClock, clock_notes, even_parts, without_frozen
-from visioncal.dynamics.motion import JointMotion, Measured
-from visioncal.dynamics.reading import RecordedSamples
+from visioncal.dynamics.model import JointMotion, Measured
+from visioncal.dynamics.reading import (
+    RecordedSamples,
+    StampClock,
+    clock_notes,
+    even_parts,
+    without_frozen,
+)
 
 # Cut-off of the low-pass: a rigid arm's torques, but for the corners of friction, lie within so
 # many times the motion's bandwidth; below the least there is little to estimate noise from, above

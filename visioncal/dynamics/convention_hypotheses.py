@@ -16,8 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.model import sign
-from visioncal.dynamics.motion import JointMotion, Measured
+from visioncal.dynamics.model import JointMotion, Measured, sign
 from visioncal.robot import Inertias, Robot, joint_torques
 
 # Samples of a test, and the least number: sweeps of single joints have fewer.

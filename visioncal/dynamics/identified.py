@@ -1,29 +1,37 @@
-"""The result of dynamic identification."""
+"""The result of dynamic identification, its verdict, and its file dynamics.json."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
-from visioncal.core.codec import KEPT, Key, Vector, reading
+from visioncal.core.codec import KEPT, Key, Vector, read, reading, write
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
-from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray
-from visioncal.dynamics.base import BaseModel
+from visioncal.core.limits import DynamicsLimits
+from visioncal.core.number_format import figure, some_of
+from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
+from visioncal.core.version import __version__
+from visioncal.dynamics.base import BaseModel, random_motion
 from visioncal.dynamics.consistent import Consistent
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Inertias, Robot
+from visioncal.robot.files import robot_names
 
 # Classes of a parameter's relative sigma; beyond the last it is not determined.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
 UNKNOWN = "not at all"
+_LIMITS = DynamicsLimits()
+_Judged: TypeAlias = tuple[VerdictStatus, Finding]
+_MOTION = "Record, and fit with this one, a motion"
+SCHEMA = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +110,6 @@ class Identified:
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Loads a dynamics.json, or that of a folder; raises DataError if missing or invalid."""
-        from visioncal.dynamics.document import fields_from_document
-
         path = Path(path)
         if path.is_dir() and not (path / DYNAMICS_FILE).exists():
             raise DataError(
@@ -120,8 +126,6 @@ class Identified:
 
     def save(self, path: Path | str) -> None:
         """Writes a dynamics.json atomically; raises DataError where it cannot be written."""
-        from visioncal.dynamics.document import to_document
-
         write_json(path, to_document(self))
 
     @property
@@ -162,3 +166,329 @@ class Identified:
             )
         values = self.base.of(self.consistent.values)
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
+
+
+def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
+    return "check", Finding(kind, words, do)
+
+
+def _plan(identified: Identified, words: str) -> Remedy:
+    """Advice to record a planned motion, with the command for a robot that visioncal knows."""
+    name = identified.robot.name
+    command = f"visioncal dynamics plan {name} -o motions" if name in robot_names() else ""
+    return Remedy(f"{words}; visioncal dynamics plan writes some.", command)
+
+
+def judge(identified: Identified) -> Verdict:
+    """Judges identified dynamics by their predictions, and by what the motion determined."""
+    judged = [
+        *_of_lag(identified),
+        *_of_prediction(identified),
+        *_of_range(identified),
+        *_of_parameters(identified),
+    ]
+    statuses = {status for status, _ in judged}
+    worst: VerdictStatus = (
+        "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
+    )
+    return Verdict(worst, tuple(finding for _, finding in judged))
+
+
+def _of_lag(identified: Identified) -> Iterator[_Judged]:
+    lag = identified.lag
+    if lag is None:
+        return
+    share = figure(100.0 * lag.share)
+    words = f"{lag.words} As they stood, that was up to {share} % of a joint's range."
+    if lag.share < _LIMITS.lag_share:
+        yield "good", Finding(NOTE, words)
+        return
+    step = Remedy(
+        "Record angles and torques by one clock, and filter neither of them, or both alike: a lag "
+        "that changes is undone in the mean alone."
+    )
+    yield _check("lag", words, step)
+
+
+def _of_prediction(identified: Identified) -> Iterator[_Judged]:
+    validation = identified.validation
+    if validation is None:
+        yield _check(
+            "unchecked",
+            "Nothing was left to predict: the torques that were fitted are no proof.",
+            _plan(identified, "Record a second motion, and name it with --validate-on"),
+        )
+        return
+    shares = validation.shares
+    worst = int(np.argmax(shares))
+    percents = ", ".join(figure(100.0 * float(share)) for share in shares)
+    status: VerdictStatus = "good"
+    if shares[worst] > _LIMITS.range_share[0]:
+        status = "bad" if shares.min() > _LIMITS.range_share[1] else "check"
+    yield (
+        status,
+        Finding(
+            "prediction",
+            f"The torques of {validation.label} are predicted to {percents} % of their "
+            f"range (joints 1 to {len(shares)}).",
+        ),
+    )
+    fitted = identified.fitted_rms_nm
+    worse = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
+    worse &= shares > _LIMITS.slight_share
+    if worse.any():
+        yield _check(
+            "optimism",
+            f"{_joints(worse)}: torques are predicted "
+            f"{figure(float((validation.rms_nm / fitted)[worse].max()))} times worse than "
+            "they were fitted: the motion says too little, or something changed.",
+            _plan(identified, _MOTION),
+        )
+    yield from _of_known(identified, validation)
+
+
+def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[_Judged]:
+    known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
+    if known is not None:
+        less_accurate = validation.rms_nm > known
+        if less_accurate.any():
+            yield _check(
+                "worse_than_known",
+                f"{_joints(less_accurate)}: the inertias that {identified.robot.name} comes with "
+                "predict torques better than the identified ones.",
+                _plan(identified, _MOTION),
+            )
+        else:
+            times = float(np.median(known / np.maximum(validation.rms_nm, 1e-12)))
+            yield (
+                "good",
+                Finding(
+                    NOTE,
+                    f"That is {figure(times)} times nearer than by the inertias that "
+                    f"{identified.robot.name} comes with, in the median of the joints.",
+                ),
+            )
+        unexplained = known > _LIMITS.known_share * validation.torque_nm
+        if unexplained.any():
+            yield _check(
+                "other_robot",
+                f"{_joints(unexplained)}: by the inertias that {identified.robot.name} comes with, "
+                f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
+                "torques' range stays unexplained.",
+                Remedy(
+                    "Check whether it is the robot that was recorded, whether it stands "
+                    "upright ([robot] gravity_m_s2), and what is on its flange."
+                ),
+            )
+    if bodies is not None:
+        worse = bodies > _LIMITS.bodies_worse * validation.rms_nm
+        if worse.any():
+            yield _check(
+                "bodies",
+                f"{_joints(worse)}: no bodies near the known ones explain the torques as "
+                "well; friction may be of another kind, or a load is on the flange.",
+            )
+
+
+def _of_range(identified: Identified) -> Iterator[_Judged]:
+    """Checks the predicted uncertainty of the torques of fast motions of all joints."""
+    base = identified.base
+    motion = random_motion(base.model, np.random.default_rng(0))
+    x = base.regressor(motion)
+    covariance = identified.covariance[: base.rank, : base.rank]
+    sigma = np.sqrt(np.mean(np.einsum("mnp,pq,mnq->mn", x, covariance, x, optimize=True), axis=0))
+    share = sigma / np.sqrt(np.mean((x @ identified.values) ** 2, axis=0))
+    if share.max() > _LIMITS.range_share[0]:
+        yield _check(
+            "weak_motion",
+            f"{_joints(share > _LIMITS.range_share[0])}: what fast motions take (up to "
+            f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
+            f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
+            "slow, too small or too short.",
+            _plan(identified, _MOTION),
+        )
+
+
+def _of_parameters(identified: Identified) -> Iterator[_Judged]:
+    unknown = np.array([name == UNKNOWN for name in identified.determined])
+    if unknown.mean() > _LIMITS.undetermined_share:
+        names = [
+            name
+            for name, is_unknown in zip(identified.base.names, unknown, strict=True)
+            if is_unknown
+        ]
+        yield _check(
+            "undetermined",
+            f"{unknown.sum()} of {len(unknown)} base parameters are not determined by this motion, "
+            f"among them {some_of(names, 3)}.",
+            _plan(identified, _MOTION),
+        )
+
+
+def _joints(which: Mask) -> str:
+    places = [str(index + 1) for index in np.flatnonzero(which)]
+    return f"Joint{'s' if len(places) > 1 else ''} {', '.join(places)}"
+
+
+def to_document(identified: Identified) -> dict[str, Any]:
+    """Builds the content of dynamics.json; fields that were not computed are absent."""
+    base = identified.base
+    document: dict[str, Any] = {"schema": SCHEMA, "visioncal": __version__, **identified.facts}
+    document |= {
+        "robot": dict(identified.robot.document),
+        "friction": vars(base.model.terms),
+        "base": [
+            {"name": name, "value": value, "sigma": sigma, "determined": determined}
+            for name, value, sigma, determined in zip(
+                base.names,
+                identified.values.tolist(),
+                identified.sigmas.tolist(),
+                identified.determined,
+                strict=True,
+            )
+        ],
+        "covariance": identified.covariance.tolist(),
+        "stribeck": stribeck_rows(identified),
+        "streams": [write(StreamStatistics, stream) for stream in identified.streams],
+    }
+    if identified.consistent is not None:
+        document["standard"] = _standard_document(identified, identified.consistent)
+    if identified.lag is not None:
+        document["lag"] = write(Lag, identified.lag)
+    if identified.validation is not None:
+        shares = {"share": identified.validation.shares.tolist()}
+        document["validation"] = write(TorqueValidation, identified.validation) | shares
+    verdict = judge(identified)
+    return document | {"verdict": {"status": verdict.status, "reasons": list(verdict.reasons)}}
+
+
+def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
+    """Parameters of each joint with a Stribeck hump."""
+    humps, count = identified.stribeck, len(identified.stribeck.joints)
+    names = [identified.base.model.names[index] for index in identified.base.independent]
+    rows = []
+    for at, joint in enumerate(humps.joints.tolist()):
+        coulomb_index = names.index(f"Fc{joint + 1}")
+        hump_index, log_index = (identified.base.rank + at + part * count for part in (0, 1))
+        covariance = identified.covariance[
+            np.ix_([coulomb_index, hump_index], [coulomb_index, hump_index])
+        ]
+        coulomb, extra = float(identified.values[coulomb_index]), float(humps.hump_nm[at])
+        gradient = np.array([-extra / coulomb**2, 1.0 / coulomb])
+        rows.append(
+            {
+                "joint": joint + 1,
+                "hump_nm": extra,
+                "hump_sigma_nm": float(np.sqrt(covariance[1, 1])),
+                "static_nm": coulomb + extra,
+                "static_sigma_nm": float(np.sqrt(covariance.sum())),
+                "static_over_coulomb": 1.0 + extra / coulomb,
+                "static_over_coulomb_sigma": float(np.sqrt(gradient @ covariance @ gradient)),
+                "speed_rad_s": float(humps.speed_rad_s[at]),
+                "speed_sigma_rad_s": float(
+                    humps.speed_rad_s[at] * np.sqrt(identified.covariance[log_index, log_index])
+                ),
+            }
+        )
+    return rows
+
+
+def _standard_document(identified: Identified, consistent: Consistent) -> dict[str, Any]:
+    return {
+        "parameters": [
+            {"name": name, "value": value, "sigma": sigma}
+            for name, value, sigma in zip(
+                identified.base.model.names,
+                consistent.values.tolist(),
+                np.sqrt(np.diag(consistent.covariance)).tolist(),
+                strict=True,
+            )
+        ],
+        "covariance": consistent.covariance.tolist(),
+        "misfit": consistent.misfit,
+    }
+
+
+_OWN_KEYS = frozenset(
+    {"schema", "visioncal", "robot", "friction", "base", "covariance", "stribeck", "streams"}
+    | {"standard", "lag", "validation", "verdict"}
+)
+
+
+def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Reads the fields of `Identified` from a document of `to_document`.
+
+    Raises:
+        DataError: It is of another schema.
+        LookupError, TypeError, ValueError, AttributeError: It does not match the schema.
+    """
+    if document.get("schema") != SCHEMA:
+        raise DataError(
+            f"schema is {document.get('schema')!r}, this version reads {SCHEMA}.",
+            culprits=["schema"],
+            next_step="Write one with visioncal dynamics identify.",
+        )
+    robot = Robot.from_document(document["robot"])
+    terms = FrictionTerms(**document["friction"])
+    model = DynamicModel(robot, terms)
+    # `BaseModel.reduce` may keep other parameters: its choice depends on rounding, and so on the
+    # machine.
+    kept = [model.names.index(str(row["name"]).split()[0]) for row in document["base"]]
+    base = BaseModel.keeping(model, np.array(kept, dtype=np.int64))
+    size = base.rank + 2 * len(document["stribeck"])
+    standard = document.get("standard")
+    return {
+        "robot": robot,
+        "base": base,
+        "values": _column(document["base"], "value"),
+        "covariance": _array(document["covariance"], (size, size)),
+        "stribeck": _stribeck(document["stribeck"], terms),
+        "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
+        **_checked_fields(read(_Figures, document, ""), robot.joint_count),
+        "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
+    }
+
+
+@dataclass(frozen=True)
+class _Figures:
+    """The fields that the codec reads."""
+
+    streams: tuple[StreamStatistics, ...]
+    validation: TorqueValidation | None = None
+    lag: Lag | None = None
+
+
+def _checked_fields(figures: _Figures, joints: int) -> dict[str, Any]:
+    """Fields by name, after checking that all arrays are of that number of joints."""
+    for stream in (*figures.streams, figures.validation):
+        for name, value in vars(stream).items() if stream else ():
+            if isinstance(value, np.ndarray) and len(value) != joints:
+                raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
+    return vars(figures)
+
+
+def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:
+    return Stribeck(
+        np.array([int(row["joint"]) - 1 for row in rows], dtype=np.int64),
+        _column(rows, "hump_nm"),
+        _column(rows, "speed_rad_s"),
+        terms.slow_rad_s,
+    )
+
+
+def _consistent(document: Mapping[str, Any], count: int) -> Consistent:
+    values = _column(document["parameters"], "value")
+    if values.shape != (count,):
+        raise ValueError(f"it has {len(values)} standard parameters instead of {count}")
+    return Consistent(values, _array(document["covariance"], (count, count)), document["misfit"])
+
+
+def _column(rows: Sequence[Mapping[str, Any]], name: str) -> FloatArray:
+    return np.array([float(row[name]) for row in rows])
+
+
+def _array(values: object, shape: tuple[int, ...]) -> FloatArray:
+    array = np.asarray(values, dtype=float)
+    if array.shape != shape:
+        raise ValueError(f"an array of shape {array.shape} stands where {shape} is needed")
+    return array

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import JointMotion
 from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
 from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions

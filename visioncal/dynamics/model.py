@@ -1,16 +1,47 @@
-"""Dynamic model of an arm: torques of links, friction and rotors, linear in the parameters."""
+"""Joint motions, and the torques of links, friction and rotors, linear in the parameters."""
 
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, IntArray
-from visioncal.dynamics.motion import JointMotion
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.robot import PARAMETER_NAMES, Robot, torque_regressor
 
 # Below this speed a joint may stick, and the sign of its friction is undefined [rad/s].
 SLOW_RAD_S = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Positions, speeds and accelerations of n joints at m times."""
+
+    times_s: FloatArray  # (m,) ascending [s].
+    q: FloatArray  # (m, n) joint angles [rad].
+    dq: FloatArray  # (m, n) their speeds [rad/s].
+    ddq: FloatArray  # (m, n) their accelerations [rad/s^2].
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def chosen(self, rows: slice | IntArray | Mask) -> "JointMotion":
+        """The samples of given rows."""
+        return JointMotion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A motion, and the torques (m, n) of the joints measured during it [N m]."""
+
+    motion: JointMotion
+    torques_nm: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    def chosen(self, rows: slice | IntArray | Mask) -> "Measured":
+        """The samples of given rows."""
+        return Measured(self.motion.chosen(rows), self.torques_nm[rows])
 
 
 def sign(dq: FloatArray, slow_rad_s: float = SLOW_RAD_S) -> FloatArray:

@@ -20,8 +20,7 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified
-from visioncal.dynamics.model import FrictionTerms
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import FrictionTerms, JointMotion
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, symmetric_entries
 

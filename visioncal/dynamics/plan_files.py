@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.core.version import __version__
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.limits import CHECK_HZ, MotionExtremes, MotionLimits
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import JointMotion
 from visioncal.dynamics.sweeps import Sweeps
 
 SCHEMA = 1

@@ -1,13 +1,16 @@
-"""Reading of joint angles and torques from the streams of a session."""
+"""Reading of joint angles and torques from the streams of a session, on one even clock."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
 
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.number_format import figure, some_of
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import Stream, too_far_apart
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
@@ -19,6 +22,15 @@ _HOW = (
     "A stream for dynamics has stamp_s, q1_rad ..., and tau1_nm ... or current1_a ... of every "
     "joint, from the base to the tip; dq1_rad_s ... where the controller reports speeds."
 )
+# Clocks whose jitter exceeds the first share of the usual step are resampled. Up to the second
+# share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
+# step of so many times the usual one that is also longer than the last [s].
+_JITTER, _EVEN, _GAP, _GAP_S = 0.02, 0.1, 2.5, 0.02
+# Least duration [s] and number of repeated angles that count as frozen, and number of samples
+# before and after in which the joint moves.
+_FROZEN_S, _FROZEN, _AROUND = 0.05, 5, 5
+# The angle then jumps by at least so many times the steps around it and the angles' resolution.
+_JUMP = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,3 +145,180 @@ def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:
         "ratio. From motion alone gains and masses cannot be separated; visioncal dynamics gains "
         "finds them by a known body on the flange.",
     )
+
+
+@dataclass(frozen=True, eq=False)
+class StampClock:
+    """Sampling clock of a stream."""
+
+    usual_s: float  # Median step from one sample to the next [s].
+    counts: IntArray  # (m - 1,) each step in usual steps; more than one where samples are missing.
+    jitter: float  # Standard deviation of the steps from whole multiples, over the usual step.
+
+    @classmethod
+    def of(cls, times_s: FloatArray) -> Self:
+        """Determines the clock of (m,) stamps [s]."""
+        steps = np.diff(times_s)
+        usual = float(np.median(steps))
+        counts = np.maximum(np.rint(steps / usual), 1.0)
+        jitter = _jitter(steps, counts, usual)
+        if jitter > _EVEN:
+            counts[steps <= max(_GAP * usual, _GAP_S)] = 1.0
+            jitter = _jitter(steps, counts, usual)
+        return cls(usual, counts.astype(np.int64), jitter)
+
+    @property
+    def even(self) -> bool:
+        """Whether the jitter is small enough to do without resampling."""
+        return self.jitter <= _JITTER
+
+
+@dataclass(frozen=True, eq=False)
+class EvenPart:
+    """A part of a stream without long gaps, on an even clock."""
+
+    samples: RecordedSamples  # Its samples; angles are interpolated where they are missing.
+    invalid: Mask  # (m, n) torques without information.
+    present: Mask  # (m,) where torques were recorded.
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second."""
+        times_s = self.samples.times_s
+        return (len(times_s) - 1) / float(times_s[-1] - times_s[0])
+
+
+def even_parts(
+    recorded: RecordedSamples, invalid: Mask, clock: StampClock, longest_gap_s: float
+) -> list[EvenPart]:
+    """Splits a stream at long gaps, and resamples each part to an even clock.
+
+    Args:
+        recorded: The samples.
+        invalid: (m, n) torques without information.
+        clock: Their clock.
+        longest_gap_s: Longest gap over which angles are interpolated [s].
+    """
+    bounds = [0, *(_gaps_of(clock, longest_gap_s) + 1), len(recorded)]
+    return [
+        _resampled(recorded, invalid, clock, slice(begin, end))
+        for begin, end in pairwise(bounds)
+        if end - begin > 2
+    ]
+
+
+def _gaps_of(clock: StampClock, longest_gap_s: float) -> IntArray:
+    """Indices of the samples before gaps that are longer than that [s]."""
+    return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > longest_gap_s))
+
+
+def clock_notes(recorded: RecordedSamples, clock: StampClock, longest_gap_s: float) -> list[str]:
+    """Messages on gaps, missing samples and jitter of a stream's clock."""
+    steps, notes = np.diff(recorded.times_s), []
+    gaps = _gaps_of(clock, longest_gap_s)
+    if len(gaps):
+        places = [f"{recorded.times_s[index] - recorded.times_s[0]:.2f} s" for index in gaps]
+        notes.append(
+            f"{recorded.label}: samples are missing for up to {steps[gaps].max():.3g} s behind "
+            f"{some_of(places, 3)}; nothing is interpolated there."
+        )
+    lost = clock.counts - 1
+    lost[gaps] = 0
+    if lost.any():
+        share = 100.0 * float(lost.sum() / (lost.sum() + len(recorded)))
+        notes.append(
+            f"{recorded.label}: {figure(share)} % of its samples are missing here and there, for "
+            f"up to {figure(steps[lost > 0].max())} s; angles are interpolated, torques are not."
+        )
+    if not clock.even:
+        inner = np.delete(steps, np.flatnonzero(clock.counts > 1))
+        notes.append(
+            f"{recorded.label}: steps of its clock differ by {100.0 * clock.jitter:.0f} % (from "
+            f"{1e3 * inner.min():.3g} to {1e3 * inner.max():.3g} ms); it was resampled evenly."
+        )
+    return notes
+
+
+def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
+    without_gaps = counts * usual <= max(_GAP * usual, _GAP_S)
+    return float(np.std((steps - counts * usual)[without_gaps])) / usual
+
+
+def _resampled(
+    recorded: RecordedSamples, invalid: Mask, clock: StampClock, rows: slice
+) -> EvenPart:
+    """Resamples rows to a sample at every usual step."""
+    times_s, counts = recorded.times_s[rows], clock.counts[rows.start : rows.stop - 1]
+    indices = np.concatenate([[0], np.cumsum(counts)])
+    even_s = np.linspace(times_s[0], times_s[-1], indices[-1] + 1)
+    if clock.even:
+        times_s = even_s[indices]
+    before = np.clip(np.searchsorted(times_s, even_s, "right") - 1, 0, len(counts) - 1)
+    distance_s = np.minimum(np.abs(even_s - times_s[before]), np.abs(times_s[before + 1] - even_s))
+    present = (counts[before] == 1) | (distance_s < _JITTER * clock.usual_s)
+
+    def at(values: FloatArray) -> FloatArray:
+        return np.stack([np.interp(even_s, times_s, column) for column in values[rows].T], axis=1)
+
+    part = replace(
+        recorded,
+        times_s=even_s,
+        q=_bridged(even_s, at(recorded.q), present),
+        dq=None if recorded.dq is None else _bridged(even_s, at(recorded.dq), present),
+        torques_nm=at(recorded.torques_nm),
+    )
+    return EvenPart(part, np.asarray(at(invalid.astype(float)) > 0.0), present)
+
+
+def _bridged(times_s: FloatArray, values: FloatArray, present: Mask) -> FloatArray:
+    """Values (m, n) with the missing ones replaced by cubic splines."""
+    if present.all():
+        return values
+    from scipy.interpolate import CubicSpline
+
+    bridged = values.copy()
+    bridged[~present] = CubicSpline(times_s[present], values[present])(times_s[~present])
+    return bridged
+
+
+def without_frozen(recorded: RecordedSamples, notes: list[str]) -> RecordedSamples:
+    """The stream without the rows in which a joint's angle is frozen while the joint moves.
+
+    A joint that stops or sets off has short steps just before and after; a frozen angle has steps
+    of the usual length, and then a far longer one.
+    """
+    rows = np.ones(len(recorded), dtype=bool)
+    for angles in recorded.q.T:
+        rows &= ~_frozen(recorded.times_s, angles)
+    if rows.all():
+        return recorded
+    begins = np.flatnonzero(rows[:-1] & ~rows[1:])
+    ends = np.flatnonzero(~rows & np.append(rows[1:], True))
+    gaps_s = recorded.times_s[ends] - recorded.times_s[begins]
+    places = [f"{recorded.times_s[begin] - recorded.times_s[0]:.2f} s" for begin in begins]
+    notes.append(
+        f"{recorded.label}: angles are frozen for up to {figure(float(gaps_s.max()))} s behind "
+        f"{some_of(places, 3)}, though the joints move; these {(~rows).sum()} rows are left out."
+    )
+    return recorded.among(rows)
+
+
+def _frozen(times_s: FloatArray, angles: FloatArray) -> Mask:
+    """(m,) mask of a joint's angles that repeat an earlier sample although the joint moves."""
+    frozen = np.zeros(len(angles), dtype=bool)
+    steps = np.abs(np.diff(angles))
+    if not steps.any():
+        return frozen
+    resolution = float(steps[steps > 0.0].min())
+    edges = np.diff(np.concatenate([[False], steps == 0.0, [False]]).astype(np.int8))
+    for begin, end in np.flatnonzero(edges).reshape(-1, 2):
+        if end - begin < _FROZEN or times_s[end] - times_s[begin] < _FROZEN_S or end == len(steps):
+            continue
+        before, after = steps[max(begin - _AROUND, 0) : begin], steps[end + 1 : end + 1 + _AROUND]
+        around = max(float(np.median(array)) if len(array) else 0.0 for array in (before, after))
+        if steps[end] > _JUMP * max(around, resolution):
+            frozen[begin + 1 : end + 1] = True
+    return frozen

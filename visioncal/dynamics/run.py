@@ -12,9 +12,17 @@ from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
-from visioncal.dynamics.identify import Identification, Options, find_lag, identify
+from visioncal.dynamics.identify import (
+    Identification,
+    Options,
+    Prediction,
+    find_lag,
+    fit_friction_to_known,
+    identify,
+    predict,
+    validate,
+)
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
-from visioncal.dynamics.validate import Prediction, fit_friction_to_known, predict, validate
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.selecting import ARM, Choice, check_one_of_each, select

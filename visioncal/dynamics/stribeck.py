@@ -15,8 +15,7 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.model import sign
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import JointMotion, sign
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram

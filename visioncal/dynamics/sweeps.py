@@ -12,9 +12,9 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.fourier import even_times
+from visioncal.dynamics.excitation import even_times
 from visioncal.dynamics.limits import MotionExtremes, MotionLimits, motion_extremes
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import JointMotion
 
 # Least duration of ramps, and of constant speed [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4

@@ -13,25 +13,24 @@ from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS
 from visioncal.frames.camera_chain import CalibratedCamera
-from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture import drawn_fixture
-from visioncal.frames.fixture_fit import FitSettings, Words
+from visioncal.frames.fixture import FitSettings, Words, drawn_fixture
 from visioncal.frames.frame_from_images import camera_details, view_findings
-from visioncal.frames.image_outliers import CandidateViews, find_inliers
-from visioncal.frames.measured_points import MeasuredPoints
 from visioncal.frames.session_observations import SessionImages, fit_views, session_images
-from visioncal.frames.single_view import (
-    Sight,
-    all_places,
-    check_labels,
-    common_covariance,
-    needs_robot,
-)
 from visioncal.frames.target_in_image import (
     check_image_size,
     target_pose_candidates,
 )
-from visioncal.frames.target_pose import inlier_warnings
+from visioncal.frames.target_pose import (
+    CandidateViews,
+    Sight,
+    all_places,
+    check_labels,
+    common_covariance,
+    find_inliers,
+    inlier_warnings,
+    needs_robot,
+)
+from visioncal.frames.touches import MeasuredPoints, NominalPoints
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
 from visioncal.vision.finders import NotFound, find_target

@@ -16,7 +16,7 @@ from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
-from visioncal.frames.fixture_fit import sigma_findings
+from visioncal.frames.fixture import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
     SessionImages,
@@ -26,9 +26,8 @@ from visioncal.frames.session_observations import (
     no_usable_image,
     without_label,
 )
-from visioncal.frames.single_view import Sight, needs_robot
 from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
-from visioncal.frames.target_pose import TargetPose, place_target
+from visioncal.frames.target_pose import Sight, TargetPose, needs_robot, place_target
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, select_matching
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice

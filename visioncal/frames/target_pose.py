@@ -1,33 +1,361 @@
-"""Pose of a target on a tool or fixture, estimated from images of a calibrated camera."""
+"""Pose of a target on a tool or fixture, estimated from images of a calibrated camera.
+
+base_from_target = base_from_cam * cam_from_target                         eye-to-hand
+base_from_target = base_from_flange * flange_from_cam * cam_from_target    eye-in-hand
+flange_from_target = flange_from_base * base_from_cam * cam_from_target    eye-to-hand
+flange_from_target = flange_from_cam * cam_from_target                     eye-in-hand
+
+In the second and third case the robot is between parent and target: its noise counts, and images of
+one stop share it. Outliers are whole images, by the 6-vector of a pose's difference from the mean.
+The search starts from the image pose with the smallest distances to half of the images (least
+median of squares, Rousseeuw 1984), over all candidate poses of each.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from visioncal.core.arguments import typed
+from visioncal.core.arguments import check_fields, typed
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, compose, invert, pose_difference
-from visioncal.core.types import FloatArray, Mask, Target
-from visioncal.frames.camera_chain import CalibratedCamera
-from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
-from visioncal.frames.single_view import (
-    Parent,
-    Sight,
-    all_places,
-    check_labels,
-    common_covariance,
-    needs_robot,
-)
+from visioncal.core.quantiles import chi2_limit, f_limit
+from visioncal.core.transforms import adjoint, compose, exp, invert, log, pose_difference
+from visioncal.core.types import Corners, FloatArray, Image, IntArray, Mask, Target
+from visioncal.estimation.linalg import covariance_from, squared_lengths
+from visioncal.estimation.robust import Distances, settled
+from visioncal.frames.camera_chain import CalibratedCamera, checked_pose
 from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.results import Calibration, Edge
 from visioncal.vision.targets import load_target
 
+Parent: TypeAlias = Literal["base", "flange"]
+# Probability that a set of images loses an inlier.
+_FALSE_ALARM = 1e-3
+# Squared distance beyond which two poses differ significantly.
+_DIFFERENT = float(chi2_limit(0.05, 6))
+# Relative difference below which scores are equal.
+_SAME = 1e-6
+# The mean converges in a few steps, since the poses are near each other.
+_STEPS, _CONVERGED = 10, 1e-12
 # Significance of images that scatter more than the noise.
-_FALSE_ALARM = 1e-4
+_SCATTER_ALARM = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One image of a target."""
+
+    label: str  # Its name in messages and results.
+    seen: Corners | Image  # The target's corners, or the (h, w) grey image to find them in.
+    # (4, 4) the flange's pose at the image as reported; None where no robot is between parent and
+    # target.
+    base_from_flange: FloatArray | None = None
+    # Number of the robot's stop; where None, images with the same pose are of one stop.
+    stop: int | None = None
+    # (n,) joints [rad] where the pose is the calibrated arm's for these joints.
+    joints_rad: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def stop_key(self) -> object:
+        """Hashable identity of the robot's stop; the label for an image without a pose."""
+        if self.stop is not None:
+            return self.stop
+        return self.label if self.base_from_flange is None else self.base_from_flange.tobytes()
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPlace:
+    """Candidate pose of a target in the parent's frame, from one image."""
+
+    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    pixels: FloatArray  # (6, 6) covariance of its right perturbation by the pixel noise.
+    # (6, 6) Jacobian by the flange's perturbation; zero where the robot is not between. With k
+    # images of one stop it is multiplied by sqrt(k), so that their mean has the variance of the
+    # error that they share.
+    flange_jacobian: FloatArray
+    # (6, c) Jacobian by the errors that all images share: see `common_covariance`.
+    by_common: FloatArray
+
+
+def common_covariance(eye: CalibratedCamera, scale_sigma: float) -> FloatArray:
+    """(c, c) covariance of common errors: the camera's edge, its lens, arm, target size."""
+    return np.asarray(block_diag(eye.shared_covariance, [[scale_sigma**2]]))
+
+
+def needs_robot(eye: CalibratedCamera, parent: Parent) -> bool:
+    """Whether the robot is between the parent and the target."""
+    return (eye.mount == "eye-in-hand") == (parent == "base")
+
+
+def all_places(
+    eye: CalibratedCamera, sights: Sequence[Sight], looks: Sequence[PoseCandidates], parent: Parent
+) -> list[tuple[TargetPlace, ...]]:
+    """Candidate poses in the parent's frame, for each image; see `candidate_places`."""
+    stops = [sight.stop_key for sight in sights]
+    return [
+        candidate_places(eye, sight, look, parent, stops.count(stop))
+        for sight, look, stop in zip(sights, looks, stops, strict=True)
+    ]
+
+
+def candidate_places(
+    eye: CalibratedCamera, sight: Sight, view: PoseCandidates, parent: Parent, of_stop: int = 1
+) -> tuple[TargetPlace, ...]:
+    """Candidate poses of one image in the parent's frame.
+
+    `view` has those in the camera's frame; `of_stop` is the number of images of the same stop.
+
+    Raises:
+        DataError: The robot's pose is needed and missing or invalid.
+    """
+    flange = sight.base_from_flange
+    if not needs_robot(eye, parent):
+        zero = np.zeros((len(view.symmetries), 6, 6))
+        return _in_parent(view, eye.edge, zero, np.zeros((6, eye.arm_error_count)), of_stop)
+    if flange is None:
+        raise DataError(
+            f"{sight.label}: the robot stands between the {parent} and what the camera "
+            f"({eye.mount}) sees, and its pose is missing.",
+            culprits=[sight.label],
+            next_step="Give base_from_flange as the robot reported it when the image was taken.",
+        )
+    checked_pose(flange, f"{sight.label}: base_from_flange")
+    arm = eye.arm_basis(flange, sight.joints_rad)
+    if parent == "base":
+        flange_jacobian = adjoint(invert(eye.edge @ view.cam_from_target))
+        return _in_parent(view, flange @ eye.edge, flange_jacobian, arm, of_stop)
+    flange_from_cam = invert(flange) @ eye.edge
+    flange_jacobian = -adjoint(invert(flange_from_cam @ view.cam_from_target))
+    return _in_parent(view, flange_from_cam, flange_jacobian, arm, of_stop)
+
+
+def _in_parent(
+    view: PoseCandidates,
+    parent_from_cam: FloatArray,
+    flange_jacobian: FloatArray,
+    arm: FloatArray,
+    of_stop: int,
+) -> tuple[TargetPlace, ...]:
+    by_edge = adjoint(invert(view.cam_from_target))
+    return tuple(
+        TargetPlace(
+            parent_from_cam @ pose,
+            view.covariance[at],
+            np.sqrt(of_stop) * flange_jacobian[at],
+            np.concatenate(
+                [
+                    by_edge[at],
+                    view.by_lens[at],
+                    flange_jacobian[at] @ arm,
+                    view.by_scale[at][:, None],
+                ],
+                axis=1,
+            ),
+        )
+        for at, pose in enumerate(view.cam_from_target)
+    )
+
+
+def check_labels(sights: Sequence[Sight]) -> None:
+    """Checks that there are images with unique labels.
+
+    Raises:
+        DataError: There is no image, or two have one label.
+    """
+    if not sights:
+        raise DataError("no image shows the target: at least one is needed.")
+    labels = [sight.label for sight in sights]
+    twice = sorted({label for label in labels if labels.count(label) > 1})
+    if twice:
+        raise DataError(f"two images are called {twice[0]!r}.", culprits=twice)
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateViews:
+    """Candidate poses of a target from m images."""
+
+    # Candidates of each image, the best by reprojection first.
+    views: Sequence[Sequence[TargetPlace]]
+    flange_noise: FloatArray  # (6, 6) covariance of the flange at one stop.
+    common: FloatArray  # (c, c) covariance of the errors that all images share.
+    freedom: float  # Degrees of freedom of the noise levels.
+
+    def independent(self, place: TargetPlace) -> FloatArray:
+        """(6, 6) covariance of a candidate by errors of its image alone: pixels and robot."""
+        carried = place.flange_jacobian @ self.flange_noise @ place.flange_jacobian.T
+        return np.asarray(place.pixels + carried)
+
+    @property
+    def limit(self) -> float:
+        """Outlier limit of the squared distance, corrected for the number of images.
+
+        F distributed, since the noise levels are estimated.
+        """
+        tail = _FALSE_ALARM / len(self.views)
+        return 6.0 * float(f_limit(tail, 6, min(self.freedom, 1e6)))
+
+
+@dataclass(frozen=True, eq=False)
+class Mean:
+    """Weighted mean pose of a target over images."""
+
+    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    independent: FloatArray  # (6, 6) covariance by the images' independent errors.
+    gains: FloatArray  # (m, 6, 6) weight of each image; zero for outliers.
+    by_common: FloatArray  # (6, c) Jacobian by the errors that all images share.
+
+
+@dataclass(frozen=True, eq=False)
+class ImageInliers:
+    """Inlier images and their mean pose."""
+
+    mean: Mean  # Mean of the inliers.
+    picks: IntArray  # (m,) index of each image's selected candidate.
+    inliers: Mask  # (m,) inlier mask.
+    residuals: FloatArray  # (m, 6) residual of each image's pose from the mean [rad, m].
+    mahalanobis_sq: FloatArray  # (m,) its squared Mahalanobis distance; six on average under noise.
+    limit: float  # Its outlier limit.
+    variance: float  # Variance factor of the images' independent errors; at least one.
+    # Another pose that is a candidate of all inliers; None where there is none.
+    rival: FloatArray | None
+
+
+def find_inliers(candidates: CandidateViews) -> ImageInliers:
+    """Finds the inlier images of a target.
+
+    Where no more than half are inliers, the correct ones are unknown, and all are kept.
+    """
+    picks, agrees = _start(candidates)
+    search = _ImageSearch(candidates, picks)
+    agrees, fit = settled(search, agrees, _fit(candidates, picks, agrees), fewest=2, suspect=0.0)
+    if 2 * int(agrees.sum()) <= len(picks):
+        return _fit(candidates, picks, np.ones(len(picks), dtype=bool))
+    return fit
+
+
+@dataclass(frozen=True, eq=False)
+class _ImageSearch:
+    """Inlier search over images, each with its selected candidate."""
+
+    candidates: CandidateViews
+    picks: IntArray
+
+    def fit(self, used: Mask, _: ImageInliers) -> ImageInliers:
+        return _fit(self.candidates, self.picks, used)
+
+    def distances(self, _: Mask, fit: ImageInliers) -> Distances:
+        six = np.full(len(self.picks), 6.0)
+        return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
+
+
+def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
+    """Selected candidates, and the half of the images nearest to one pose (least median)."""
+    best: tuple[float, IntArray, FloatArray] | None = None
+    half = len(candidates.views) // 2 + 1
+    for seed in (place for view in candidates.views for place in view):
+        nearest, picks = _nearest(candidates, seed)
+        score = float(np.sort(nearest)[:half].sum())
+        # Poses of a symmetric board fit equally, apart from rounding of their fits.
+        if best is None or score < (1.0 - _SAME) * best[0] - 1e-9:
+            best = (score, picks, nearest)
+    if best is None:
+        raise RuntimeError("there are no images to agree")
+    _, picks, nearest = best
+    agrees = np.zeros(len(picks), dtype=bool)
+    agrees[np.argsort(nearest)[:half]] = True
+    return picks, agrees
+
+
+def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
+    """Squared distance (m,) of each image's nearest candidate from a pose, and its index."""
+    independent, nearest = candidates.independent(seed), []
+    for view in candidates.views:
+        differences = [log(invert(seed.matrix) @ place.matrix) for place in view]
+        squared = [
+            float(d @ np.linalg.solve(independent + candidates.independent(place), d))
+            for d, place in zip(differences, view, strict=True)
+        ]
+        nearest.append((min(squared), int(np.argmin(squared))))
+    return np.array([item[0] for item in nearest]), np.array(
+        [item[1] for item in nearest], dtype=np.int64
+    )
+
+
+def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
+    """Mean over the inliers, and the distances of all images from it."""
+    chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
+    mean = _mean(candidates, chosen, agrees)
+    errors = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
+    independent = np.array([candidates.independent(value) for value in chosen])
+    common_difference = np.array([value.by_common for value in chosen]) - mean.by_common
+    shared = common_difference @ candidates.common @ np.swapaxes(common_difference, 1, 2)
+    is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
+    squared = np.einsum(
+        "mi,mi->m", errors, np.linalg.solve(independent + shared, errors[..., None])[..., 0]
+    )
+    # Six degrees of freedom for each image beyond the first.
+    variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
+    # The residual of an image that is part of the mean has a smaller covariance.
+    covariance = independent + shared + np.where(is_inlier, -1.0, 1.0) * mean.independent
+    mahalanobis_sq = (
+        squared_lengths(errors, covariance, independent)[0]
+        if others
+        else np.where(agrees, 0.0, squared)
+    )
+    return ImageInliers(
+        mean,
+        picks,
+        agrees,
+        errors,
+        mahalanobis_sq,
+        candidates.limit,
+        variance,
+        _rival(candidates, mean.matrix, agrees, variance),
+    )
+
+
+def _mean(candidates: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mask) -> Mean:
+    """Mean pose weighted by the images' independent errors; common errors do not average out."""
+    weights = np.array(
+        [
+            np.linalg.inv(candidates.independent(place)) if ok else np.zeros((6, 6))
+            for place, ok in zip(chosen, agrees, strict=True)
+        ]
+    )
+    independent = covariance_from(weights.sum(axis=0))
+    gains = independent @ weights
+    matrices = np.array([place.matrix for place in chosen])
+    matrix = matrices[int(np.flatnonzero(agrees)[0])]
+    for _ in range(_STEPS):
+        step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
+        matrix = matrix @ exp(step)
+        if np.abs(step).max() < _CONVERGED:
+            break
+    by_common = np.einsum("mij,mjk->ik", gains, np.array([place.by_common for place in chosen]))
+    return Mean(matrix, independent, gains, by_common)
+
+
+def _rival(
+    candidates: CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
+) -> FloatArray | None:
+    """Another pose among the candidates of all inliers: of a mirrored or rotated target."""
+    limit = variance * candidates.limit
+    first = candidates.views[int(np.flatnonzero(agrees)[0])]
+    for seed in first:
+        delta = log(invert(matrix) @ seed.matrix)
+        is_other = (
+            float(delta @ np.linalg.solve(2.0 * candidates.independent(seed), delta)) > _DIFFERENT
+        )
+        if is_other and bool(np.all(_nearest(candidates, seed)[0][agrees] < limit)):
+            return seed.matrix
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +505,7 @@ def inlier_warnings(
             f"The images disagree, by up to {_distance_words(fit, worst)}, and with {count} of "
             "them it is not known which are right: take more."
         )
-    elif fit.variance * 6 * (inliers - 1) > chi2_limit(_FALSE_ALARM, 6 * (inliers - 1)):
+    elif fit.variance * 6 * (inliers - 1) > chi2_limit(_SCATTER_ALARM, 6 * (inliers - 1)):
         yield (
             f"The images scatter {figure(np.sqrt(fit.variance))} times as much as the "
             "calibration's noise lets them; the sigmas are that much larger."

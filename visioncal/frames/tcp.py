@@ -15,7 +15,7 @@ from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.placing import assumed_words
 from visioncal.estimation.readings import PoseReading, readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
-from visioncal.frames.fixture_fit import RENAMED, FitSettings, PointsFit, Words
+from visioncal.frames.fixture import RENAMED, FitSettings, PointsFit, Words
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,

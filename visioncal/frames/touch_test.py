@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
-from visioncal.frames.measured_points import Tool
+from visioncal.frames.touches import Tool
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.robot.bodies import camera_body

@@ -9,8 +9,7 @@ from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
-from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.touches import TouchRows, touches_of
+from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.fields import Fields, unnamed_columns
 from visioncal.interchange.formats.foreign import ImportOptions

@@ -13,7 +13,7 @@ from rerun.blueprint import BlueprintLike
 from visioncal.core.files import replacing_file
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
-from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.model import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import Obstacle, log_arm, log_frames, log_obstacles
