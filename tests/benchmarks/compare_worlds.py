@@ -34,7 +34,7 @@ from visioncal.simulation import (
     simulate,
     simulate_warm_up,
 )
-from visioncal.simulation.heat import heated_poses
+from visioncal.simulation.arms import heated_poses
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,

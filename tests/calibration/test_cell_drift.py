@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
 from visioncal.simulation import SimulatedCell, simulate
-from visioncal.simulation.heat import Heat
+from visioncal.simulation.arms import Heat
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.records import cell_session

@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers.protocols import CameraDevice
 from visioncal.live.simulated.cell import SimulatedCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
-from visioncal.simulation.live import LiveView
+from visioncal.simulation.render import LiveView
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.result import DetectedCorners
 

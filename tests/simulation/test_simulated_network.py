@@ -24,7 +24,7 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
-from visioncal.simulation.observing import is_symmetric
+from visioncal.simulation.recordings import is_symmetric
 
 EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(

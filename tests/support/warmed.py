@@ -19,7 +19,7 @@ from visioncal.simulation import (
     cell_session,
     simulate_warm_up,
 )
-from visioncal.simulation.heat import Heat, Warming, heated_poses
+from visioncal.simulation.arms import Heat, Warming, heated_poses
 from visioncal.simulation.optics import fine_camera
 
 # What 100 minutes are to predict: the rest of five hours [s].

@@ -18,10 +18,9 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
 from visioncal.core.version import __version__
-from visioncal.dynamics.base import BaseModel, random_motion
-from visioncal.dynamics.consistent import Consistent
+from visioncal.dynamics.base import BaseModel, Consistent, random_motion
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
-from visioncal.dynamics.stribeck import Stribeck
+from visioncal.dynamics.regression import Stribeck
 from visioncal.robot import Inertias, Robot
 from visioncal.robot.files import robot_names
 

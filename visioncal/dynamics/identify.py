@@ -14,14 +14,26 @@ import numpy as np
 from visioncal.core.errors import DegenerateError
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.types import FloatArray, Mask
-from visioncal.dynamics.base import BaseModel, check_identifiable, check_joints_move, null_space
+from visioncal.dynamics.base import (
+    BaseModel,
+    check_identifiable,
+    check_joints_move,
+    fit_consistent,
+    null_space,
+)
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.consistent import fit_consistent
 from visioncal.dynamics.convention_hypotheses import check_recording
 from visioncal.dynamics.identified import Identified, Lag, StreamStatistics, TorqueValidation
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
-from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, std_of
-from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
+from visioncal.dynamics.regression import (
+    NoiseBlock,
+    Regression,
+    Stribeck,
+    fit_stribeck,
+    regress,
+    rms_of,
+    std_of,
+)
 from visioncal.robot import Robot, joint_torques
 
 # Uncertainty of filtered speeds, below which the sign of friction is smoothed [rad/s].

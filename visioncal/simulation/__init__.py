@@ -4,7 +4,7 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 in a projection or in a kinematic chain cannot cancel out.
 """
 
-from visioncal.simulation.arms import ArmOptions, DhArm, Payload, arm_named, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, DhArm, Heat, Payload, arm_named, forward, ur_arm
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import (
     InstrumentReading,
@@ -13,7 +13,6 @@ from visioncal.simulation.cell import (
     SimulatedSight,
 )
 from visioncal.simulation.cell_files import cell_names, read_cell
-from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,

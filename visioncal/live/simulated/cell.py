@@ -24,7 +24,7 @@ from visioncal.live.simulated.controller import ControllerOptions, TrueState, sp
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import ArmOptions
-from visioncal.simulation.live import LiveView
+from visioncal.simulation.render import LiveView
 
 # Errors of the user's guesses of both edges, as measured by ruler and by eye [m, rad].
 GUESS_M, GUESS_RAD = 0.02, float(np.deg2rad(5.0))
