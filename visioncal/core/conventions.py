@@ -118,13 +118,6 @@ def _without(rotations: FloatArray, missing: Mask) -> FloatArray:
     return np.asarray(np.where(missing[:, None, None], np.nan, rotations))
 
 
-def _euler_orders() -> tuple[str, ...]:
-    """The twelve Euler angle sequences, about moving axes and about fixed axes."""
-    straight = ["".join(permutation) for permutation in permutations("XYZ")]
-    repeated = [f"{a}{b}{a}" for a, b in permutations("XYZ", 2)]
-    return tuple(name for order in straight + repeated for name in (order, order.lower()))
-
-
 ROTATION_FORMS: Mapping[str, RotationForm] = {
     form.name: form
     for form in (
@@ -141,7 +134,13 @@ ROTATION_FORMS: Mapping[str, RotationForm] = {
         ),
         _matrices("matrix", "a rotation matrix by rows", transposed=False),
         _matrices("matrix-transposed", "a rotation matrix by columns", transposed=True),
-        *(_euler(order, unit) for order in _euler_orders() for unit in ("rad", "deg")),
+        *(
+            _euler(name, unit)
+            # The twelve sequences, about moving axes (capitals) and about fixed axes.
+            for order in (*permutations("XYZ"), *((a, b, a) for a, b in permutations("XYZ", 2)))
+            for name in ("".join(order), "".join(order).lower())
+            for unit in ("rad", "deg")
+        ),
     )
 }
 

@@ -96,24 +96,20 @@ def _final_paths_in_errors(new: Path, folder: Path) -> Iterator[None]:
 def _switch(folder: Path, aside: Path) -> Iterator[Path]:
     """Renames a temporary folder to the switch of an output folder, and back at the end."""
     switch = folder / _SWITCH
-    while not _renamed(aside, switch):
-        _recover(folder, wait=True)
+    while True:
+        try:
+            aside.rename(switch)
+            break
+        except OSError as error:
+            # Another writer's switch exists.
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            _recover(folder, wait=True)
     try:
         yield switch
     finally:
         _resolve_links(folder)
         switch.rename(aside)
-
-
-def _renamed(aside: Path, switch: Path) -> bool:
-    """Renames to the switch; False if another one exists."""
-    try:
-        aside.rename(switch)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            return False
-        raise
-    return True
 
 
 def _replace_together(folder: Path, switch: Path, names: Sequence[str]) -> None:
@@ -122,8 +118,14 @@ def _replace_together(folder: Path, switch: Path, names: Sequence[str]) -> None:
         links.mkdir()
         following.symlink_to(_NEW)
         (switch / _CURRENT).symlink_to(_OLD)
-        _link_old(folder, switch / _OLD, names)
+        (switch / _OLD).mkdir()
         for name in names:
+            path, old = folder / name, switch / _OLD / name
+            if path.is_symlink():
+                # A relative link would be wrong in another folder.
+                old.symlink_to(os.path.realpath(path))
+            elif path.exists():
+                os.link(path, old)
             (links / name).symlink_to(_through_switch(name))
         for path in (switch / _NEW, switch / _OLD, switch):
             flush_folder(path)
@@ -135,17 +137,6 @@ def _replace_together(folder: Path, switch: Path, names: Sequence[str]) -> None:
     flush_folder(folder)
     following.replace(switch / _CURRENT)
     flush_folder(switch)
-
-
-def _link_old(folder: Path, old: Path, names: Sequence[str]) -> None:
-    old.mkdir()
-    for name in names:
-        path = folder / name
-        if path.is_symlink():
-            # A relative link would be wrong in another folder.
-            (old / name).symlink_to(os.path.realpath(path))
-        elif path.exists():
-            os.link(path, old / name)
 
 
 def _through_switch(name: str) -> str:

@@ -176,20 +176,10 @@ def mean_transform(matrices: FloatArray) -> FloatArray:
 
 def rotation_angle(matrices: FloatArray) -> FloatArray:
     """Angles [rad] of (..., 3, 3) or (..., 4, 4) rotations, accurate near 0 and near pi."""
-    rotation = matrices[..., :3, :3]
-    sine = 0.5 * np.linalg.norm(
-        np.stack(
-            [
-                rotation[..., 2, 1] - rotation[..., 1, 2],
-                rotation[..., 0, 2] - rotation[..., 2, 0],
-                rotation[..., 1, 0] - rotation[..., 0, 1],
-            ],
-            axis=-1,
-        ),
-        axis=-1,
-    )
-    cosine = 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
-    return np.asarray(np.arctan2(sine, cosine))
+    flat = matrices[..., :3, :3].reshape(-1, 3, 3)
+    vector, scalar = _quaternions(flat)
+    angles = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(scalar))
+    return np.asarray(angles.reshape(matrices.shape[:-2]))
 
 
 def distances(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:

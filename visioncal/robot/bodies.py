@@ -10,6 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
+from visioncal.robot.conversion import swing
 from visioncal.robot.model import BODY_KEYS, Robot
 
 Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
@@ -74,8 +75,8 @@ def capsule(
     """Builds a capsule about the line between two points of a link's frame [m]."""
     axis = end - start
     length = float(np.linalg.norm(axis))
-    along_z = _turned_to(axis / length) if length > 0.0 else np.eye(3)
-    pose = compose(along_z, 0.5 * (start + end))
+    pose = swing(axis / length) if length > 0.0 else np.eye(4)
+    pose[:3, 3] = 0.5 * (start + end)
     return Body(name, link, "capsule", np.array([radius_m, length]), pose, of_arm, unsure_m)
 
 
@@ -147,11 +148,3 @@ def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
             )
         sizes.append((radius, offset))
     return sizes
-
-
-def _turned_to(direction: FloatArray) -> FloatArray:
-    """A rotation (3, 3) that turns z to a unit vector."""
-    aside = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    x = np.cross(aside, direction)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(direction, x), direction], axis=1)

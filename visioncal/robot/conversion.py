@@ -79,7 +79,11 @@ def convert_table(table: DHTable, convention: Convention) -> DHTable:
         hayati = bool(parallel[index + 1])
         keeps = link.d == 0.0 or bool(angles[index + 1] < EXACTLY) if hayati else link.beta == 0.0
         rows.append(link if keeps else _between(link.transform, link, hayati=hayati))
-        carried = np.zeros(2) if keeps else _remaining_screw(link.transform, rows[-1])
+        carried = np.zeros(2)
+        if not keeps:
+            # Rotation about [rad] and translation along [m] the next axis that the row leaves.
+            rest = invert(rows[-1].transform) @ link.transform
+            carried[:] = np.arctan2(rest[1, 0], rest[0, 0]), rest[2, 3]
     return _with_rows(replace(table, convention=convention, parallel=parallel), rows)
 
 
@@ -105,7 +109,7 @@ def table_of(
     Returns:
         The table. Joint function offsets are in its theta and d.
     """
-    chain = _about_z(robot.chain.with_offsets_placed())
+    chain = chain_about_z(robot.chain.with_offsets_placed())
     like = None if like is None else convert_table(like, convention)
     hints = [_DhRow()] * len(chain) if like is None else _rows(like)
     first = np.eye(4) if like is None else like.along_x[0]
@@ -185,7 +189,7 @@ def _of_table(
 
 def parallel_axes(robot: Robot) -> Mask:
     """(n - 1,) mask of nearly parallel consecutive axes."""
-    links = _about_z(robot.chain).placements[1:-1]
+    links = chain_about_z(robot.chain).placements[1:-1]
     return np.asarray(_off_parallel(links[:, :3, 2]) < PARALLEL_RAD)
 
 
@@ -217,7 +221,7 @@ def _with_rows(table: DHTable, rows: list[_DhRow]) -> DHTable:
     )
 
 
-def _about_z(chain: Chain) -> Chain:
+def chain_about_z(chain: Chain) -> Chain:
     """The chain with each joint's frame rotated so that its axis is z."""
     turns = np.array([np.eye(4), *map(swing, chain.axes), np.eye(4)])
     return replace(
@@ -239,12 +243,6 @@ def swing(direction: FloatArray) -> FloatArray:
 def _off_parallel(directions: FloatArray) -> FloatArray:
     """(...,) acute angles [rad] between (..., 3) unit vectors and the z axis."""
     return np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), np.abs(directions[..., 2]))
-
-
-def _remaining_screw(link: FloatArray, row: _DhRow) -> FloatArray:
-    """Rotation about [rad] and translation along [m] the next axis that a row leaves."""
-    rest = invert(row.transform) @ link
-    return np.array([np.arctan2(rest[1, 0], rest[0, 0]), rest[2, 3]])
 
 
 def _between(link: FloatArray, hint: _DhRow, *, hayati: bool) -> _DhRow:
@@ -350,28 +348,20 @@ def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
     declared = _described(robot)
     if declared is None:
         return None
-    standard, modified = _readings(declared)
-    other = standard if declared.convention == "modified" else modified
-    document = chain_document(robot.name, robot.tip, chain_of_table(other))
-    return Robot.from_document(document), other.convention
-
-
-def _readings(table: DHTable) -> tuple[DHTable, DHTable]:
-    """The table's rows read as standard (or Hayati's) and as modified."""
-    rows = slice(None, -1) if table.convention == "modified" else slice(1, None)
-    columns = np.array([table.a_m, table.alpha_rad, table.beta_rad])[:, rows]
-    bare = replace(
-        table,
+    # Standard (or Hayati's) rows hold X_1 to X_n, modified ones X_0 to X_(n-1).
+    is_modified = declared.convention == "modified"
+    rows = slice(None, -1) if is_modified else slice(1, None)
+    columns = np.array([declared.a_m, declared.alpha_rad, declared.beta_rad])[:, rows]
+    a_m, alpha_rad, beta_rad = np.pad(columns, ((0, 0), (1, 0) if is_modified else (0, 1)))
+    other = replace(
+        declared,
+        convention="standard" if is_modified else "modified",
         base=np.eye(4),
         flange=np.eye(4),
-        functions=np.tile(IDENTITY_FUNCTION, (len(table), 1)),
+        functions=np.tile(IDENTITY_FUNCTION, (len(declared), 1)),
+        a_m=a_m,
+        alpha_rad=alpha_rad,
+        beta_rad=beta_rad,
     )
-    standard: Convention = "hayati" if table.convention == "hayati" else "standard"
-    return (
-        _with_across(replace(bare, convention=standard), np.pad(columns, ((0, 0), (1, 0)))),
-        _with_across(replace(bare, convention="modified"), np.pad(columns, ((0, 0), (0, 1)))),
-    )
-
-
-def _with_across(table: DHTable, columns: FloatArray) -> DHTable:
-    return replace(table, a_m=columns[0], alpha_rad=columns[1], beta_rad=columns[2])
+    document = chain_document(robot.name, robot.tip, chain_of_table(other))
+    return Robot.from_document(document), other.convention

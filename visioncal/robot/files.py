@@ -52,7 +52,13 @@ def read_robot_document(
     )
     if path.suffix.lower() in (".toml", ".json"):
         is_toml = path.suffix.lower() == ".toml"
-        table = read_toml(path, path.name) if is_toml else _parse_json(read_text(path), path.name)
+        table = read_toml(path, path.name) if is_toml else parse_json(read_text(path), path.name)
+        if not isinstance(table, dict) or not (is_toml or "kind" in table):
+            raise DataError(
+                f"{path.name} describes no robot: an object of kind chain is needed.",
+                culprits=[path.name],
+                next_step="Write one with visioncal export CALIBRATION --to robot-json.",
+            )
         named = {"name": path.stem, "tip": "flange"} | table
         return named if tip is None else named | {"tip": tip}
     return {
@@ -61,17 +67,6 @@ def read_robot_document(
         "tip": tip or "",
         "urdf": read_text(path, _MAX_URDF_BYTES),
     }
-
-
-def _parse_json(text: str, label: str) -> dict[str, Any]:
-    document = parse_json(text, label)
-    if isinstance(document, dict) and "kind" in document:
-        return document
-    raise DataError(
-        f"{label} describes no robot: an object of kind chain is needed.",
-        culprits=[label],
-        next_step="Write one with visioncal export CALIBRATION --to robot-json.",
-    )
 
 
 def robot_file(document: Mapping[str, Any], named: str = "") -> tuple[str, str]:

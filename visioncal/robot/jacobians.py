@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.transforms import adjoint, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document
-from visioncal.robot.conversion import EXACTLY, swing
+from visioncal.robot.conversion import EXACTLY, chain_about_z, swing
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, about_x, chain_of_table
 
@@ -43,17 +43,21 @@ def table_jacobian(
     count, chain = len(table), robot.chain
     twists = _twists_about_z(chain, placements, functions)
     derivatives = np.zeros((len(placements), count, 5))
-    frames = _LinkFrames(table, chain)
+    frames = chain_about_z(chain.with_offsets_placed()).placements
+    along = table.along_z @ table.along_x[1:]
+    # (4, 4) the screw that each row, the first of the base, leaves to the next axis.
+    rest = invert(table.base @ table.along_x[0]) @ frames[0]
     # The screw about the next axis that a row passes on, (p, 2).
-    screw = (twists[:, 0] @ adjoint(frames.rest[0]).T)[:, _Z]
+    screw = (twists[:, 0] @ adjoint(rest).T)[:, _Z]
     for row in range(count - 1):
-        link = twists[:, row + 1] + screw @ adjoint(invert(frames.links[row]))[:, _Z].T
+        link = twists[:, row + 1] + screw @ adjoint(invert(frames[row + 1]))[:, _Z].T
+        rest = invert(along[row]) @ rest @ frames[row + 1]
         free = _free_columns(table, row)
         basis = np.concatenate([_row_jacobian(table, row)[:, free], np.eye(6)[:, _Z]], axis=1)
-        motion = link @ adjoint(frames.rest[row + 1]).T
+        motion = link @ adjoint(rest).T
         solution = np.linalg.lstsq(basis, motion.T, rcond=None)[0].T
         derivatives[:, row, free], screw = solution[:, :-2], solution[:, -2:]
-    last = twists[:, count] + screw @ adjoint(invert(frames.links[-1]))[:, _Z].T
+    last = twists[:, count] + screw @ adjoint(invert(frames[-1]))[:, _Z].T
     across = about_x(table.a_m[-1], table.alpha_rad[-1], table.beta_rad[-1])
     derivatives[:, -1, [_THETA, _D]] = (last @ adjoint(across @ table.flange).T)[:, _Z]
     return derivatives
@@ -76,25 +80,6 @@ def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArr
     ends[-1] = adjoint(invert(table.flange)) @ ends[-1]
     functions = robot.function_jacobian(q).reshape(len(q), 6, len(table), -1)
     return np.einsum("mirj,rjk->mirk", placement_jacobian, ends), functions
-
-
-class _LinkFrames:
-    """A robot's links in frames with z along the axes, against its table.
-
-    Attributes:
-        rest: (n, 4, 4) the screw that each row, the first of the base, leaves to the next axis.
-        links: (n, 4, 4) the placements after each joint.
-    """
-
-    def __init__(self, table: DHTable, chain: Chain) -> None:
-        placed = chain.with_offsets_placed()
-        turns = np.array([np.eye(4), *map(swing, placed.axes), np.eye(4)])
-        placements = invert(turns[:-1]) @ placed.placements @ turns[1:]
-        along = table.along_z @ table.along_x[1:]
-        rest = [invert(table.base @ table.along_x[0]) @ placements[0]]
-        for row in range(len(table) - 1):
-            rest.append(invert(along[row]) @ rest[-1] @ placements[row + 1])
-        self.rest, self.links = np.array(rest), placements[1:]
 
 
 def _twists_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -> FloatArray:

@@ -211,20 +211,15 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
     arm = pin.buildReducedModel(model, others, pin.neutral(model))
     bodies = list(arm.inertias)[1:]
     kg = np.array([body.mass for body in bodies])
-    rates = _rates_of_model(arm)
+    # Zero in a URDF means unknown.
+    limits = np.array([arm.velocityLimit, arm.effortLimit])
+    known = (limits > 0.0) & (limits < np.finfo(float).max)
+    speed, torque = np.where(known, limits, np.inf)
+    rates = DriveLimits(speed, np.full(len(speed), np.inf), torque)
     if not kg.any():
         return UrdfArm(_chain_of_model(arm, tip), tip, None, None, rates)
     inertias = Inertias(np.array([body.toDynamicParameters() for body in bodies]))
     return UrdfArm(_chain_of_model(arm, tip), tip, inertias.masses, inertias, rates)
-
-
-def _rates_of_model(model: "pin.Model") -> DriveLimits:
-    """Limits of the joints' drives; zero in a URDF means unknown."""
-    known = [
-        np.where(value > 0.0, value, np.inf) for value in (model.velocityLimit, model.effortLimit)
-    ]
-    speed, torque = (np.where(array < np.finfo(float).max, array, np.inf) for array in known)
-    return DriveLimits(speed, np.full(len(speed), np.inf), torque)
 
 
 def _chain_of_model(model: "pin.Model", tip: str) -> Chain:

@@ -77,7 +77,11 @@ def project_with_jacobian(
     if lens:
         by_intrinsics[:, [0, 1], [0, 1]] = distorted
         by_intrinsics[:, [0, 1], [2, 3]] = 1.0
-        by_intrinsics[:, :, 4:] = focal[:, None] * _by_coefficients(camera, plane)
+        by_intrinsics[:, :, 4:] = focal[:, None] * (
+            _fisheye_by_coefficients(plane)
+            if camera.model == "fisheye"
+            else _brown_by_coefficients(plane, camera.distortion)
+        )
     return Projection(distorted * focal + centre, by_point, by_intrinsics)
 
 
@@ -128,13 +132,6 @@ def _distort(camera: Camera, plane: FloatArray) -> tuple[FloatArray, FloatArray]
     if camera.model == "fisheye":
         return _distort_fisheye(plane, camera.distortion)
     return _distort_brown(plane, camera.distortion)
-
-
-def _by_coefficients(camera: Camera, plane: FloatArray) -> FloatArray:
-    """Jacobian (n, 2, k) of the distorted plane points with respect to the coefficients."""
-    if camera.model == "fisheye":
-        return _fisheye_by_coefficients(plane)
-    return _brown_by_coefficients(plane, camera.distortion)
 
 
 def _distort_brown(plane: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -630,33 +630,20 @@ def rotation_transforms(target: Target) -> FloatArray:
     Returns:
         (k, 4, 4) `target_from_turned`, the identity first.
     """
-    identity = np.eye(4)
-    if target.kind == "circles":
-        return _turns_of_circles(target)
-    if target.kind != "checkerboard" or (target.columns + target.rows) % 2:
-        return identity[None]
-    width_m = target.square_m * (target.columns - 1)
-    height_m = target.square_m * (target.rows - 1)
-    half = transforms.compose(np.diag([-1.0, -1.0, 1.0]), np.array([width_m, height_m, 0.0]))
-    if target.columns != target.rows or target.columns % 2:
-        return np.stack([identity, half])
-    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    quarter = transforms.compose(rotation, np.array([width_m, 0.0, 0.0]))
-    return np.stack([identity, quarter, half, transforms.invert(quarter)])
-
-
-def _turns_of_circles(target: Target) -> FloatArray:
-    """Rotations by quarter turns about a grid's centre that map circles to circles."""
+    if target.kind not in ("checkerboard", "circles"):
+        return np.eye(4)[None]
     places = corner_positions(target)
-    low, high = places.min(axis=0), places.max(axis=0)
+    odd = np.rint(places / target.square_m).sum(axis=1) % 2
     turns = []
-    for quarters in range(4):
-        cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
+    for quarters, (cosine, sine) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         turned = places @ turn.T
-        shift = (low + high - turned.min(axis=0) - turned.max(axis=0)) / 2
-        distances = np.linalg.norm(turned[:, None] + shift - places, axis=2).min(axis=1)
-        if distances.max() < 0.1 * target.square_m:
+        shift = (np.ptp(places, axis=0) - turned.min(axis=0) - turned.max(axis=0)) / 2
+        distances = np.linalg.norm(turned[:, None] + shift - places, axis=2)
+        fits = distances.min(axis=1).max() < 0.1 * target.square_m
+        # A quarter turn exchanges the colours of the squares around a corner.
+        colours = (odd[distances.argmin(axis=1)] + odd + quarters) % 2
+        if fits and (target.kind == "circles" or not colours.any()):
             turns.append(transforms.compose(turn, shift))
     return np.stack(turns)
 

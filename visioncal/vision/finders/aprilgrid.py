@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
-from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
+from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit, read_markers
 from visioncal.vision.finders.result import DetectedCorners, NotFound
-from visioncal.vision.targets import aruco_dictionary
 
 LACKS_SQUARES = "the tags lack the small dark squares at their corners that an AprilGrid has"
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
@@ -106,11 +105,9 @@ def grid_tags(
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits = border
         parameters.adaptiveThreshConstant = copy.darker
-        detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
-        px, ids, _ = detector.detectMarkers(copy.image)
-        found_ids = [] if ids is None else [int(number) for number in ids.ravel()]
+        found_ids, px = read_markers(copy.image, dictionary, parameters)
         # From pixel centres of the copy to those of the image.
-        quads = (np.reshape(px, (-1, 4, 2)) + 0.5) / copy.scale - 0.5
+        quads = (px + 0.5) / copy.scale - 0.5
         unique = {
             index: quad
             for index, quad in zip(found_ids, quads, strict=True)

@@ -13,6 +13,7 @@ from visioncal.vision.finders.aprilgrid import find_aprilgrid
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.checkerboard import find_checkerboard
 from visioncal.vision.finders.circles import find_circles
+from visioncal.vision.finders.imaging import shrunk
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine
 from visioncal.vision.targets import corner_positions
@@ -52,7 +53,7 @@ def find_board(image: Image, target: Target, *, quick: bool = False) -> Detected
     `refine` then measures their positions. With `quick`, detection stops if the first search fails.
     """
     for find, factor in _quick_searches(image, target.kind):
-        small = image if factor == 1 else _shrunk(image, factor)
+        small = image if factor == 1 else shrunk(image, factor)
         seen = find(small, target)
         if isinstance(seen, DetectedCorners) and not len(hidden_corners(seen, small.shape, target)):
             # From pixel centres of the small image to those of the large one.
@@ -84,13 +85,6 @@ def _refined(image: Image, target: Target, seen: DetectedCorners) -> DetectedCor
     return DetectedCorners(
         seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
     )
-
-
-def _shrunk(image: Image, factor: int) -> Image:
-    height, width = (factor * (side // factor) for side in image.shape)
-    size = (width // factor, height // factor)
-    small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
 
 
 def hidden_corners(

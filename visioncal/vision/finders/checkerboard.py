@@ -44,7 +44,9 @@ def find_checkerboard(
             continue
         grid = px.reshape(target.rows, target.columns, 2).astype(np.float64)
         if _is_checkered(image, grid):
-            grid = _dark_corner_first(image, _right_handed(grid))
+            x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+            grid = grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
+            grid = _dark_corner_first(image, grid)
             return DetectedCorners(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
     return NotFound(
         f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
@@ -89,26 +91,17 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
     return all(bool(np.all(meet.mean(axis=axis) >= _CHECKERED)) for axis in (0, 1))
 
 
-def _right_handed(grid: FloatArray) -> FloatArray:
-    """Mirrors the (rows, columns, 2) grid if its handedness differs from the board's."""
-    x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    return grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
-
-
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
     """Rotates the grid by the least turn that makes its first corner's outward square dark."""
     # That square has the colour of the one diagonally inside, and the inner squares alternate. If
     # no turn changes the colour, the board is symmetric and the grid remains.
-    turns = (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2)
-    rotated = (np.rot90(grid, quarter) for quarter in turns)
-    return next((array for array in rotated if _starts_dark(image, array)), grid)
-
-
-def _starts_dark(image: Image, grid: FloatArray) -> bool:
-    levels = _levels(image, grid)
-    row, column = np.indices(levels.shape)
-    even = (row + column) % 2 == 0
-    return bool(levels[even].mean() < levels[~even].mean())
+    for quarter in (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2):
+        rotated = np.rot90(grid, quarter)
+        levels = _levels(image, rotated)
+        even = np.indices(levels.shape).sum(axis=0) % 2 == 0
+        if levels[even].mean() < levels[~even].mean():
+            return rotated
+    return grid
 
 
 def _levels(image: Image, grid: FloatArray) -> FloatArray:

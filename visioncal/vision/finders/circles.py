@@ -111,13 +111,12 @@ def _seen_grids(image: Image) -> tuple[Circles, ...]:
             width = float(np.median(diameters))
             if share > 0.0:
                 grids.append(Circles(columns, rows, asymmetric, px[order], share, width))
-    return tuple(sorted(grids, key=lambda value: abs(_turn(value))))
 
+    def turn_rad(grid: Circles) -> float:
+        first_row = grid.px[grid.columns - 1] - grid.px[0]
+        return abs(float(np.arctan2(first_row[1], first_row[0])))
 
-def _turn(grid: Circles) -> float:
-    """Angle of the first row against the image's rows [rad]."""
-    first_row = grid.px[grid.columns - 1] - grid.px[0]
-    return float(np.arctan2(first_row[1], first_row[0]))
+    return tuple(sorted(grids, key=turn_rad))
 
 
 @dataclass(frozen=True, eq=False)

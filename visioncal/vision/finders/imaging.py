@@ -100,6 +100,14 @@ def encode_png(image: Image | Image16) -> bytes:
     return bytes(cv2.imencode(".png", pixels)[1].tobytes())
 
 
+def shrunk(image: Image, factor: int) -> Image:
+    """A (h, w) image reduced by a whole factor; rows and columns that are left over are cut off."""
+    height, width = (factor * (side // factor) for side in image.shape)
+    size = (width // factor, height // factor)
+    small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
 def read_image(path: Path) -> Image:
     """Reads a (h, w) grey image; see `decode_image`.
 

@@ -1,15 +1,33 @@
-"""Check whether markers lie on a plane as a target describes them."""
+"""Markers in an image, and whether they lie on a plane as a target describes them."""
 
 import cv2
 import numpy as np
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Image
+from visioncal.vision.targets import aruco_dictionary
 
 # Largest rms distance of markers from a homography, in marker sides. Lens distortion and noise stay
 # under 0.1; another layout moves every second row by more than a side.
 LAYOUT_MISFIT = 0.35
 # Number of markers in a neighbourhood; enough to include the rows above and below.
 _NEIGHBOURS = 9
+
+
+def read_markers(
+    image: Image, dictionary: str, parameters: cv2.aruco.DetectorParameters | None = None
+) -> tuple[list[int], FloatArray]:
+    """Markers of a dictionary in a (h, w) grey image (Garrido-Jurado et al. 2014; OpenCV).
+
+    Returns:
+        Their ids, which may repeat, and (t, 4, 2) corners in OpenCV's order [px].
+    """
+    if min(image.shape) < 2:
+        return [], np.zeros((0, 4, 2))
+    given = parameters or cv2.aruco.DetectorParameters()
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), given)
+    px, ids, _ = detector.detectMarkers(image)
+    found = [] if ids is None else [int(number) for number in np.ravel(ids)]
+    return found, np.asarray(np.reshape(px, (-1, 4, 2)), dtype=float)
 
 
 def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:

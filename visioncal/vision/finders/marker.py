@@ -1,12 +1,11 @@
 """Detection of single ArUco or AprilTag markers."""
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.board import DETECTED_WEIGHT
+from visioncal.vision.finders.layout import read_markers
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine_tags
 from visioncal.vision.targets import aruco_dictionary
@@ -24,13 +23,13 @@ def find_marker(image: Image, target: Target) -> DetectedCorners | NotFound:
     """
     if min(image.shape) < 2:
         return NotFound("the image is a line")
-    px, ids = _markers(image, target.dictionary)
+    ids, px = _markers(image, target.dictionary)
     if target.marker_id not in ids:
         seen = f"; seen instead: {', '.join(map(str, ids[:5]))}" if ids else ""
         return NotFound(f"no marker {target.marker_id} of {target.dictionary} is seen{seen}")
     if ids.count(target.marker_id) > 1:
         return NotFound(f"marker {target.marker_id} is seen {ids.count(target.marker_id)} times")
-    corners = px[ids.index(target.marker_id)].reshape(4, 2)
+    corners = px[ids.index(target.marker_id)]
     modules = int(aruco_dictionary(target.dictionary).markerSize) + 2
     refined = refine_tags(image, modules, corners[None])
     fitted = refined.sigma_px < _DETECTED_SIGMA_PX
@@ -40,13 +39,10 @@ def find_marker(image: Image, target: Target) -> DetectedCorners | NotFound:
 
 def marker_ids(image: Image, dictionary: str) -> tuple[int, ...]:
     """Ids of a dictionary's markers in a (h, w) grey image, each once."""
-    return tuple(dict.fromkeys(_markers(image, dictionary)[1]))
+    return tuple(dict.fromkeys(_markers(image, dictionary)[0]))
 
 
-def _markers(image: Image, dictionary: str) -> tuple[Sequence[FloatArray], list[int]]:
+def _markers(image: Image, dictionary: str) -> tuple[list[int], FloatArray]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
-    px, ids, _ = detector.detectMarkers(image)
-    found_ids = [] if ids is None else [int(number) for number in ids.ravel()]
-    return [np.asarray(corners, dtype=np.float64) for corners in px], found_ids
+    return read_markers(image, dictionary, parameters)

@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping
 
-import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
-from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit
+from visioncal.vision.finders.layout import LAYOUT_MISFIT, layout_misfit, read_markers
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine_tags
 from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_corners
@@ -19,12 +18,10 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
     """Corners of a rig's tags in a (h, w) grey image, or why there are none."""
     if min(image.shape) < 2:
         return NotFound("the image is a line")
-    dictionary = aruco_dictionary(target.dictionary)
-    found_px, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
-    numbers = [] if ids is None else [int(number) for number in ids.ravel()]
+    numbers, found_px = read_markers(image, target.dictionary)
     corner_ids = tag_corners(target)
     quads = {
-        number: np.asarray(px, dtype=float).reshape(4, 2)
+        number: px
         for number, px in zip(numbers, found_px, strict=True)
         if number in corner_ids and numbers.count(number) == 1
     }
@@ -38,7 +35,7 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
         side = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
         if layout_misfit(places / side, np.array(list(quads.values()))) > LAYOUT_MISFIT:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
-    modules = int(dictionary.markerSize) + 2
+    modules = int(aruco_dictionary(target.dictionary).markerSize) + 2
     if places is None:
         parts = [refine_tags(image, modules, quad[None]) for quad in quads.values()]
     else:

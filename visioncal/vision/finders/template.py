@@ -48,6 +48,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
+from visioncal.vision.finders.imaging import shrunk
 from visioncal.vision.finders.maps import OpticalAxis, maps_about
 from visioncal.vision.targets import corner_positions, marked_squares, marker_cells
 
@@ -343,8 +344,12 @@ def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refin
     """
     share = target.spacing if target.kind == "aprilgrid" else 1.0
     board = corner_positions(target)[ids, :2] / (share * target.square_m)
-    if target.kind == "circles" and _is_large(target, board, px):
-        return _refine_at_half_size(image, target, ids, px)
+    if target.kind == "circles" and len(px) >= _MIN_CORNERS:
+        scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(board - board.mean(axis=0))
+        if scale * target.diameter_m / target.square_m > 2 * _MOST_RADIUS_PX:
+            # Half of the size has edges of enough pixels.
+            half = refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
+            return Refined(2 * half.px + 0.5, 2 * half.sigma_px, half.reasons, 2 * half.blur_px)
     return _refine_part(image, _Pattern.of(target, ids, board), board, px)
 
 
@@ -386,15 +391,10 @@ def refine_tags(
         for white in _TAG_WHITE:
             printed = replace(pattern, outside=white * module, clear=clear)
             fits.append(_refine_part(image, printed, positions, start))
-        best = min(fits, key=_uncertainty)
+        best = min(fits, key=lambda fit: (sum(map(bool, fit.reasons)), np.nansum(fit.sigma_px**2)))
         if not any(best.reasons):
             break
     return best
-
-
-def _uncertainty(refined: Refined) -> tuple[int, float]:
-    """Number of failed corners, and the sum of the others' variances [px^2]."""
-    return sum(map(bool, refined.reasons)), float(np.nansum(refined.sigma_px**2))
 
 
 def _refine_part(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
@@ -415,24 +415,6 @@ def _refine_part(image: Image, pattern: _Pattern, board: FloatArray, px: FloatAr
     unknown = np.full(len(px), np.nan)
     reason = "the corners found are too few, or lie as no board's do"
     return Refined(px, unknown, (reason,) * len(px), np.full(2, np.nan))
-
-
-def _is_large(target: Target, board: FloatArray, px: FloatArray) -> bool:
-    """Whether the windows around circles would be too large."""
-    if len(px) < _MIN_CORNERS:
-        return False
-    scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(board - board.mean(axis=0))
-    return bool(scale * target.diameter_m / target.square_m > 2 * _MOST_RADIUS_PX)
-
-
-def _refine_at_half_size(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
-    """Refines in an image of half the size, whose edges have enough pixels."""
-    height, width = (2 * (side // 2) for side in image.shape)
-    small = cv2.resize(
-        image[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA
-    )
-    refined = refine(np.asarray(small, np.uint8), target, ids, (px - 0.5) / 2)
-    return Refined(2 * refined.px + 0.5, 2 * refined.sigma_px, refined.reasons, 2 * refined.blur_px)
 
 
 def _refine_corners(
