@@ -75,7 +75,8 @@ def _svg(figure: Figure, words: str) -> Markup:
     # Identifiers come from content and salt: the same everywhere, and other ones in each figure.
     with mpl.rc_context({"svg.hashsalt": words}):
         # `Figure.savefig` would draw twice.
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     # Numbered names of groups would be there once a figure; none is referred to.
