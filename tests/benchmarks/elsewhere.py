@@ -1,21 +1,11 @@
-"""Cells that visioncal has not made: error over the stated covariance, world by world.
-
-    PYTHONPATH=tests python tests/benchmarks/elsewhere.py [SEEDS] [WORLD ...]
+"""Cells that visioncal has not made: the worlds `elsewhere` of `compare.py`.
 
 The generator is numpy and OpenCV alone; corners travel through `corners.csv`, poses through
-`views.csv`. For each world, mount, and lens (given or estimated): squared error over the stated
-covariance per degree of freedom, of the camera's pose in the frame of the ray of its image's centre
-(X) and of picks (a point of the table that `visioncal.locate` finds by one pixel), the median
-errors of the camera's place and of picks, those by Park's X and the lens that
-Park had (OpenCV), the share of each verdict, how many are good although X is beyond three sigma,
-and refusals. Base and flange are those of which the
-robot reports: what of an arm's errors is one twist of the base and one of the flange at all
-postures is in no residual, and an arm that goes where it is sent does it again.
+`views.csv`. Base and flange are those of which the robot reports: what of an arm's errors is one
+twist of the base and one of the flange at all postures is in no residual, and an arm that goes
+where it is sent does it again.
 """
 
-import tempfile
-import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -25,14 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from results import WORDS, few, first, write_section
 from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.stats import chi2, norm
+from scipy.spatial.transform import Rotation
 
-import visioncal
-
-SEEDS = 40
 SIZE = (1280, 1024)
 MATRIX = np.array([[1150.0, 0.0, 644.0], [0.0, 1152.0, 508.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.11, 0.09, 0.0004, -0.0006, -0.01])
@@ -42,8 +27,6 @@ WINDOW_M = np.array([0.22, 0.16])
 LEVER_M = 0.3
 # Picks of each cell.
 LOOKS = 4
-# The squared error per degree of freedom that X exceeds as seldom as a number does three sigma.
-BEYOND = float(chi2.isf(2.0 * norm.sf(3.0), 6)) / 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,13 +283,8 @@ class Case:
     mount: str
     x: np.ndarray
     z: np.ndarray
-    robot: np.ndarray
     reported_of: Callable[[np.ndarray], np.ndarray]
     shift: Callable[[np.ndarray], np.ndarray]
-    corners: np.ndarray
-    boards: np.ndarray
-    pixels: np.ndarray
-    given: np.ndarray
     mean_m: float
 
     def flanges(self, boards):
@@ -445,9 +423,7 @@ def cell(world: World, mount: str, given: bool, seed: int, folder: Path) -> Case
     if given and world.is_said:
         with (folder / "session.toml").open("a") as file:
             file.write(f"matrix_sigma_px = {world.off_px}\n")
-    return Case(
-        world, mount, x, z, reported, reported_of, shift, corners, boards, pixels, stated, mean_m
-    )
+    return Case(world, mount, x, z, reported_of, shift, mean_m)
 
 
 def write(folder, mount, matrix, reported, pixels):
@@ -475,63 +451,6 @@ def write(folder, mount, matrix, reported, pixels):
     for view, px in enumerate(pixels):
         lines += [f"{view},{at},{u:.5f},{v:.5f}" for at, (u, v) in enumerate(px)]
     (folder / "corners.csv").write_text("\n".join(lines) + "\n")
-
-
-def park(case: Case, given: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """OpenCV's calibrateCamera and Park: X, and the lens."""
-    points = np.tile(case.corners.astype(np.float32), (len(case.pixels), 1, 1))
-    px = case.pixels.astype(np.float32)
-    if given:
-        matrix, distortion = case.given, DISTORTION
-        turns, places = [], []
-        for at in range(len(px)):
-            _, turn, place = cv2.solvePnP(points[at], px[at], matrix, distortion)
-            turns.append(turn)
-            places.append(place)
-    else:
-        _, matrix, distortion, turns, places = cv2.calibrateCamera(
-            [*points], [*px], SIZE, None, None
-        )
-    robot = case.robot if case.mount == "eye-in-hand" else np.linalg.inv(case.robot)
-    turn, place = cv2.calibrateHandEye(
-        [*robot[:, :3, :3]],
-        [*robot[:, :3, 3]],
-        [cv2.Rodrigues(turn)[0] for turn in turns],
-        [*places],
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
-    x = np.eye(4)
-    x[:3, :3], x[:3, 3] = turn, place.ravel()
-    return x, matrix, distortion
-
-
-def trial(world: World, mount: str, given: bool, seed: int, folder: Path) -> dict:
-    case = cell(world, mount, given, seed, folder)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            result = visioncal.calibrate(visioncal.Session.load(folder))
-    except visioncal.VisioncalError as error:
-        return {"refused": str(error)}
-    found, covariance = result.ray_frame.transform.matrix, result.ray_frame.transform.covariance
-    truth = case.reported_x @ pose(centre_ray(case.shift), np.zeros(3))
-    turned = Rotation.from_matrix(truth[:3, :3].T @ found[:3, :3]).as_rotvec()
-    shifted = truth[:3, :3].T @ (found[:3, 3] - truth[:3, 3])
-    error = np.concatenate([turned, shifted])
-    looks = looks_of(case, seed)
-    picks = [pick(case, result, look) for look in looks]
-    theirs = [pick_by(case, *park(case, given), look) for look in looks]
-    x = park(case, given)[0]
-    return {
-        "x": float(error @ np.linalg.solve(covariance, error) / 6),
-        "x_mm": 1e3 * float(np.linalg.norm(shifted)),
-        "pick": float(np.mean([pair[0] for pair in picks])),
-        "pick_mm": float(np.median([pair[1] for pair in picks])),
-        "park_mm": float(np.median(theirs)),
-        "park_x_mm": 1e3 * float(np.linalg.norm(x[:3, 3] - case.reported_x[:3, 3])),
-        "status": result.verdict.status,
-        "cause": [cause.kind for cause in result.verdict.causes][:1],
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -564,82 +483,3 @@ def looks_of(case: Case, seed: int) -> list[Look]:
     return [
         replace(look, reported=at @ look.reported) for look, at in zip(looks, reported, strict=True)
     ]
-
-
-def pick(case: Case, result: visioncal.Calibration, look: Look) -> tuple[float, float]:
-    """Squared error over covariance per degree of freedom, and the error [mm], in the plane."""
-    (located,) = visioncal.locate(
-        result,
-        look.px,
-        visioncal.Plane.through(look.normal, look.point),
-        RigidTransform.from_matrix(look.reported) if case.mount == "eye-in-hand" else None,
-    )
-    axes = np.linalg.svd(look.normal[None])[2][1:]
-    error = axes @ (located.p_base - look.point)
-    among = axes @ located.covariance @ axes.T
-    return float(error @ np.linalg.solve(among, error) / 2), 1e3 * float(np.linalg.norm(error))
-
-
-def pick_by(case: Case, x: np.ndarray, matrix, distortion, look: Look) -> float:
-    """The error [mm] of the same pick by another X and lens."""
-    camera = look.reported @ x if case.mount == "eye-in-hand" else x
-    ray = camera[:3, :3] @ np.append(
-        cv2.undistortPoints(look.px.reshape(1, 1, 2), matrix, distortion).ravel(), 1.0
-    )
-    along = look.normal @ (look.point - camera[:3, 3]) / (look.normal @ ray)
-    return 1e3 * float(np.linalg.norm(camera[:3, 3] + along * ray - look.point))
-
-
-def row(name: str, mount: str, given: bool, seeds: int) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        found = [
-            trial(WORLDS[name], mount, given, seed, Path(folder) / str(seed))
-            for seed in range(seeds)
-        ]
-    done = [mapping for mapping in found if "refused" not in mapping]
-    if not done:
-        return f"| {name} | {mount} | {'given' if given else 'estimated'} | all refused |"
-
-    def mean(key):
-        return np.mean([mapping[key] for mapping in done])
-
-    def middle(key):
-        return np.median([mapping[key] for mapping in done])
-
-    verdicts = "/".join(
-        str(sum(mapping["status"] == word for mapping in done)) for word in ("good", "check", "bad")
-    )
-    beyond = sum(mapping["status"] == "good" and mapping["x"] > BEYOND for mapping in done)
-    causes = Counter(cause for mapping in done for cause in mapping["cause"])
-    first = ", ".join(f"{cause} {count}" for cause, count in causes.most_common(2))
-    return (
-        f"| {name} | {mount} | {'given' if given else 'estimated'} | {mean('x'):.2f} "
-        f"| {mean('pick'):.2f} | {middle('x_mm'):.3f}, {middle('park_x_mm'):.3f} "
-        f"| {middle('pick_mm'):.3f}, {middle('park_mm'):.3f} "
-        f"| {verdicts} | {beyond} | {first} | {len(found) - len(done)} |"
-    )
-
-
-def main() -> None:
-    """Prints the table row by row, and keeps it where all worlds are in it."""
-    seeds = int(WORDS[0]) if WORDS and WORDS[0].isdigit() else few(SEEDS, 1)
-    asked = [word for word in WORDS if word in WORLDS]
-    table = [
-        "| world | mount | lens | X | pick | X [mm], Park's | pick [mm], Park's "
-        "| good/check/bad | good beyond 3 sigma | likeliest causes | refused |",
-        f"|{' --- |' * 11}",
-    ]
-    print("\n".join(table))
-    for name in asked or first(list(WORLDS), 2):
-        for mount in ("eye-in-hand", "eye-to-hand"):
-            for given in (True, False) if WORLDS[name].off_px == 0.0 else (True,):
-                table.append(row(name, mount, given, seeds))
-                print(table[-1], flush=True)
-    if not asked:
-        text = "\n".join([f"{seeds} cells a row.\n", *table])
-        command = "PYTHONPATH=tests python tests/benchmarks/elsewhere.py"
-        write_section("Cells of another generator", command, text)
-
-
-if __name__ == "__main__":
-    main()
