@@ -23,7 +23,7 @@ from support.fuzz.broken_sessions import BROKEN, broken_session
 
 import visioncal as package
 from visioncal.present.recording import paths
-from visioncal.present.viewer.process import free_port, viewer_process
+from visioncal.present.viewer.native import free_port, viewer_process
 from visioncal.simulation import CellOptions, simulate, write_session
 
 _FOLDER = Path(__file__).parents[2] / "recordings"

@@ -9,8 +9,7 @@ from support.samples import made_up
 
 from visioncal.core.number_format import significant
 from visioncal.present import facts, result_parts
-from visioncal.present.recording.markdown import table_lines
-from visioncal.present.recording.notes import result_markdown
+from visioncal.present.recording.notes import result_markdown, table_lines
 from visioncal.present.report.page import render
 from visioncal.present.tables import Table, TableRow
 from visioncal.results import Moved, ViewResult

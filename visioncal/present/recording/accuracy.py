@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.present import result_parts
-from visioncal.present.placements import placement
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import log_scalars
 from visioncal.present.recording.recorder import send_rows
+from visioncal.present.result_parts import placement
 from visioncal.results import Calibration, Edge
 from visioncal.results.arm import ArmResult
 from visioncal.results.evidence import ViewEvidence

@@ -13,7 +13,7 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
-from visioncal.present.recording.markdown import markdown, plain, table_lines
+from visioncal.present.recording.notes import markdown, plain, table_lines
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.writer import RecordingWriter
 from visioncal.present.torques import base_parameter_table, torque_note, torque_table

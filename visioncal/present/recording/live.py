@@ -12,7 +12,7 @@ from visioncal.present.coverage import corners_chart
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
 from visioncal.present.recording.charts import Charts
-from visioncal.present.recording.markdown import markdown
+from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.robot import Robot
 

@@ -1,9 +1,9 @@
-"""Texts and plots of a result: verdict, figures, and residuals of every view."""
+"""Texts in Markdown and plots of a result: verdict, figures, and residuals of every view."""
 
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
 from typing import Any, Literal
@@ -16,8 +16,8 @@ from visioncal.core.number_format import significant
 from visioncal.core.types import Target
 from visioncal.present import advice, arms, details, facts
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.markdown import fact_lines, markdown, plain, table_lines
 from visioncal.present.recording.recorder import send_rows
+from visioncal.present.tables import Fact, Table
 from visioncal.results import Calibration, ViewResult
 from visioncal.session import View
 
@@ -47,6 +47,8 @@ _MARKS = (
 )
 # End of a plot's scale, as a multiple of the used views' largest residual.
 _ROOM = 1.25
+# Marks of rows that are set in bold.
+_BOLD = ("taken", "sure")
 
 
 def log_static(
@@ -183,3 +185,38 @@ def _unseen_markdown(view: View) -> str:
     """Text of a view without any observation of the cell."""
     reason = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
     return f"# View {view.number}\n\n{reason}"
+
+
+def plain(text: str) -> str:
+    """Escapes text from outside: in Markdown, the viewer would load pictures and follow links."""
+    return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
+
+
+def markdown(text: str) -> rr.TextDocument:
+    """A text document that viewers render as Markdown."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+
+def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
+    """Facts as a list."""
+    for fact in facts:
+        note = f" ({plain(fact.note)})" if fact.note else ""
+        yield f"- {plain(fact.label)}: {plain(fact.value)}{note}"
+
+
+def table_lines(table: Table | None) -> Iterator[str]:
+    """A table, after an empty line; nothing for None."""
+    if table is None:
+        return
+    yield ""
+    yield _line(map(plain, table.titles))
+    yield _line("---" if column in table.words else "---:" for column in range(len(table.titles)))
+    for row in table.rows:
+        first, *rest = map(plain, row.cells)
+        is_bold = row.mark in _BOLD or not rest
+        rest = rest or [""] * (len(table.titles) - 1)
+        yield _line([f"**{first}**" if is_bold else first, *rest])
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -18,7 +18,7 @@ from visioncal.present.coverage import corners_chart, directions_chart, rotation
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import Obstacle, log_arm, log_frames, log_obstacles
 from visioncal.present.recording.charts import Charts
-from visioncal.present.recording.markdown import markdown
+from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.results.evidence import ViewEvidence

@@ -11,13 +11,13 @@ from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present import result_parts
 from visioncal.present.network_layout import layout, pairs, sigma_words
-from visioncal.present.placements import target_frames
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import image_frames, log_image_frames
 from visioncal.present.recording.recorder import send_rows
+from visioncal.present.result_parts import target_frames
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot

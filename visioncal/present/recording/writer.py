@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, replacing_file, sha256
 from visioncal.core.types import Searched
 from visioncal.present.recording import codec
-from visioncal.present.recording.external_images import ExternalImages
+from visioncal.present.recording.reader import ExternalImages
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
 from visioncal.results import Calibration

@@ -6,7 +6,7 @@ from pathlib import Path
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
-from visioncal.present.report import plots, sources
+from visioncal.present.report import plots
 from visioncal.results import Calibration
 
 FIGURES = ("residuals", "budget", "directions")
@@ -44,7 +44,7 @@ def draw(calibration: Calibration, what: str) -> Drawing:
     if what == "residuals":
         markup = str(plots.residuals(calibration))
     elif what in FIGURES and budget is not None:
-        markup = str((sources.budget if what == "budget" else sources.directions)(budget))
+        markup = str((plots.budget if what == "budget" else plots.directions)(budget))
     if not markup:
         raise DataError(
             f"There is no figure {what!r} of this calibration.",

@@ -1,4 +1,4 @@
-"""Plots of the report: residuals by view and joint angle, coverage, tools and fixtures."""
+"""Plots of the report: residuals, coverage, tools and fixtures, uncertainty, the board's shape."""
 
 from collections.abc import Collection, Sequence
 
@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import log, nearest_rotation
+from visioncal.core.types import Target
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import directions_chart
-from visioncal.present.placements import placement, target_frames
+from visioncal.present.facts import SOURCES
 from visioncal.present.report.plotting import (
     ACCENT,
     BAD,
@@ -31,10 +32,13 @@ from visioncal.present.report.plotting import (
     few_ticks,
     label_x,
     legend,
+    logarithmic,
     panels,
 )
+from visioncal.present.result_parts import placement, target_frames
 from visioncal.results import Calibration, Frame, ViewResult
 from visioncal.results.evidence import ViewEvidence
+from visioncal.results.sections import BoardResult, UncertaintyResult
 from visioncal.results.views import rms_of
 from visioncal.session import Session
 
@@ -45,6 +49,8 @@ _ROOM, _KEPT_PERCENT = 1.3, 95.0
 _MOST_CHARACTERS, _LONGEST, _MOST_LABELS = 36, 12, 24
 # Height of a bar chart over its largest used bar.
 _HEADROOM = 1.25
+# Smaller depths are rounding errors.
+_LEAST_DEPTH_MM = 1e-6
 
 
 def draw_bars(
@@ -317,3 +323,62 @@ def frame_plot(name: str, frame: Frame) -> tuple[Figure, str] | None:
     label_x(axes, labels, _MOST_LABELS, "", vertical=vertical)
     axes.set_ylabel("off by [mm]")
     return figure, f"Bars: what each observation of {name} is off"
+
+
+@drawn
+def budget(uncertainty: UncertaintyResult) -> tuple[Figure, str]:
+    """Standard deviation by source, of a point where the views look."""
+    parts = uncertainty.parts_mm
+    labels = [f"{significant(mm)} ({uncertainty.percent(name)})" for name, mm in parts.items()]
+    labels.append(significant(uncertainty.total_mm))
+    values = [*parts.values(), uncertainty.total_mm]
+    names = [*(SOURCES.get(name, name) for name in parts), "total"]
+    figure, ((axes,),) = panels(MIDDLE_IN, 0.32 * len(names) + 0.6)
+    colours = [ACCENT] * len(parts) + [INK]
+    bars = axes.barh(range(len(names)), values, 0.6, color=colours, alpha=0.9)
+    axes.bar_label(bars, labels, padding=4.0, fontsize=SMALL)
+    # Room for the labels beside the longest bar.
+    axes.set(xlim=(0.0, 1.55 * max(values) or 1.0), ylim=(len(names) - 0.5, -0.5))
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("sigma of the point's place [mm]")
+    few_ticks(axes, 4)
+    return figure, "Bars: standard deviation by source"
+
+
+@drawn
+def directions(uncertainty: UncertaintyResult) -> tuple[Figure, str] | None:
+    """Standard deviations of the edges' principal directions, relative to the limit."""
+    values = uncertainty.spectrum[uncertainty.spectrum > 0.0]
+    if not len(values):
+        return None
+    low, high = min(1e-2, 0.5 * float(values.min())), max(2.5, 1.5 * float(values.max()))
+    figure, ((axes,),) = panels(MIDDLE_IN, 1.0)
+    logarithmic(axes.xaxis)
+    axes.set(xlim=(low, high), ylim=(-1.0, 1.0), yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("sigma / largest accepted")
+    axes.plot(values, np.zeros(len(values)), "|", color=ACCENT, markersize=18.0)
+    axes.axvline(1.0, color=BAD, linewidth=1.4)
+    axes.annotate("limit", (1.0, 0.6), xytext=(4.0, 0.0), textcoords="offset points",
+                  fontsize=SMALL, color=BAD)  # fmt: skip
+    return figure, "Sigmas of the directions, and the limit"
+
+
+@drawn
+def board_shape(board: BoardResult, target: Target, name: str = "") -> tuple[Figure, str] | None:
+    """Depth of a board behind its mean plane; None for a flat one."""
+    x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
+    reach = float(np.abs(depth_mm).max())
+    if not board.is_bent or reach < _LEAST_DEPTH_MM:
+        return None
+    figure, ((axes,),) = panels(MIDDLE_IN, 0.7 * MIDDLE_IN)
+    levels = np.linspace(-reach, reach, 14)
+    shown = axes.tricontourf(x_mm, y_mm, depth_mm, levels, cmap="coolwarm")
+    axes.plot(x_mm, y_mm, "o", color="#202020", markersize=1.4)
+    # y points down on the printed page.
+    axes.invert_yaxis()
+    axes.set(xlabel="target x [mm]", ylabel="target y [mm]", aspect="equal")
+    axes.grid(visible=False)
+    colour_bar(axes, shown, "depth [mm]")
+    return figure, f"Depth of the board {name}".strip() + " over its plane"

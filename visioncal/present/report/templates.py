@@ -43,11 +43,11 @@ def _environment(*, has_result: bool) -> Environment:
         return environment
     # Imported late: a page without figures does not wait for matplotlib.
     from visioncal.present import advice, arms, details, facts, result_parts, torques
-    from visioncal.present.report import armplots, content, network, plots, sources
+    from visioncal.present.report import armplots, content, network, plots
 
     called = (
         *(result_parts, facts, arms, details, torques, advice),
-        *(content, network, plots, armplots, sources),
+        *(content, network, plots, armplots),
     )
     environment.globals |= {
         name: var

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from visioncal.core.errors import DriverError
 from visioncal.present.recording import paths
 from visioncal.present.viewer.layout import image_view, space_view
-from visioncal.present.viewer.process import free_port, viewer_process
+from visioncal.present.viewer.native import free_port, viewer_process
 
 _HOST = "127.0.0.1"
 # Time for the viewer to listen, polling interval, and time for its window to open [s].

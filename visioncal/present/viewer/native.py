@@ -1,8 +1,17 @@
-"""Shows a recording in rerun's viewer, in a window or in a browser."""
+"""Shows a recording in rerun's viewer, in a window or in a browser: a process of its own.
 
+The viewer has no network access beyond this machine.
+"""
+
+import os
 import re
+import signal
+import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import Popen
 from threading import Thread
@@ -10,12 +19,16 @@ from threading import Thread
 from rerun.experimental import ViewerClient
 
 from visioncal.core.errors import DriverError
+from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.present.recording import paths
-from visioncal.present.viewer.process import free_port, until_interrupted, viewer_process
 
 _HOST = "127.0.0.1"
 # Longest wait for the recording to load, and polling interval [s].
 _PATIENCE_S, _AGAIN_S = 60.0, 0.2
+# Longest wait for the viewer to end [s].
+_END_S = 5.0
+# Nothing listens at the port of the discard service.
+_NOWHERE = "http://127.0.0.1:9"
 _SERVING = re.compile(rf"connect at (http://{re.escape(_HOST)}:\d+\S*)")
 
 
@@ -80,3 +93,65 @@ def _seek(process: Popen[str], port: int, row: int) -> None:
             time.sleep(_AGAIN_S)
         else:
             return
+
+
+@contextmanager
+def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Runs rerun's viewer; leaving the block ends it with all its child processes.
+
+    Args:
+        arguments: Arguments of the `rerun` command. Its output can be read from `stdout`.
+
+    Yields:
+        The process, which leads its own process group.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rerun_cli", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        env=_quiet(os.environ),
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        _end_group(process)
+
+
+def free_port() -> int:
+    """A free port of this machine."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Runs a block that Ctrl-C or SIGTERM ends without an error."""
+    with suppress(KeyboardInterrupt), signals_as_interrupts("SIGINT", "SIGTERM"):
+        yield
+
+
+def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
+    """Environment in which the viewer sends no statistics and checks for no newer version."""
+    # It sends none under continuous integration, and checks through the proxy; neither changes the
+    # user's settings of rerun.
+    quiet = {key: name for key, name in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
+    proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
+    return quiet | proxies | {"CI": "1", "NO_COLOR": "1"}
+
+
+def _end_group(process: subprocess.Popen[str]) -> None:
+    """Ends a process and its children; rerun's command starts the viewer as a child."""
+    # Both signals, as the command may have ended before its child.
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_END_S)
+    if process.stdout is not None:
+        process.stdout.close()
