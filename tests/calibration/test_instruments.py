@@ -20,7 +20,7 @@ from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
+from visioncal.session.kinds import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 

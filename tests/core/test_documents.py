@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from visioncal.core.documents import as_numbers, parse_stored, read_json, read_table
-from visioncal.core.documents.arrays import read_npy, read_npz
-from visioncal.core.documents.jsons import parse_json
+from visioncal.core.documents.jsons import parse_json, read_npy, read_npz
 from visioncal.core.documents.structured import parse_yaml, read_opencv, read_xml, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes

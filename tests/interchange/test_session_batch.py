@@ -17,7 +17,7 @@ from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
 from visioncal.interchange.batch import Options, batch, jobs_of
 from visioncal.interchange.batch import run as batch_run
-from visioncal.interchange.batch.work import work
+from visioncal.interchange.batch.run import work
 from visioncal.interchange.outputs import RECORDING, REPORT
 from visioncal.results import Calibration, to_document
 from visioncal.simulation import CellOptions, simulate, write_session

@@ -12,7 +12,7 @@ from support.rendered import Shot, photograph
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.interchange.formats.boards import read_target_description
+from visioncal.interchange.formats.intrinsics import read_target_description
 from visioncal.session import Session
 from visioncal.simulation import BOARDS, CellOptions, simulate, write_session
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target

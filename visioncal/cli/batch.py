@@ -7,7 +7,7 @@ from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answers
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import BatchOptions
 from visioncal.core.errors import DataError
-from visioncal.interchange.batch import Batch, batch
+from visioncal.interchange.batch import batch
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 _MOST_NAMED = 5
@@ -29,7 +29,20 @@ def batch_command(options: BatchOptions) -> None:
             against=options.against,
             progress=progress,
         )
-    _report(found)
+    console, counts = answers(), found.counts
+    named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
+    words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
+    console.print(f"{len(found.rows)} sessions: {words}")
+    lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
+    lines += [f"{row.name}: {row.change}" for row in found.rows if row.changed][:_MOST_NAMED]
+    failed = [
+        f"{row.name}: {row.words} {row.next_step}".rstrip()
+        for row in found.rows
+        if row.state == "failed"
+    ]
+    for line in [*lines, *failed[:_MOST_NAMED]]:
+        console.print(escape(f"  {line}"))
+    console.print(escape(f"written: {found.page}, {found.table}"))
     if found.is_cut_short:
         done = sum(row.state != "failed" for row in found.rows)
         raise DataError(
@@ -42,22 +55,3 @@ def batch_command(options: BatchOptions) -> None:
         raise typer.Exit(EXIT_NO_RESULT)
     if any(row.verdict == "bad" for row in found.rows):
         raise typer.Exit(EXIT_BAD)
-
-
-def _report(results: Batch) -> None:
-    console, counts = answers(), results.counts
-    named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
-    words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
-    console.print(f"{len(results.rows)} sessions: {words}")
-    lines = [f"{row.name}: {row.stands_out}" for row in results.rows if row.score > 0.0][
-        :_MOST_NAMED
-    ]
-    lines += [f"{row.name}: {row.change}" for row in results.rows if row.changed][:_MOST_NAMED]
-    failed = [
-        f"{row.name}: {row.words} {row.next_step}".rstrip()
-        for row in results.rows
-        if row.state == "failed"
-    ]
-    for line in [*lines, *failed[:_MOST_NAMED]]:
-        console.print(escape(f"  {line}"))
-    console.print(escape(f"written: {results.page}, {results.table}"))

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.calibration.guess import Candidate, Guess
+from visioncal.calibration.guess import Candidate
 from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages, say
 from visioncal.cli.parsing import names_in, pair_in, size_in
@@ -87,11 +87,15 @@ def _chosen(recorded: DoubtfulSession | ForeignRecording, *, yes: bool) -> Candi
             guess = guess_foreign(recorded, progress=progress)
         else:
             guess = guess_session(recorded.session, recorded.robot, progress=progress)
-    _print_guess(guess)
-    return _confirmed(guess, yes=yes)
-
-
-def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
+    console = messages()
+    table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
+    for candidate in guess.candidates:
+        cells = (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
+        table.add_row(*map(escape, cells), style="bold green" if candidate is guess.best else "")
+    console.print(table)
+    console.print(escape(guess.sentence))
+    for note in guess.notes:
+        console.print(escape(f"note: {note}"))
     if not guess.stands_out:
         if guess.declared.closes:
             return guess.declared
@@ -120,16 +124,3 @@ def _confirmed(guess: Guess, *, yes: bool) -> Candidate:
     if not is_confirmed:
         raise DataError("Nothing was written: the reading was declined.")
     return guess.best
-
-
-def _print_guess(guess: Guess) -> None:
-    """Prints the readings, the best first, the conclusion, and what remains ambiguous."""
-    console = messages()
-    table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
-    for candidate in guess.candidates:
-        cells = (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
-        table.add_row(*map(escape, cells), style="bold green" if candidate is guess.best else "")
-    console.print(table)
-    console.print(escape(guess.sentence))
-    for note in guess.notes:
-        console.print(escape(f"note: {note}"))

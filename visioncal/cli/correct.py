@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import typer
@@ -82,7 +81,17 @@ def correct_command(options: CorrectOptions) -> None:
     unreachable = tuple(_unreachable(targets, corrected))
     rows = np.flatnonzero(corrected.reached)
     if unreachable and not (options.skip and len(rows)):
-        raise _refusal(unreachable, len(targets))
+        count = len(targets)
+        lines = [f"{place}: {why}." for place, why in unreachable[:_MOST_SHOWN]]
+        if len(unreachable) > _MOST_SHOWN:
+            lines.append(f"And {len(unreachable) - _MOST_SHOWN} more of the kind.")
+        raise DataError(
+            "\n".join([f"{len(unreachable)} of {count} targets cannot be reached.", *lines]),
+            culprits=[place for place, _ in unreachable],
+            next_step="Move them, or write the others with --skip-unreachable."
+            if len(unreachable) < count
+            else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
+        )
     sigma_mm = predicted_sigma_mm(calibration, base_from_flange[:, :3, 3], corrected.q)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
@@ -95,7 +104,22 @@ def correct_command(options: CorrectOptions) -> None:
     if file is not None:
         write_atomically(file, table_to_send(targets, columns, rows))
     if options.as_json:
-        print_json(_document(targets, columns, rows, unreachable) | {"warnings": warnings})
+        kept = [column for column in targets.table.columns if column not in columns]
+        cells = [dict(zip(targets.table.columns, row, strict=True)) for row in targets.table.rows]
+        print_json(
+            {
+                "targets": [
+                    {
+                        "place": targets.places[row],
+                        **{name: cells[row][name] for name in kept},
+                        **{name: float(numbers[row]) for name, numbers in columns.items()},
+                    }
+                    for row in rows
+                ],
+                "unreachable": [{"place": place, "reason": why} for place, why in unreachable],
+            }
+            | {"warnings": warnings}
+        )
         return
     if file is None:
         typer.echo(table_to_send(targets, columns, rows), nl=False)
@@ -168,19 +192,6 @@ def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, 
             else "out of reach: "
         )
         yield targets.places[row], reason + nearest
-
-
-def _refusal(unreachable: Sequence[tuple[str, str]], count: int) -> DataError:
-    lines = [f"{place}: {why}." for place, why in unreachable[:_MOST_SHOWN]]
-    if len(unreachable) > _MOST_SHOWN:
-        lines.append(f"And {len(unreachable) - _MOST_SHOWN} more of the kind.")
-    return DataError(
-        "\n".join([f"{len(unreachable)} of {count} targets cannot be reached.", *lines]),
-        culprits=[place for place, _ in unreachable],
-        next_step="Move them, or write the others with --skip-unreachable."
-        if len(unreachable) < count
-        else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
-    )
 
 
 def _warn_turns(
@@ -259,24 +270,3 @@ def _report(
         console.print(f"  and {len(unreachable) - _MOST_SHOWN} more")
     for warning in warnings:
         warn(warning)
-
-
-def _document(
-    targets: Targets,
-    columns: Mapping[str, FloatArray],
-    rows: IntArray,
-    unreachable: Sequence[tuple[str, str]],
-) -> dict[str, Any]:
-    kept = [column for column in targets.table.columns if column not in columns]
-    cells = [dict(zip(targets.table.columns, row, strict=True)) for row in targets.table.rows]
-    return {
-        "targets": [
-            {
-                "place": targets.places[row],
-                **{name: cells[row][name] for name in kept},
-                **{name: float(numbers[row]) for name, numbers in columns.items()},
-            }
-            for row in rows
-        ],
-        "unreachable": [{"place": place, "reason": why} for place, why in unreachable],
-    }

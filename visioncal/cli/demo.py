@@ -1,22 +1,123 @@
-"""`visioncal demo`."""
+"""`visioncal demo`; with `--live` it drives a simulated cell by the real client library."""
 
 import shutil
+from contextlib import ExitStack, closing
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import typer
 
 from visioncal.calibration.pipeline import run
-from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_written, say
+from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_error, report_written, say
 from visioncal.cli.progress import shown_progress
+from visioncal.cli.record import (
+    RecordedSetup,
+    ViewLines,
+    check_all,
+    facts_of,
+    record_driven,
+    scene_of,
+)
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_table
+from visioncal.core.choices import Faults
+from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import invert, log
-from visioncal.interchange.outputs import write_outputs
+from visioncal.core.threads import signals_as_interrupts
+from visioncal.core.transforms import invert, log, pose_difference
+from visioncal.interchange.outputs import write_outputs, write_plan
+from visioncal.live.capture.gate import Consent
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.extras import client_library
+from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.messages import summary_of
+from visioncal.live.planning.plan import PlanRequest, make_plan
+from visioncal.live.planning.plan_file import plan_document
+from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.simulated.cell import Bench
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Truth, read_truth, simulate, truth_path, write_session
+from visioncal.simulation.arms import forward
+from visioncal.simulation.records import truth_of, write_truth
+
+# The default speed of a UR's program; nobody stands beside this one.
+_TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
+# Fewer candidates than for a real plan, as a demonstration should be short.
+_CANDIDATES = 600
+# The arm begins so near to the first stop, as if guided there by hand [rad].
+_NEAR_RAD = 2e-3
+
+
+def record_simulated(
+    session: Path, plan: Path, stops: int, seed: int, fault: Faults | None
+) -> None:
+    """Plans stops of a simulated cell and records them, with its truth beside the session.
+
+    Args:
+        session: Folder of the session, which does not exist.
+        plan: Folder of the plan.
+        stops: Number of planned stops.
+        seed: Of everything random.
+        fault: What happens half way; the recording then ends, is mended and resumed.
+
+    Raises:
+        DriverError: The client library is missing, or a device failed other than by the fault.
+        DataError: The views cannot be written, or stops gave none.
+    """
+    bench = Bench(seed, fault, after=max(1, stops // 2))
+    plan.parent.mkdir(parents=True, exist_ok=True)
+    # From the begin, so that the next demonstration replaces one that was interrupted.
+    write_truth(session, truth_of(bench.truth))
+    scene = _planned(bench.known, stops, seed, plan)
+    bench.start(scene.planned.stops[0].q + _NEAR_RAD)
+    with closing(bench):
+        host = bench.controller.host
+        say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
+        if fault is not None:
+            try:
+                _drive(bench, scene, session, resume=False)
+            except VisioncalError as error:
+                if "Ctrl-C" in error.culprits:
+                    raise
+                report_error(error, as_json=False)
+            else:
+                raise DriverError(f"demo: {fault} did not happen before all views were taken.")
+            say(f"  ({fault} is mended; on with --resume)")
+            bench.mend()
+        _drive(bench, scene, session, resume=fault is not None)
+    flange = np.array([state.base_from_flange[0] for _, state in bench.views])
+    x, z = bench.truth.transforms.values()
+    poses = {"base_from_flange": flange, "cam_from_target": invert(flange @ x) @ z}
+    write_truth(session, truth_of(bench.truth) | poses)
+    q = np.array([view.state.q for view, _ in bench.views])
+    recorded = forward(bench.truth.robot.true_arm, q)
+    away_mm = max(pose_difference(*pair)[0] for pair in zip(recorded, flange, strict=True))
+    say(f"where views were taken the flange was within {1e3 * away_mm:.0f} um of what was recorded")
+
+
+def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> RecordedSetup:
+    """Plans stops from the rough poses, and reads them back as a recording does."""
+    request = PlanRequest(purpose_of("hand-eye"), stops, candidates=_CANDIDATES, seed=seed)
+    with shown_progress(quiet=False) as progress:
+        plan = make_plan(known, request, progress=progress)
+        written = write_plan(folder, plan, plan_document(plan, {"kind": "demo"}))
+    report_written(written, quiet=True)
+    say(f"plan: {summary_of(plan)}")
+    return scene_of(folder)
+
+
+def _drive(bench: Bench, scene: RecordedSetup, session: Path, *, resume: bool) -> None:
+    with ExitStack() as opened, signals_as_interrupts():
+        cell = opened.enter_context(bench.connected())
+        begin = Journal.resume if resume else Journal.begin
+        facts = facts_of(scene, cell, session.name)
+        journal = begin(session, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
+        steps = record_driven(cell, scene, journal, _TAKING, [ViewLines(), bench], Consent(None))
+        check_all(journal, steps)
+
 
 # False-alarm probability of that test, and factor on the sigmas: errors of one board's corners are
 # correlated by hundredths of a pixel, and joints deviate from their encoders, which a covariance of
@@ -35,8 +136,6 @@ def demo_command(options: DemoOptions) -> None:
         # An earlier demonstration's; nothing else is ever removed.
         shutil.rmtree(session, ignore_errors=True)
     if options.live:
-        from visioncal.cli.live_demo import record_simulated
-
         record_simulated(session, options.out / "plan", options.views, options.seed, options.fault)
     with shown_progress(quiet=False) as progress:
         if not options.live:

@@ -26,10 +26,7 @@ def diff_command(options: DiffOptions) -> None:
     if options.as_json:
         print_json(to_document(comparison))
         return
-    _print(comparison, (str(options.first), str(options.second)))
-
-
-def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
+    paths = (str(options.first), str(options.second))
     console = answers(markup=False)
     # Names of cells' frames are long, and are not truncated.
     console.width = max(console.width, _LEAST_WIDTH)
@@ -40,7 +37,20 @@ def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
     for finding in comparison.findings:
         console.print(f"- {finding}")
     if comparison.edges:
-        console.print(_edge_table(comparison))
+        table = _table("transform", "moved", "sigma", "moved / sigma", "by chance", "")
+        for edge in comparison.edges:
+            for moved, sigma, unit, test in (
+                (edge.moved_mm, edge.sigma_mm, "mm", edge.translation),
+                (edge.moved_deg, edge.sigma_deg, "deg", edge.rotation),
+            ):
+                table.add_row(
+                    edge.name,
+                    f"{round(moved, _DECIMALS):.3g} {unit}",
+                    f"{figure(sigma)} {unit}",
+                    f"{moved / sigma:.1f}" if sigma > 0.0 else "",
+                    *_outcome(test),
+                )
+        console.print(table)
     for name, where in (
         *((name, "first") for name in comparison.only_in_a),
         *((name, "second") for name in comparison.only_in_b),
@@ -52,23 +62,6 @@ def _print(comparison: Comparison, paths: tuple[str, str]) -> None:
     elif lens is not None:
         console.print(_lens_table(lens))
     console.print(_noise_table(comparison))
-
-
-def _edge_table(comparison: Comparison) -> Table:
-    table = _table("transform", "moved", "sigma", "moved / sigma", "by chance", "")
-    for edge in comparison.edges:
-        for moved, sigma, unit, test in (
-            (edge.moved_mm, edge.sigma_mm, "mm", edge.translation),
-            (edge.moved_deg, edge.sigma_deg, "deg", edge.rotation),
-        ):
-            table.add_row(
-                edge.name,
-                f"{round(moved, _DECIMALS):.3g} {unit}",
-                f"{figure(sigma)} {unit}",
-                f"{moved / sigma:.1f}" if sigma > 0.0 else "",
-                *_outcome(test),
-            )
-    return table
 
 
 def _lens_table(lens: LensChange) -> Table:

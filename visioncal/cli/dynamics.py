@@ -29,8 +29,8 @@ from visioncal.cli.summary import print_verdict
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
-from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.core.number_format import figure, matched, significant, some_of
+from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import (
     BaseModel,
@@ -65,9 +65,8 @@ from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrMotion
-from visioncal.live.planning.cell import Box
 from visioncal.live.planning.messages import plan_warnings, plan_words
-from visioncal.robot import Inertias, Robot, load_robot, symmetric_matrices
+from visioncal.robot import Inertias, load_robot, symmetric_matrices
 from visioncal.robot.bodies import Body, capsule
 from visioncal.session import STREAMS, Session, check_stream, save_stream
 
@@ -76,6 +75,20 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     """Plans an exciting motion and sweeps, writes them into a folder, and reports them."""
     motion, kept, limits = options.motion, options.kept, options.arm_options
     arm = load_robot(options.robot)
+    boxes = boxes_of(kept)
+    bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
+    if limits.tool is not None:
+        length, radius = (
+            1e-3 * number for number in numbers_in(limits.tool, "--tool", "length,radius")
+        )
+        if min(length, radius) <= 0.0:
+            raise DataError(
+                f"--tool is {limits.tool!r}; a length and a radius above zero [mm] are needed.",
+                culprits=["--tool"],
+            )
+        flange = arm.chain.placements[-1]
+        tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
+        bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
     allowed = motion_limits(
         arm,
         MotionMargins(
@@ -89,7 +102,7 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
         missing=DefaultLimits(
             *map(_radians, (limits.range_deg, limits.speed_deg, limits.acceleration_deg))
         ),
-        bodies=_bodies(arm, boxes_of(kept), limits.tool),
+        bodies=tuple(bodies),
         payload=None if limits.payload is None else _payload(limits.payload),
     )
     request = ExcitationRequest(
@@ -142,21 +155,6 @@ def _radians(degrees: float | None) -> float | None:
             culprits=["--range-deg", "--speed-deg", "--acceleration-deg"],
         )
     return float(np.deg2rad(degrees))
-
-
-def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
-    bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
-    if tool is not None:
-        length, radius = (1e-3 * number for number in numbers_in(tool, "--tool", "length,radius"))
-        if min(length, radius) <= 0.0:
-            raise DataError(
-                f"--tool is {tool!r}; a length and a radius above zero [mm] are needed.",
-                culprits=["--tool"],
-            )
-        flange = arm.chain.placements[-1]
-        tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
-        bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
-    return tuple(bodies)
 
 
 def _payload(words: str) -> FloatArray:
@@ -306,12 +304,6 @@ def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
         f"{identified.base.rank} base parameters: {shares}, {counts[-1][1]} {counts[-1][0]}, "
         f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
     )
-    console.print(_joint_table(identified))
-    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
-
-
-def _joint_table(identified: Identified) -> Table:
-    """Table of torque errors and friction by joint."""
     names = [identified.base.model.names[index] for index in identified.base.independent]
     values = dict(zip(names, identified.values.tolist(), strict=True))
     stribeck = {row["joint"]: row for row in stribeck_rows(identified)}
@@ -339,7 +331,8 @@ def _joint_table(identified: Identified) -> Table:
             for group in filled.values()
         ]
         table.add_row(str(joint), *row)
-    return table
+    console.print(table)
+    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
 
 
 def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
@@ -359,7 +352,26 @@ def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
         return
     for note in (note for conditioned in loaded for note in conditioned.notes):
         say(note)
-    typer.echo("\n".join(_lines(payload)))
+    mass = f"{matched(payload.mass_kg, payload.mass_sigma_kg)} kg"
+    pairs = zip(1e3 * payload.centre_m, 1e3 * payload.centre_sigma_m, strict=True)
+    centre = ", ".join(
+        f"{matched(value, sigma)} (sigma {significant(sigma)})" for value, sigma in pairs
+    )
+    gains = ""
+    if payload.gains_sigma_kg:
+        gains = f", {significant(payload.gains_sigma_kg)} of it from the drives' gains"
+    lines = [
+        f"mass {mass} (sigma {significant(payload.mass_sigma_kg)}{gains})",
+        f"centre {centre} mm in the flange's frame",
+    ]
+    if payload.consistent:
+        inertia = ", ".join(f"{value:.4g}" for value in payload.inertia_kg_m2)
+        lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
+    else:
+        lines.append("its inertia is lost in the noise")
+    left = ", ".join(significant(rm) for rm in payload.rms_nm.tolist())
+    lines.append(f"unexplained {left} N m, joint by joint")
+    typer.echo("\n".join([*lines, f"on a UR: {_ur_words(payload)}"]))
 
 
 def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
@@ -401,29 +413,6 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
             "--gains needs all joints: move those that are not determined more, or take a body "
             "that is heavier or whose centre is farther from their axes."
         )
-
-
-def _lines(payload: Payload) -> list[str]:
-    mass = f"{matched(payload.mass_kg, payload.mass_sigma_kg)} kg"
-    pairs = zip(1e3 * payload.centre_m, 1e3 * payload.centre_sigma_m, strict=True)
-    centre = ", ".join(
-        f"{matched(value, sigma)} (sigma {significant(sigma)})" for value, sigma in pairs
-    )
-    gains = ""
-    if payload.gains_sigma_kg:
-        gains = f", {significant(payload.gains_sigma_kg)} of it from the drives' gains"
-    lines = [
-        f"mass {mass} (sigma {significant(payload.mass_sigma_kg)}{gains})",
-        f"centre {centre} mm in the flange's frame",
-    ]
-    if payload.consistent:
-        inertia = ", ".join(f"{value:.4g}" for value in payload.inertia_kg_m2)
-        lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
-    else:
-        lines.append("its inertia is lost in the noise")
-    left = ", ".join(significant(rm) for rm in payload.rms_nm.tolist())
-    lines.append(f"unexplained {left} N m, joint by joint")
-    return [*lines, f"on a UR: {_ur_words(payload)}"]
 
 
 def _ur_words(payload: Payload) -> str:

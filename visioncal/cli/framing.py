@@ -222,7 +222,18 @@ def place_frame(
     """
     part, source = request.part, request.touches
     if source is None or request.goes.remove is not None:
-        report_written(_removed(kind, request))
+        command = "tcp" if kind == "tool" else "fixture"
+        name = request.goes.remove
+        if name is None:
+            raise DataError(
+                f"{command}: touches of it, or a session that shows it, are needed.",
+                culprits=["TOUCHES"],
+                next_step=f"Name them: visioncal {command} TOUCHES -c OUT; or --remove NAME.",
+            )
+        refuse_given(
+            {"TOUCHES": request.touches, "--name": request.goes.name}, "--remove measures nothing"
+        )
+        report_written(FrameLocation.remove(request.goes, kind, name))
         return
     session = _image_session(source, {"--tool": tool, **request.written.given()})
     if session is None:
@@ -246,26 +257,6 @@ def place_frame(
             )
         frame = _by_images(kind, request, session, location.calibration, drawing)
     keep_and_report(location, frame, source, as_json=request.as_json)
-
-
-def _removed(kind: FrameKind, request: TcpOptions | FixtureOptions) -> Written:
-    """Removes a frame, where no touches are given.
-
-    Raises:
-        DataError: There are touches too, or there is neither.
-    """
-    command = "tcp" if kind == "tool" else "fixture"
-    name = request.goes.remove
-    if name is None:
-        raise DataError(
-            f"{command}: touches of it, or a session that shows it, are needed.",
-            culprits=["TOUCHES"],
-            next_step=f"Name them: visioncal {command} TOUCHES -c OUT; or --remove NAME.",
-        )
-    refuse_given(
-        {"TOUCHES": request.touches, "--name": request.goes.name}, "--remove measures nothing"
-    )
-    return FrameLocation.remove(request.goes, kind, name)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:

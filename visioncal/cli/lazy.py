@@ -48,11 +48,6 @@ class PlainCommand(TyperCommand):
                 culprits=names[-1:],
                 next_step=f"{ctx.command_path} --help lists what it takes.",
             ) from None
-        self._refuse_empty_paths(ctx, typed)
-        return rest
-
-    def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
-        """Refuses empty paths, as from an unset shell variable."""
         paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
         path_options = {opt for path in paths for opt in path.opts}
         for option, value in (
@@ -66,6 +61,7 @@ class PlainCommand(TyperCommand):
                     next_step="Write . for the folder where you are; or look whether a variable of "
                     "the shell is set.",
                 )
+        return rest
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs the command; on Ctrl-C, lists the files that it has written."""

@@ -20,7 +20,7 @@ from visioncal.frames.camera_chain import CalibratedCamera, Plane
 from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.frames.session_observations import calibrated_joints, pose_of
 from visioncal.frames.target_in_image import check_image_size
-from visioncal.interchange.formats.boards import target_named
+from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.picking import check_mount
@@ -76,7 +76,24 @@ def locate_command(options: LocateOptions) -> None:
         elif source is not None:
             check_image_size(CalibratedCamera.of(calibrated), read_image(source), source.name)
         boards = targets_fixed_to_base(result, choice, EYE)
-        points = _by_plane(options, calibrated, boards, flange, joints_rad)
+        if options.plane is None:
+            raise DataError(
+                "One image shows no depth: the plane (--plane) that the feature lies in is needed.",
+                culprits=["--plane"],
+                next_step=f"It is {FORMS}.",
+            )
+        px = np.array([numbers_in(pixel, "--pixel", "u,v") for pixel in options.pixel or ()])
+        declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)
+        sigma_px = options.sigma_px
+        places = locate(calibrated, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
+        points = tuple(
+            _Point(
+                f"pixel ({u:g}, {v:g})",
+                {"pixel": [u, v]},
+                replace(place, warnings=(*place.warnings, note)) if note else place,
+            )
+            for (u, v), place in zip(px.tolist(), places, strict=True)
+        )
     else:
         needless = {"--plane": options.plane, "--plane-sigma-mm": options.plane_sigma}
         refuse_given(needless, "it is for --pixel")
@@ -143,33 +160,6 @@ def _flange_of(
             next_step="Fill in x_m to qw, or joint angles and [robot] model.",
         )
     return flange, calibrated_joints(view, calibration)
-
-
-def _by_plane(
-    options: LocateOptions,
-    calibration: Calibration,
-    boards: Mapping[str, Edge],
-    flange: FloatArray | None,
-    joints_rad: FloatArray | None,
-) -> tuple[_Point, ...]:
-    if options.plane is None:
-        raise DataError(
-            "One image shows no depth: the plane (--plane) that the feature lies in is needed.",
-            culprits=["--plane"],
-            next_step=f"It is {FORMS}.",
-        )
-    px = np.array([numbers_in(pixel, "--pixel", "u,v") for pixel in options.pixel or ()])
-    declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibration, boards)
-    sigma_px = options.sigma_px
-    places = locate(calibration, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
-    return tuple(
-        _Point(
-            f"pixel ({u:g}, {v:g})",
-            {"pixel": [u, v]},
-            replace(place, warnings=(*place.warnings, note)) if note else place,
-        )
-        for (u, v), place in zip(px.tolist(), places, strict=True)
-    )
 
 
 def _plane_of(

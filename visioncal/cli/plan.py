@@ -24,8 +24,7 @@ from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Need, Progress
 from visioncal.estimation.problem_parts import Noise
-from visioncal.interchange.formats.boards import target_named
-from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.interchange.formats.intrinsics import read_intrinsics, target_named
 from visioncal.interchange.outputs import CALIBRATION, write_plan
 from visioncal.interchange.result_files import content_of, load_calibration, load_stored
 from visioncal.live.planning.cell import (

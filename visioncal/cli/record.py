@@ -15,10 +15,10 @@ from visioncal.cli.console import asked, messages, print_json, say
 from visioncal.cli.parsing import size_in
 from visioncal.cli.session_options import RecordCellOptions, RecordOptions
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.core.number_format import counted, figure
+from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import Camera, Mount, Target
-from visioncal.interchange.formats.boards import target_named
+from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.assessment import RecordedAccuracy
 from visioncal.live.capture.cell import HostClock, LiveCell
 from visioncal.live.capture.devices import ArmSetup, is_folder, open_arm, open_camera
@@ -372,34 +372,32 @@ def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
 def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
     """Prints a summary of the recording, and the next command."""
     if as_json:
-        print_json(_summary(journal, steps))
+        predicted = [
+            step.accuracy
+            for step in steps
+            if step.accuracy is not None and not step.accuracy.is_open
+        ]
+        summary: dict[str, Any] = {
+            "session": str(journal.folder),
+            "views": [view.number for view in journal.views],
+            "times_s": [
+                {
+                    "view": step.view,
+                    "moved_s": round(step.moved_s, 3),
+                    "settled_s": round(step.settled_s, 3),
+                    "worked_s": round(step.worked_s, 3),
+                }
+                for step in steps
+            ],
+        }
+        if predicted:
+            summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
+        print_json(summary)
         return
     say(
         f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
         f"{shlex.quote(str(journal.folder))} -o out"
     )
-
-
-def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
-    predicted = [
-        step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
-    ]
-    summary: dict[str, Any] = {
-        "session": str(journal.folder),
-        "views": [view.number for view in journal.views],
-        "times_s": [
-            {
-                "view": step.view,
-                "moved_s": round(step.moved_s, 3),
-                "settled_s": round(step.settled_s, 3),
-                "worked_s": round(step.worked_s, 3),
-            }
-            for step in steps
-        ],
-    }
-    if predicted:
-        summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
-    return summary
 
 
 def check_driven(scene: RecordedSetup, *, drives: bool) -> None:

@@ -80,7 +80,31 @@ _TAKES: Mapping[str, frozenset[str]] = {
 
 def simulate_command(asked: SimulateOptions) -> None:
     """Runs `visioncal simulate`."""
-    _check_given(asked)
+    kinds = [take for take in _TAKES if take and getattr(asked, take)]
+    if "cell" in kinds:
+        kinds = [kind for kind in kinds if kind not in _WITH_CELL]
+    if len(kinds) > 1:
+        named = [_option(kind) for kind in kinds]
+        raise DataError(
+            f"{' and '.join(named)}: each makes a session of its own kind.",
+            culprits=named,
+            next_step="A whole cell's own file says which robots warm up, and what is swept."
+            if "cell" in kinds
+            else "Give one of them, and make the others into folders of their own.",
+        )
+    kind = kinds[0] if kinds else ""
+    takes = _TAKES[kind]
+    if kind == "cell" and asked.torques:
+        takes = takes | {"currents"}
+    for wrong in sorted(asked.given - takes - {"folder", kind}):
+        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
+        raise DataError(
+            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
+            culprits=[_option(wrong)],
+            next_step="Leave it out."
+            if kind != "cell"
+            else "Leave it out; what a whole cell is made of is said by a file of your own.",
+        )
     given, folder = asked.given, asked.folder
     options = CellOptions(
         robot=asked.robot,
@@ -148,35 +172,6 @@ def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
             lambda share: progress("render", round(share * count), count),
             images=asked.images and not (asked.sweep or asked.warm_up),
             touched=touch(cell) if asked.touches else None,
-        )
-
-
-def _check_given(asked: SimulateOptions) -> None:
-    """Refuses options that do not apply to the kind of session."""
-    kinds = [take for take in _TAKES if take and getattr(asked, take)]
-    if "cell" in kinds:
-        kinds = [kind for kind in kinds if kind not in _WITH_CELL]
-    if len(kinds) > 1:
-        named = [_option(kind) for kind in kinds]
-        raise DataError(
-            f"{' and '.join(named)}: each makes a session of its own kind.",
-            culprits=named,
-            next_step="A whole cell's own file says which robots warm up, and what is swept."
-            if "cell" in kinds
-            else "Give one of them, and make the others into folders of their own.",
-        )
-    kind = kinds[0] if kinds else ""
-    takes = _TAKES[kind]
-    if kind == "cell" and asked.torques:
-        takes = takes | {"currents"}
-    for wrong in sorted(asked.given - takes - {"folder", kind}):
-        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
-        raise DataError(
-            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
-            culprits=[_option(wrong)],
-            next_step="Leave it out."
-            if kind != "cell"
-            else "Leave it out; what a whole cell is made of is said by a file of your own.",
         )
 
 

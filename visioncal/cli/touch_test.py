@@ -89,7 +89,12 @@ def touch_test_command(options: TouchTestOptions) -> None:
         board = next(iter(loaded.boards.values()))
         gaps = _drive(options, result, board, located, targets)
     elif sys.stdin.isatty() and not options.as_json:
-        gaps = _ask_gaps(points, targets)
+        console = messages()
+        console.print(_FORM)
+        gaps = []
+        for point, target in zip(points, targets, strict=True):
+            _report_point(point, target, console)
+            gaps.append(_gap())
     else:
         _report(points, targets, as_json=options.as_json)
         return
@@ -161,17 +166,6 @@ def _report_point(point: TouchPoint, target: dict[str, Any], console: Console) -
         place, turn = target[name][:3], target[name][3:]
         numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
         console.print(f"  {name}: {', '.join(numbers)}")
-
-
-def _ask_gaps(points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]]) -> list[float]:
-    """Asks for the gaps, one point after the other."""
-    console = messages()
-    console.print(_FORM)
-    gaps = []
-    for point, target in zip(points, targets, strict=True):
-        _report_point(point, target, console)
-        gaps.append(_gap())
-    return gaps
 
 
 def _drive(

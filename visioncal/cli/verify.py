@@ -2,14 +2,11 @@
 
 import json
 import sys
-from collections.abc import Sequence
 
 import typer
 from rich.markup import escape
 
 from visioncal.calibration.verification import (
-    Check,
-    Outcome,
     facts_of,
     load_policy,
     outcomes,
@@ -22,7 +19,6 @@ from visioncal.cli.parsing import named_result
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.summary import print_steps
-from visioncal.core.verdict import Verdict
 from visioncal.interchange.outputs import Written, refuse_calibration, write_check
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
@@ -61,23 +57,18 @@ def verify_command(options: VerifyOptions) -> None:
     if options.as_json:
         typer.echo(document, nl=False)
     else:
-        _report(check, fired, verdict)
+        console = answers()
+        word, colour = ("pass", "green") if check.passed else ("fail", "red")
+        name = escape(check.predicted.observed.session.name)
+        reference = escape(f"{check.calibration.session_name}, {check.calibration.created}")
+        console.print(f"[bold {colour}]{word}[/]  {name} against {reference}")
+        for line in (*verdict.top, *verdict.rest, *check.predicted.warnings):
+            console.print(f"  - {escape(line)}")
+        print_steps(verdict.next_steps)
+        for view, reason in sorted(check.predicted.observed.reasons.items()):
+            console.print(f"  view {view} was not used: {escape(reason)}")
+        for state, begin in _TRIGGERED.items():
+            words = "; ".join(trigger.words for trigger in fired if trigger.state == state)
+            if words:
+                console.print(f"{begin}: {escape(words)}")
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)
-
-
-def _report(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> None:
-
-    console = answers()
-    word, colour = ("pass", "green") if check.passed else ("fail", "red")
-    name = escape(check.predicted.observed.session.name)
-    against = escape(f"{check.calibration.session_name}, {check.calibration.created}")
-    console.print(f"[bold {colour}]{word}[/]  {name} against {against}")
-    for line in (*verdict.top, *verdict.rest, *check.predicted.warnings):
-        console.print(f"  - {escape(line)}")
-    print_steps(verdict.next_steps)
-    for view, reason in sorted(check.predicted.observed.reasons.items()):
-        console.print(f"  view {view} was not used: {escape(reason)}")
-    for state, begin in _TRIGGERED.items():
-        words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
-        if words:
-            console.print(f"{begin}: {escape(words)}")

@@ -260,12 +260,6 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
     except ValueError as error:
         # Integers of thousands of digits, and impossible dates.
         raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
-    _check_toml(document, label)
-    return document
-
-
-def _check_toml(document: dict[str, Any], label: str) -> None:
-    """Checks depth and numbers without recursion; errors name the field."""
     pending: list[tuple[str, object, int]] = [("", document, 1)]
     while pending:
         path, value, depth = pending.pop()
@@ -282,6 +276,7 @@ def _check_toml(document: dict[str, Any], label: str) -> None:
                 f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
                 culprits=[f"{label}: {path}"],
             )
+    return document
 
 
 def _too_deep(where: str) -> DataError:

@@ -1,16 +1,39 @@
-"""Process-wide settings that several threads change temporarily.
+"""Process-wide settings that several threads change temporarily, and handling of signals.
 
 The first thread that needs a setting makes it and the last one undoes it; if each restored the
 value it found, it could restore another thread's.
 """
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache, wraps
 from threading import Lock, RLock
+from types import FrameType
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+
+@contextmanager
+def signals_as_interrupts(*names: str) -> Iterator[None]:
+    """Runs a block in which signals raise KeyboardInterrupt, like Ctrl-C.
+
+    By default SIGTERM, and SIGHUP of a closed terminal; signals that the system lacks are ignored.
+    """
+    present = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [getattr(signal, name) for name in present]
+    previous = {number: signal.signal(number, _interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - signal's interface
+    raise KeyboardInterrupt
+
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")

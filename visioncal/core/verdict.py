@@ -266,7 +266,9 @@ def with_paths(
 ) -> str:
     """Fills the paths of a run into a command; see `Verdict.with_paths`."""
     folder, result = Path(session), Path(out or "out")
-    fixed = _free_name(f"{folder.with_suffix('') if folder.is_file() else folder}-fixed")
+    name = f"{folder.with_suffix('') if folder.is_file() else folder}-fixed"
+    names = (name, *(f"{name}-{index}" for index in range(2, 100)))
+    fixed = next((word for word in names if not Path(word).exists()), name)
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
@@ -291,9 +293,3 @@ def _without_options(typed: Sequence[str], options: Sequence[str]) -> Iterator[s
             yield word
         elif has_value[name] and not value:
             next(words, None)
-
-
-def _free_name(name: str) -> str:
-    """A name that does not exist yet."""
-    names = (name, *(f"{name}-{index}" for index in range(2, 100)))
-    return next((word for word in names if not Path(word).exists()), name)

@@ -1,4 +1,4 @@
-"""Camera, robot, target and instrument of each row, and the robots' and boards' files.
+"""Camera, robot, target and instrument of each row, and their files; a table of known instruments.
 
 Boards and robots are shared between sessions, so files that session.toml names may be outside of
 the session's folder. Since a session may be untrusted, a warning names each such file, and its
@@ -7,19 +7,103 @@ errors are reported without its content.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence, is_inside
+from visioncal.core.files import DocumentTable, absence, is_inside, parse_toml, read_text
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.core.types import Target
+from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session.columns import POSITION
 from visioncal.session.document import KINDS, Declaration, Kind, RobotTable
 from visioncal.session.table import View
 from visioncal.vision.targets import misspelt_keys, read_target, target_from_document
+
+_FILE = Path(__file__).with_name("instruments.toml")
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """Noise of an instrument's readings, as standard deviations."""
+
+    words: str  # Description of the instrument.
+    sigma_m: float  # Of each coordinate of a position, at the instrument's origin [m].
+    sigma_per_m: float = 0.0  # Its growth with the distance from there [m/m].
+    # Of a probe's rotation about each axis; None where unknown [rad].
+    sigma_rad: float | None = None
+
+    def sigmas_m(self, places: FloatArray) -> FloatArray:
+        """Standard deviations (m,) of each coordinate of (m, 3) measured positions [m]."""
+        distance = np.linalg.norm(places, axis=-1)
+        return np.asarray(self.sigma_m + self.sigma_per_m * distance)
+
+
+def instrument_names() -> tuple[str, ...]:
+    """Names of the instruments in the table."""
+    return tuple(sorted(_table()))
+
+
+def known_instrument(name: str) -> Instrument | None:
+    """Finds an instrument in the table; None where it is not there.
+
+    Raises:
+        DataError: It measures only lengths or angles, no positions.
+    """
+    row = _table().get(name.strip().lower())
+    if row is None:
+        return None
+    words = row.text("words")
+    if "measures" in row.content:
+        raise DataError(
+            f"instrument {name!r}: the {words} measures {row.text('measures')}; readings of "
+            "places (meas_x_m, meas_y_m, meas_z_m) are needed.",
+            culprits=["session.toml: instrument.name"],
+        )
+    return Instrument(
+        words,
+        row.number("sigma_m"),
+        row.number("sigma_per_m", 0.0),
+        row.number("sigma_rad") if "sigma_rad" in row.content else None,
+    )
+
+
+def stated_instrument(
+    name: str, sigma_m: float | None, sigma_per_m: float | None, sigma_rad: float | None
+) -> Instrument:
+    """Instrument of a session: stated values, with those of the table for the others.
+
+    Raises:
+        DataError: The name is unknown and no noise is stated.
+    """
+    in_table = known_instrument(name)
+    if sigma_m is None and in_table is None:
+        raise DataError(
+            f"session.toml: the instrument {name!r} is not in the table of known ones, and its "
+            "noise is not stated.",
+            culprits=["session.toml: instrument"],
+            next_step=f"{did_you_mean(name, instrument_names())} State sigma_m (and sigma_per_m) "
+            f"in [instrument], or name one of {', '.join(instrument_names())}.".strip(),
+        )
+    base = Instrument(name, 0.0) if in_table is None else in_table
+    return Instrument(
+        base.words,
+        base.sigma_m if sigma_m is None else sigma_m,
+        base.sigma_per_m if sigma_per_m is None else sigma_per_m,
+        base.sigma_rad if sigma_rad is None else sigma_rad,
+    )
+
+
+@cache
+def _table() -> Mapping[str, DocumentTable]:
+    rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
+    return {row["name"]: DocumentTable(row, f"{_FILE.name}, {row['name']}") for row in rows}
+
 
 _Test: TypeAlias = Callable[[View], bool]
 
@@ -75,7 +159,16 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         named = {view.number: view.text.get(kind, "").strip() for view in views}
         declared = list(declaration.named(kind))
         if declared in ([], [""]):
-            _check_one_name(kind, bool(declared), sorted({*named.values()} - {""}))
+            names = sorted({*named.values()} - {""})
+            if len(names) > 1:
+                tables = ", ".join(f"[{kind}s.{name}]" for name in names)
+                of_target = ", each with target = a name or a path" if kind == "target" else ""
+                raise DataError(
+                    f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
+                    f"{f'has the one {kind} for all' if bool(declared) else 'declares none'}.",
+                    culprits=[f"session.toml: {kind}s"],
+                    next_step=f"Declare {tables}{of_target}.",
+                )
             continue
         known = ", ".join(declared)
         unknown = {view: name for view, name in named.items() if name and name not in declared}
@@ -98,19 +191,6 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
                 culprits=[f"views.csv: view {name}" for name in without],
                 next_step=f"Name the {kind} in each of these rows{hint}.",
             )
-
-
-def _check_one_name(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
-    """Checks that rows have only one name for a kind that is not in a plural table."""
-    if len(names) > 1:
-        tables = ", ".join(f"[{kind}s.{name}]" for name in names)
-        of_target = ", each with target = a name or a path" if kind == "target" else ""
-        raise DataError(
-            f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
-            f"{f'has the one {kind} for all' if is_declared else 'declares none'}.",
-            culprits=[f"session.toml: {kind}s"],
-            next_step=f"Declare {tables}{of_target}.",
-        )
 
 
 def kind_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:

@@ -17,8 +17,14 @@ from visioncal.core.types import FloatArray, IntArray, Rejection
 from visioncal.estimation.positions import Mounting, PositionReadings, find_mounting, residuals
 from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
-from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
-from visioncal.session.kinds import is_camera_observation, is_instrument_reading, name_of
+from visioncal.session.kinds import (
+    Instrument,
+    instrument_names,
+    is_camera_observation,
+    is_instrument_reading,
+    name_of,
+    stated_instrument,
+)
 
 _V = TypeVar("_V")
 

@@ -1,7 +1,7 @@
 """Safe readers of foreign files: no pickles, constructors or entities, and bounded sizes.
 
 Every reader raises DataErrors that name the file, the line if any, the value found and the value
-needed. Those of numpy's files, OpenCV, XML and YAML are in modules of their own, which import more.
+needed. Those of OpenCV, XML and YAML are in a module of its own, which imports more.
 """
 
 from visioncal.core.documents.jsons import parse_stored, read_json

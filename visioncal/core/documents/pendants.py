@@ -101,10 +101,31 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
         )
     name = _form(written, form, where)
     chosen = POSE_FORMS[name]
-    reading = _reading(chosen, written)
+    length = written.length if written.length in UNITS_M else chosen.unit
+    rotation = chosen.rotation
+    if written.angle == "deg" and rotation == "rotation-vector":
+        rotation = "rotation-vector-deg"
+    if written.angle == "rad" and rotation.endswith("-deg"):
+        rotation = f"{rotation.removesuffix('-deg')}-rad"
+    reading = Reading(rotation, length or "m")
     values = np.array([written.numbers])
     poses = PoseNumbers(values[:, :3], values[:, 3:], reading, (where,)).poses()
-    _check_size(values[0], reading, where)
+    numbers = values[0]
+    distance_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
+    if distance_m > _FAR_M:
+        raise DataError(
+            f"{where}: read in {reading.unit}, it is {distance_m:.4g} m from the base.",
+            culprits=[where],
+            next_step="Write the unit behind the numbers, as X 400 mm, or name another form.",
+        )
+    is_radian = reading.rotation == "rotation-vector" or reading.rotation.endswith("-rad")
+    angle = float(np.abs(numbers[3:]).max())
+    if is_radian and angle > _TURNED_RAD:
+        raise DataError(
+            f"{where}: an angle of {angle:.4g} is too large for radians.",
+            culprits=[where],
+            next_step="Write the unit behind the numbers, as RX 12.5 deg, or name another form.",
+        )
     return PendantPose(poses[0], chosen, reading)
 
 
@@ -177,33 +198,3 @@ def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
             next_step=f"The forms are {', '.join(POSE_FORMS)}.",
         )
     return stated
-
-
-def _reading(form: PoseForm, written: _PendantNumbers) -> Reading:
-    """The form's reading, with units that the line itself states."""
-    length = written.length if written.length in UNITS_M else form.unit
-    rotation = form.rotation
-    if written.angle == "deg" and rotation == "rotation-vector":
-        rotation = "rotation-vector-deg"
-    if written.angle == "rad" and rotation.endswith("-deg"):
-        rotation = f"{rotation.removesuffix('-deg')}-rad"
-    return Reading(rotation, length or "m")
-
-
-def _check_size(numbers: FloatArray, reading: Reading, where: str) -> None:
-    """Refuses values that are implausible in their assumed unit."""
-    distance_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
-    if distance_m > _FAR_M:
-        raise DataError(
-            f"{where}: read in {reading.unit}, it is {distance_m:.4g} m from the base.",
-            culprits=[where],
-            next_step="Write the unit behind the numbers, as X 400 mm, or name another form.",
-        )
-    is_radian = reading.rotation == "rotation-vector" or reading.rotation.endswith("-rad")
-    angle = float(np.abs(numbers[3:]).max())
-    if is_radian and angle > _TURNED_RAD:
-        raise DataError(
-            f"{where}: an angle of {angle:.4g} is too large for radians.",
-            culprits=[where],
-            next_step="Write the unit behind the numbers, as RX 12.5 deg, or name another form.",
-        )

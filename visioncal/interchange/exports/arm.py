@@ -3,7 +3,6 @@
 What a format cannot hold of the arm is said in its comments and warnings.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,10 +15,8 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import log
 from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.estimation.workspace import postures
-from visioncal.interchange.exports.content import Format, Selection
-from visioncal.interchange.exports.sources import Source
+from visioncal.interchange.exports.content import Format, Selection, Source
 from visioncal.results import Calibration
-from visioncal.results.arm import JointRange
 from visioncal.robot import DHTable, Robot, parallel_axes, table_from_document, table_of
 from visioncal.robot.writing import (
     corrected_tip,
@@ -212,37 +209,28 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     links = None
     if form.holds != "all" and (loses or _sag_mm(source)):
         robot = arm.robot if corrected else without_functions(arm.robot)
-        links = _fit_constant_links(source, robot, arm.measured)
+        # They are fitted over its measured ranges, where these are known, and the workspace.
+        samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
+        if arm.measured:
+            lower, upper = np.array([(joint.lower, joint.upper) for joint in arm.measured]).T
+            rng = np.random.default_rng(0)
+            samples = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *samples]
+        # Half of the postures are fitted, the other half measures the remaining error.
+        q = np.concatenate([angles[::2] for angles, _ in samples])
+        weights = np.concatenate(
+            [np.full(len(angles[::2]), weight / len(angles)) for angles, weight in samples]
+        )
+        fitted = fit_links(robot, q, source.standing(q), weights)
+        errors = []
+        for angles, _ in samples:
+            poses = source.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2])
+            away_mm = 1e3 * np.linalg.norm(poses[:, :3, 3], axis=1)
+            rms_mm, most_mm = float(np.sqrt(np.mean(away_mm**2))), float(away_mm.max())
+            errors.append(f"{figure(rms_mm)} mm rms, {figure(most_mm)} mm at the most")
+        places = ["where the arm was measured", "over the workspace"][-len(errors) :]
+        links = fitted, ", ".join(map(" ".join, zip(errors, places, strict=True)))
     convention, known_hash = selection.convention, selection.calibration_hash
     return ArmContent(source, nominal, arm.robot, convention, known_hash, links, corrected)
-
-
-def _fit_constant_links(
-    calibration: Calibration, robot: Robot, measured: Sequence[JointRange]
-) -> tuple[Robot, str]:
-    """Fits constant links to the calibrated arm; also says what error remains.
-
-    They are fitted over its measured ranges, where these are known, and the workspace.
-    """
-    samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
-    if measured:
-        lower, upper = np.array([(joint.lower, joint.upper) for joint in measured]).T
-        rng = np.random.default_rng(0)
-        samples = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *samples]
-    # Half of the postures are fitted, the other half measures the remaining error.
-    q = np.concatenate([angles[::2] for angles, _ in samples])
-    weights = np.concatenate(
-        [np.full(len(angles[::2]), weight / len(angles)) for angles, weight in samples]
-    )
-    fitted = fit_links(robot, q, calibration.standing(q), weights)
-    errors = []
-    for angles, _ in samples:
-        poses = calibration.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2])
-        away_mm = 1e3 * np.linalg.norm(poses[:, :3, 3], axis=1)
-        rms_mm, most_mm = float(np.sqrt(np.mean(away_mm**2))), float(away_mm.max())
-        errors.append(f"{figure(rms_mm)} mm rms, {figure(most_mm)} mm at the most")
-    places = ["where the arm was measured", "over the workspace"][-len(errors) :]
-    return fitted, ", ".join(map(" ".join, zip(errors, places, strict=True)))
 
 
 def _sag_mm(calibration: Calibration) -> float:

@@ -1,20 +1,318 @@
-"""Selection of what to export, formats, and the content that they write."""
+"""Transforms that can be exported, their selection, formats, and the content that they write."""
 
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
+import cv2
+import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
-from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray, Mount
-from visioncal.results import CameraResult, Edge, Verdict
+from visioncal.core.number_format import did_you_mean, figure
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import Camera, FloatArray, Mount
+from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
-from visioncal.results.lens import RefittedLens, fit_coefficients
+from visioncal.results.lens import RefittedLens, fit_coefficients, image_grid, to_ray
+from visioncal.vision.camera import normalise
+
+# Coefficients of OpenCV's largest model, whose last two tilt the sensor.
+_MOST_COEFFICIENTS = 14
+# Share of the image about its centre in which both lenses are compared: at the rim neither is known
+# well where no view looked.
+_INNER = 0.5
+# Largest error of an inverted distortion [px]: far less than any lens is known to.
+_SAME_PX = 1e-3
+# Iterations of OpenCV's fixed point, and where it ends [plane at unit depth].
+_INVERSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+
+
+Source: TypeAlias = Calibration | FrameFile
+Kind: TypeAlias = Literal["tool", "fixture"]
+
+# Name of the camera's or the instrument's transform by its mount.
+HAND_EYE: Mapping[Mount, str] = {
+    "eye-in-hand": "flange_from_cam",
+    "eye-to-hand": "base_from_cam",
+    "instrument": "base_from_instrument",
+}
+# Parent frames by our names: flange, flange_2, ...
+_PARENTS: Mapping[Kind, re.Pattern[str]] = {
+    "tool": re.compile(r"flange(_\w+)?", re.ASCII),
+    "fixture": re.compile(r"base(_\w+)?", re.ASCII),
+}
+WORST_FIRST = ("bad", "check", "good")
+_COMMANDS: Mapping[Kind, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """One transform of a source."""
+
+    edge: Edge  # `parent_from_child`.
+    origin: str
+    verdict: Verdict
+    oriented: bool = True  # Whether its rotation was measured.
+    rotation_of: str = ""  # The frame whose rotation was copied otherwise; empty for its parent's.
+    conditions: tuple[Condition, ...] = ()  # Under which it holds.
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """All transforms of a source, and its camera."""
+
+    by_name: Mapping[str, Placement]
+    frames: tuple[str, ...]  # Names of the tools' and fixtures' transforms.
+    words: str  # The kind of source, for messages.
+    mount: Mount | None  # How the camera is mounted; None where there is no calibration.
+    lens: CameraResult | None
+    # The result of a cell, which relates any two of its frames; None for other sources.
+    cell: Calibration | None = None
+    lenses: Mapping[str, CameraResult] = field(default_factory=dict)  # Its cameras by frame.
+
+    def find(self, name: str) -> tuple[Placement, tuple[str, str]]:
+        """Finds a transform by its name, with our names of its parent and child.
+
+        Raises:
+            DataError: There is none, or it depends on a robot's pose.
+        """
+        ends = ends_of(name)
+        if name in self.by_name and all(ends):
+            return self.by_name[name], ends
+        if self.cell is not None and all(ends):
+            return _between(self.cell, *ends), ends
+        inverse = f"{ends[1]}_from_{ends[0]}"
+        hint = did_you_mean(name, self.by_name)
+        if inverse in self.by_name:
+            hint = f"Ask for --edge {inverse} --inverse."
+        raise DataError(
+            f"There is no transform {name!r}; {self.words} has {', '.join(self.by_name)}.",
+            culprits=[name],
+            next_step=hint,
+        )
+
+    def default(self) -> str:
+        """Name of the default transform.
+
+        Raises:
+            DataError: The source is a file of several frames, or a cell.
+        """
+        if self.mount is not None:
+            return HAND_EYE[self.mount]
+        if len(self.frames) == 1 and self.cell is None:
+            return self.frames[0]
+        if self.cell is not None:
+            frames = list(self.cell.tree.parents)
+            # Transforms of the cell itself never depend on a robot's pose.
+            example = next((name for name in self.by_name if "_from_cam" in name), "")
+            example = example or list(self.by_name)[-1]
+            raise DataError(
+                f"{self.words.capitalize()} has {', '.join(frames)}: which is meant is not said.",
+                culprits=["--edge"],
+                next_step=f"Name two of them, as --edge {example}; or all: --edge all.",
+            )
+        raise DataError(
+            f"{self.words.capitalize()} has {', '.join(self.frames) or 'no frames'}: which one is "
+            "meant is not said.",
+            culprits=self.frames,
+            next_step="Name one with --edge." if self.frames else "",
+        )
+
+    def only(self, kind: Kind) -> str:
+        """Name of the only tool or fixture.
+
+        Raises:
+            DataError: There is none, or there are several.
+        """
+        names = [frame for frame in self.frames if is_kind(frame, kind)]
+        if len(names) == 1:
+            return names[0]
+        if names:
+            raise DataError(
+                f"{self.words.capitalize()} has {len(names)} {kind}s: {', '.join(names)}.",
+                culprits=names,
+                next_step="Name one with --edge.",
+            )
+        others = [name for name in self.by_name if is_kind(name, kind)]
+        choose = f", or name another transform: --edge {others[0]}" if others else ""
+        raise DataError(
+            f"{self.words.capitalize()} has no {kind}; it has {', '.join(self.by_name)}.",
+            next_step=f"Find one with {_COMMANDS[kind]}{choose}.",
+        )
+
+
+def ends_of(name: str) -> tuple[str, str]:
+    """Names of a transform's parent and child; empty where the name has none."""
+    parent, _, child = name.partition("_from_")
+    return parent, child
+
+
+def is_kind(name: str, kind: Kind) -> bool:
+    """Whether a transform is a pose on the flange, or in the base."""
+    return _PARENTS[kind].fullmatch(ends_of(name)[0]) is not None
+
+
+def placements(source: Source, camera: str | None = None) -> Placements:
+    """Lists the transforms of a source; `camera` selects one of a cell, by name or frame.
+
+    Raises:
+        DataError: There is no such camera, or the source is no cell.
+    """
+    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
+    cell = source.cell if isinstance(source, Calibration) else None
+    if cell is None and camera is not None:
+        raise DataError(
+            "Which camera is meant is said of a whole cell alone, and this is none.",
+            culprits=["--camera"],
+            next_step="Leave it out.",
+        )
+    if isinstance(source, FrameFile):
+        return Placements(frames, tuple(frames), "this file of frames", None, None)
+    if cell is None:
+        origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
+        holds = source.conditions
+        edges = {
+            name: Placement(edge, origin, source.verdict, edge.oriented, conditions=holds)
+            for name, edge in source.edges.items()
+        }
+        by_name = edges | {name: replace(one, conditions=holds) for name, one in frames.items()}
+        words = "this calibration"
+        return Placements(by_name, tuple(frames), words, source.mount, source.camera)
+    # The reference and the cell are one frame; two frames would split the tree.
+    tree, lenses = source.tree, cell.lenses
+    edges = {
+        f"{parent}_from_{name}": _in_cell(source, tree.edge_of(name))
+        for name, parent in tree.parents.items()
+        if name not in tree.flanges
+    }
+    lens = next(iter(lenses.values())) if len(lenses) == 1 else None
+    if camera is not None:
+        frame = next((name for name in (camera, f"cam_{camera}") if name in lenses), None)
+        if frame is None:
+            raise DataError(
+                f"There is no camera {camera!r}; this cell has {', '.join(lenses) or 'none'}.",
+                culprits=["--camera"],
+                next_step=did_you_mean(camera, list(lenses)),
+            )
+        lens = lenses[frame]
+    return Placements(edges | frames, tuple(frames), "this cell", None, lens, source, lenses)
+
+
+def _in_cell(source: Calibration, edge: Edge) -> Placement:
+    origin = f"aligned by visioncal from {source.session_name!r}, {source.created}"
+    return Placement(edge, origin, source.verdict, conditions=source.conditions)
+
+
+def _between(source: Calibration, first: str, second: str) -> Placement:
+    """Relates two frames of a cell, with the worst verdict of the cell and their placements."""
+    tree = source.tree
+    placement = _in_cell(source, tree.between(first, second))
+    for parent, frame in filter(None, (tree.placement(first), tree.placement(second))):
+        if WORST_FIRST.index(frame.verdict.status) < WORST_FIRST.index(placement.verdict.status):
+            placement = replace(placement, verdict=frame.verdict)
+        origin = f"{placement.origin}; {_of_frame(frame).origin}"
+        placement = replace(placement, origin=origin)
+        if not frame.oriented:
+            placement = replace(placement, oriented=False, rotation_of=parent)
+    return placement
+
+
+def _of_frame(frame: Frame) -> Placement:
+    origin = f"calibrated by visioncal from {frame.source!r}, {frame.created}: {frame.method}"
+    return Placement(frame.edge, origin, frame.verdict, frame.oriented)
+
+
+def with_lens(source: Source, available: Placements, name: str, path: Path) -> Placements:
+    """The transforms, with the camera's for another lens model of the same camera.
+
+    The ray of the image's centre is the same for any lens model (`Calibration.ray_frame`), and so
+    is, for the roll about it, what the rays around it point at.
+
+    Args:
+        source: The calibration.
+        available: Its transforms.
+        name: The one that is exported.
+        path: The other lens, in any form of `read_intrinsics`, with up to 14 coefficients.
+
+    Raises:
+        DataError: The transform is not that of the only camera, or the lens is not of that camera.
+    """
+    frame = source.ray_frame if isinstance(source, Calibration) and source.cell is None else None
+    lens, mount = available.lens, available.mount
+    if frame is None or lens is None or mount is None or name != HAND_EYE[mount]:
+        raise DataError(
+            "--lens is of the transform of one calibrated camera on its robot, or in its base, and "
+            f"{name} of {available.words} is none.",
+            culprits=["--lens"],
+            next_step="Leave it out; of a whole cell, name --robot, --camera and --target.",
+        )
+    stated, _ = read_intrinsics(path, _MOST_COEFFICIENTS)
+    resolution = tuple(stated.get("resolution", lens.camera.resolution))
+    if resolution != lens.camera.resolution:
+        raise DataError(
+            f"{path} is of images of {resolution[0]} x {resolution[1]} px; the calibrated camera "
+            "has {} x {} px.".format(*lens.camera.resolution),
+            culprits=["--lens"],
+            next_step="Name the lens of the same camera, with the same binning and region.",
+        )
+    px = np.concatenate([frame.px[None], image_grid(lens.camera, _INNER)])
+    own, other = normalise(lens.camera, lens.in_model(px)), _rays(stated, lens.camera, px)
+    if not np.isfinite([own, other]).all():
+        raise DataError(
+            f"{path}: its distortion cannot be inverted in the middle of the image.",
+            culprits=["--lens"],
+            next_step="Name the lens of this camera.",
+        )
+    turns = [np.eye(4), np.eye(4)]
+    around = []
+    for turn, rays in zip(turns, (own, other), strict=True):
+        turn[:3, :3] = to_ray(rays[0])
+        seen = np.column_stack([rays, np.ones(len(rays))]) @ turn[:3, :3]
+        around.append((seen[:, 0] + 1j * seen[:, 1]) / seen[:, 2])
+    roll = np.eye(4)
+    angle = np.angle(np.vdot(around[1], around[0]))
+    roll[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+    remaining = np.abs(around[0] - np.exp(1j * angle) * around[1])
+    remaining_px = lens.camera.matrix[0] * np.sqrt(np.mean(remaining**2) / 2.0)
+    back = roll @ invert(turns[1])
+    carried = adjoint(invert(back))
+    edge = Edge(
+        frame.transform.matrix @ back, np.asarray(carried @ frame.transform.covariance @ carried.T)
+    )
+    placement = available.by_name[name]
+    own_lens = Condition(
+        "own-lens",
+        f"The transform is for the lens of {path.name}, which differs from the calibration's own "
+        f"by {figure(remaining_px)} px rms in the inner half of the image.",
+        "Use it with that lens only.",
+    )
+    others = (condition for condition in placement.conditions if condition.kind != "own-lens")
+    placed = replace(placement, edge=edge, conditions=(own_lens, *others))
+    # The calibration's own lens does not go with it.
+    return replace(available, by_name={**available.by_name, name: placed}, lens=None)
+
+
+def _rays(stated: dict[str, object], camera: Camera, px: FloatArray) -> FloatArray:
+    """(n, 2) rays of a stated lens, at unit depth; NaN where it has none."""
+    matrix, distortion = (np.array(stated[name], dtype=float) for name in ("matrix", "distortion"))
+    if stated["model"] == "fisheye":
+        return normalise(Camera("fisheye", camera.resolution, matrix, distortion), px)
+    fx, fy, cx, cy = matrix
+    square = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    plane = np.eye(3)
+    rays = cv2.undistortPointsIter(px[:, None], square, distortion, plane, plane, _INVERSE)[:, 0]
+    points = np.column_stack([rays, np.ones(len(rays))])
+    shown = cv2.projectPoints(points, np.zeros(3), np.zeros(3), square, distortion)[0][:, 0]
+    found = np.linalg.norm(shown - px, axis=1) < _SAME_PX
+    return np.where(found[:, None], rays, np.nan)
+
 
 _OF_LENS = "it goes with the lens of that calibration: for other intrinsics, export it with --lens"
 # Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the

@@ -13,21 +13,23 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified, judge
 from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
-from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
-from visioncal.interchange.exports.files import FILES
-from visioncal.interchange.exports.other_lens import with_lens
-from visioncal.interchange.exports.robots import ROBOTS
-from visioncal.interchange.exports.ros import ROS_FORMATS
-from visioncal.interchange.exports.sources import (
+from visioncal.interchange.exports.content import (
     HAND_EYE,
     WORST_FIRST,
+    Content,
+    ExportFormat,
     Kind,
+    OfTransforms,
     Placements,
+    Selection,
     Source,
     ends_of,
     is_kind,
     placements,
+    with_lens,
 )
+from visioncal.interchange.exports.robots import ROBOTS
+from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
 from visioncal.results import Calibration, Edge, Verdict
 from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 
@@ -96,7 +98,24 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         omitted = tuple(f"{name}." for name in arm.omitted)
         return Document(form.write(arm), arm.calibration.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
-        contents = _select_all(source, selection, form)
+        available = placements(source, selection.camera)
+        _check_takes(form, selection)
+        why = ""
+        if form.write_all is None:
+            why = f"{form.name} holds one transform"
+        elif selection.inverse or selection.parent is not None or selection.child is not None:
+            why = "--inverse, --parent and --child are of one transform"
+        elif selection.lens is not None:
+            why = "--lens is of one camera's transform"
+        elif available.cell is None:
+            why = f"{available.words} is of no whole cell"
+        if why:
+            raise DataError(
+                f"--edge all: {why}.",
+                culprits=["--edge"],
+                next_step=f"Name one of {', '.join(available.by_name)}.",
+            )
+        contents = tuple(_content(form, selection, available, name) for name in available.by_name)
         text = "" if form.write_all is None else form.write_all(contents)
     else:
         contents = (select(source, selection, form),)
@@ -154,28 +173,6 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     if selection.lens is not None:
         available = with_lens(source, available, name, selection.lens)
     return _content(form, selection, available, name)
-
-
-def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
-    """Selects all transforms of an aligned cell, each frame in its parent."""
-    available = placements(source, selection.camera)
-    _check_takes(form, selection)
-    why = ""
-    if form.write_all is None:
-        why = f"{form.name} holds one transform"
-    elif selection.inverse or selection.parent is not None or selection.child is not None:
-        why = "--inverse, --parent and --child are of one transform"
-    elif selection.lens is not None:
-        why = "--lens is of one camera's transform"
-    elif available.cell is None:
-        why = f"{available.words} is of no whole cell"
-    if why:
-        raise DataError(
-            f"--edge all: {why}.",
-            culprits=["--edge"],
-            next_step=f"Name one of {', '.join(available.by_name)}.",
-        )
-    return tuple(_content(form, selection, available, name) for name in available.by_name)
 
 
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:

@@ -15,14 +15,17 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
-from visioncal.interchange.formats.boards import read_target_description, target_name
 from visioncal.interchange.formats.corner_lists import with_corners
 from visioncal.interchange.formats.foreign import (
     ForeignRecording,
     ImportOptions,
     rows_of,
 )
-from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.interchange.formats.intrinsics import (
+    read_intrinsics,
+    read_target_description,
+    target_name,
+)
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
 from visioncal.session import columns as session_columns

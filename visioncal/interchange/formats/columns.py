@@ -19,11 +19,6 @@ from visioncal.estimation.clock_correlation import (
     turning_matches,
 )
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
-from visioncal.interchange.formats.fields import (
-    Fields,
-    stamp_name,
-    unnamed_columns,
-)
 from visioncal.interchange.formats.file_search import (
     files_in,
     images_beside,
@@ -38,7 +33,13 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
-from visioncal.interchange.formats.reading import ENDINGS, read_fields
+from visioncal.interchange.formats.reading import (
+    ENDINGS,
+    Fields,
+    read_fields,
+    stamp_name,
+    unnamed_columns,
+)
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 # Limits of the overlap of two streams [s]: a shorter one determines no offset, a longer one is no

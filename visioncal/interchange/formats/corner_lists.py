@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.documents import is_number, read_table
-from visioncal.core.documents.arrays import Array, read_npz
+from visioncal.core.documents.jsons import Array, read_npz
 from visioncal.core.documents.structured import read_opencv
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError

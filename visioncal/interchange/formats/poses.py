@@ -12,8 +12,8 @@ from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, 
 from visioncal.core.documents import as_numbers
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.foreign import PoseImportOptions
+from visioncal.interchange.formats.reading import Fields
 from visioncal.session.columns import SELECTORS, joint_columns
 
 # An ordinal indicator is common for the degree sign, too.

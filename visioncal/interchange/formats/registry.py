@@ -13,7 +13,7 @@ from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.file_search import files_in
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
-from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
+from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KINEMATICS, MOVEIT
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
@@ -22,9 +22,7 @@ from visioncal.interchange.formats.rereading import (
     reread,
     reread_session,
 )
-from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
-from visioncal.interchange.formats.views import VIEWS
-from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
+from visioncal.interchange.formats.views import VIEWS, VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.selecting import check_one_of_each
 

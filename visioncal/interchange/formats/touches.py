@@ -11,10 +11,9 @@ from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
-from visioncal.interchange.formats.fields import Fields, unnamed_columns
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.poses import check_radians, pose_names
-from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.reading import Fields, read_fields, unnamed_columns
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
 

@@ -19,7 +19,7 @@ from threading import Thread
 from rerun.experimental import ViewerClient
 
 from visioncal.core.errors import DriverError
-from visioncal.core.interrupts import signals_as_interrupts
+from visioncal.core.threads import signals_as_interrupts
 from visioncal.present.recording import paths
 
 _HOST = "127.0.0.1"
