@@ -35,7 +35,6 @@ from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats import FOREIGN_FORMATS
 from visioncal.live.capture.options import Keep
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.robot import robot_names
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -45,7 +44,6 @@ from visioncal.simulation import (
     truth_path,
     write_session,
 )
-from visioncal.vision.targets import target_names
 
 # As a user has it.
 DRAWS = True
@@ -177,24 +175,6 @@ def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["calibrate", "nowhere"], "nowhere"),
-        (["calibrate", "nowhere.rrd"], "nowhere.rrd"),
-        (["calibrate"], "Missing argument"),
-        (["calibrate", "x", "--solver", "best"], "best"),
-        (["fly"], "No such command"),
-    ],
-)
-def test_mistakes_at_the_command_line_are_status_2(arguments, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = visioncal(*arguments)
-    assert done.status == 2
-    assert words in done.err
-    assert "Traceback" not in done.err
-
-
 def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
     (tmp_path / "taken").write_text("a file where the folder should be")
     done = visioncal("calibrate", rendered, "-o", tmp_path / "taken")
@@ -243,11 +223,6 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     # What to do next can be typed as it is printed.
     assert "visioncal plan demo/session --add 5" in done.out
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
-
-
-def test_help_and_version_name_the_program():
-    assert "calibrate" in started("--help").out
-    assert visioncal("--version").out.strip().count(".") == 2
 
 
 def test_steps_are_said_in_words_and_counted_by_what_they_go_through():
@@ -340,12 +315,6 @@ def test_names_that_help_lists_are_those_of_the_registries():
     assert tuple(foreign_format.name for foreign_format in FOREIGN_FORMATS) == FOREIGN_NAMES
     assert tuple(export_format.name for export_format in EXPORT_FORMATS) == EXPORT_NAMES
     assert cell_names() == SIMULATED_CELLS
-
-
-def test_boards_and_robots_are_found_from_any_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names = {*target_names(), *robot_names()}
-    assert {"charuco_9x6_30mm", "checkerboard_9x6_25mm", "ur10e", "panda"} <= names
 
 
 def test_arrow_does_not_load_pandas_while_a_command_runs():

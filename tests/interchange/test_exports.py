@@ -22,7 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera
 from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, export
-from visioncal.results import CameraResult, Edge, Verdict
+from visioncal.results import CameraResult, Edge
 from visioncal.vision.camera import matrix_3x3, normalise
 
 NAMES = [export_format.name for export_format in EXPORT_FORMATS]
@@ -388,26 +388,6 @@ def test_the_command_writes_a_file_once(saved, tmp_path):
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
 
 
-def test_a_bad_result_is_exported_by_force_alone_and_with_a_warning(tmp_path):
-    verdict = Verdict.of("bad", "The views disagree by 14 mm.")
-    replace(SAMPLE, verdict=verdict).save(tmp_path / "calibration.json")
-    refused = exporting(tmp_path, "--to", "ur", "-o", tmp_path / "pose.script")
-    assert refused.status == 3
-    assert "14 mm" in refused.err
-    assert "--force" in refused.err
-    assert not (tmp_path / "pose.script").exists()
-    done = exporting(tmp_path, "--to", "ur", "--force")
-    assert done.status == 0
-    assert "14 mm" in done.err
-    assert "# verdict bad; sigma" in done.out
-
-
-def test_the_command_lists_its_formats():
-    done = exporting("--list")
-    assert done.status == 0, done.err
-    assert [line.split()[0] for line in done.out.splitlines()] == NAMES
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -430,15 +410,6 @@ def test_a_dash_is_stdout(saved):
     done = exporting(saved, "--to", "ros", "-o", "-")
     assert (done.status, done.out) == (0, export(SAMPLE, "ros"))
     assert not Path("-").exists()
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_behind_stdout_is_told(saved):
-    with Path("/dev/full").open("w") as full:
-        done = started("export", saved, "--to", "ros", stdout=full)
-    assert done.status == 2
-    assert "stdout cannot be written" in done.err
-    assert "Traceback" not in done.err
 
 
 @pytest.mark.parametrize("name", ["", "session.toml"])

@@ -9,7 +9,6 @@ import pytest
 from support.kept import assert_same, assert_same_evidence
 from support.samples import Sample, made_up, tool_frame, with_frames
 
-import visioncal.present.recording
 from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.options import NeedOptions, WorkOptions
@@ -87,22 +86,6 @@ def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
     for name, edge in first.calibration.edges.items():
         assert np.array_equal(again.edges[name].matrix, edge.matrix)
     assert np.array_equal(again.joint_covariance, first.calibration.joint_covariance)
-
-
-@pytest.mark.parametrize("part", ["write_recording", "replace"])
-def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, part):
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    before = contents(folder)
-    if part == "write_recording":
-        monkeypatch.setattr(visioncal.present.recording, "write_recording", fail)
-    else:
-        monkeypatch.setattr(Path, "replace", fail)
-    with pytest.raises(DataError, match="No space left on device"):
-        rewrite_result(folder, with_frames(sample).calibration)
-    monkeypatch.undo()
-    assert contents(folder) == before
 
 
 def test_a_result_without_its_recording_keeps_the_rest(sample, folder):

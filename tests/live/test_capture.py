@@ -24,13 +24,12 @@ from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import (
     Capture,
     CaptureEvent,
-    ask_and_take,
     checked_path,
     follow,
     missed_stops,
     motion_summary,
 )
-from visioncal.live.capture.take import TakenView, image_motion_px
+from visioncal.live.capture.take import image_motion_px
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
@@ -168,15 +167,6 @@ def test_a_failure_on_the_way_halts_and_leaves_a_session(plan, tmp_path, failure
     assert len(Session.load(tmp_path / "live").views) == 3
 
 
-def test_a_camera_that_is_unplugged_ends_the_recording(plan, tmp_path):
-    arm, camera = fake_devices(plan)
-    camera.unplugged_at = 4
-    with pytest.raises(DriverError, match=r"no picture in 0\.5 s\. 3 views are safe"):
-        recorded(tmp_path / "live", plan, arm, camera)
-    assert arm.halted == 1
-    assert Session.load(tmp_path / "live").views
-
-
 def test_a_board_that_is_lost_once_is_told_and_three_times_ends(plan, tmp_path):
     arm, camera = fake_devices(plan)
     # The first move goes to the first stop.
@@ -289,29 +279,6 @@ def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():
     camera.noise = 2.0
     # Fresh noise of two levels moves the median point by far less than what is taken for still.
     assert image_motion_px(camera.frame().image, camera.frame().image) < 0.05
-
-
-def test_ctrl_c_halts_and_a_resumed_recording_is_complete(plan, tmp_path):
-    arm, camera = fake_devices(plan)
-    state, asked = arm.state, []
-
-    def interrupted():
-        asked.append(1)
-        if len(asked) == 400:
-            raise KeyboardInterrupt
-        return state()
-
-    arm.state = interrupted
-    with pytest.raises(DriverError, match=r"Ctrl-C or a signal; the arm was halted\. . views? "):
-        recorded(tmp_path / "live", plan, arm, camera)
-    assert arm.halted == 1
-    some = len(Session.load(tmp_path / "live").views)
-    assert 0 < some < len(plan.stops)
-    arm, camera = fake_devices(plan)
-    steps = recorded(tmp_path / "live", plan, arm, camera, resume=True)
-    assert len(steps) == len(plan.stops) - some
-    numbers = [view.number for view in Session.load(tmp_path / "live").views]
-    assert sorted(numbers) == [stop.view for stop in plan.stops]
 
 
 def test_a_full_disk_is_told_and_leaves_the_session(plan, tmp_path, monkeypatch):
@@ -442,19 +409,6 @@ class Hand:
         self.arm.start_move(place, speed=2.0, acceleration=4.0)
 
 
-def test_a_guided_arm_gives_a_view_wherever_it_rests(plan, tmp_path):
-    arm, camera = fake_devices(plan)
-    capture = _capture(tmp_path / "live", plan, arm, camera)
-    # It begins at the first of them.
-    places = [stop.q for stop in plan.stops[1:]]
-    capture.watchers = (Hand(arm, places),)
-    steps = follow(capture, len(plan.stops))
-    assert len(steps) == len(plan.stops)
-    session = Session.load(tmp_path / "live")
-    assert [view.number for view in session.views] == list(range(1, len(plan.stops) + 1))
-    assert max(errors_m(session, camera)) < REPEATABILITY_M
-
-
 def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_path):
     arm, camera = fake_devices(plan)
     capture = _capture(tmp_path / "live", plan, arm, camera)
@@ -488,25 +442,6 @@ def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
     capture.watchers = (Hand(arm, [plan.stops[1].q]),)
     assert len(follow(capture, 0)) == 2
     assert len(Session.load(tmp_path / "live").views) == 2
-
-
-def test_typed_poses_make_a_session(plan, tmp_path):
-    arm, camera = fake_devices(plan)
-    capture = _capture(tmp_path / "live", plan, arm, camera)
-    answers, asked = iter(["", "", "", "q"]), []
-    places = iter(plan.stops)
-
-    def ask(question: str) -> str:
-        asked.append(question)
-        answer = next(answers)
-        if answer == "":
-            arm.q0 = next(places).q
-        return answer
-
-    steps = ask_and_take(capture, arm, 0, ask)
-    assert all(isinstance(step.found, TakenView) for step in steps)
-    assert "View 1 (another place" in asked[0]
-    assert len(Session.load(tmp_path / "live").views) == 3
 
 
 def _capture(folder, plan: PlanFile, arm: FakeArm, camera: FakeCamera) -> Capture:

@@ -17,7 +17,7 @@ from visioncal.live.planning.cell import Box
 from visioncal.live.planning.design import Wish, choose_stops, shortfall
 from visioncal.live.planning.information import predict_worlds, stop_factors
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.purposes import PURPOSES, purpose_of
+from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import RoughEdges, start_from_session
 from visioncal.live.planning.visibility import BoardViews
 from visioncal.robot import load_robot
@@ -130,29 +130,6 @@ def test_what_is_known_beforehand_may_be_singular_to_rounding(views):
     np.testing.assert_allclose(root.T @ world.prior @ root, np.eye(size), atol=1e-9)
 
 
-def test_it_stops_when_the_wish_is_predicted(views):
-    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views)
-    wish = Wish(mm=0.08)
-    design = choose_stops(worlds, 40, wish=wish)
-    assert design.met
-    assert design.predicted.mm <= 0.08
-    assert len(design.rows) < 40
-    fewer = choose_stops(worlds, len(design.rows) - 1, wish=wish)
-    assert not fewer.met
-    assert "more than" in shortfall(fewer, wish, len(design.rows) - 1)
-    assert shortfall(design, wish, 40) == ""
-
-
-def test_a_wish_that_no_candidates_give_is_refused_with_what_they_give(views):
-    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views)
-    wish = Wish(mm=1e-4, deg=0.1)
-    design = choose_stops(worlds, 10, wish=wish)
-    assert design.met is False
-    words = shortfall(design, wish, 10)
-    assert "cannot be reached" in words
-    assert f"{design.best.mm:.2g} mm" in words
-
-
 def test_a_board_of_unknown_size_is_named_as_what_is_in_the_way():
     options = CELL
     worlds = predict_worlds([true_cell(options)], KINEMATICS, postures_in_view(options, 60))
@@ -207,17 +184,6 @@ def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
     wider = BoardViews(replace(found, observed_distances_m=(3.0 * near, 3.0 * far)), 0).distance_m
     assert wider[0] == near
     assert wider[1] > 3.0 * far
-
-
-def test_a_session_that_is_good_already_needs_no_stop():
-    cell = simulate(replace(CELL, views=15, seed=4))
-    begun = start_from_session(so_far_of(cell))
-    assert begun.refusal == ""
-    q = postures_in_view(replace(CELL, seed=4), 40)
-    easy = next_best(begun, HAND_EYE, q, 5, wish=Wish(mm=1.0))
-    assert easy.design.met
-    assert len(easy.design.rows) == 0
-    assert easy.helps == ()
 
 
 def test_the_few_stops_that_a_recorded_cell_allows_are_added():
@@ -319,13 +285,3 @@ def test_two_stops_need_a_guess():
     x, z = cell.transforms.values()
     begun = start_from_session(found, guess=RoughEdges(x, z, 0.1, 0.03))
     assert len(begun.recorded.problem) == 2
-
-
-def test_what_cannot_be_is_refused(views):
-    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views[:4])
-    with pytest.raises(DataError, match="5 stops cannot be chosen from 4"):
-        choose_stops(worlds, 5)
-    with pytest.raises(DataError, match="wished accuracy"):
-        Wish(mm=-1.0)
-    with pytest.raises(DataError, match="Did you mean kinematics"):
-        purpose_of("kinematic")

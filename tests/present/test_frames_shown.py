@@ -122,12 +122,6 @@ def test_doubtful_frames_are_among_the_next_steps(sample):
     assert "what was found of flange_from_tool" in good.next_steps[-1].words
 
 
-def test_calibrations_without_frames_say_nothing_of_them():
-    bare = made_up(5)
-    words = Page(render(bare.calibration, bare.session, bare.evidence)).words
-    assert "Tools and fixtures" not in words
-
-
 def test_frames_without_observations_or_residuals_still_have_a_report(sample):
     bare = replace(tool_frame(), observations=(), details={}, verdict=Verdict("good"))
     words = of_frames(Page(render(with_frame(sample, bare), None, ())))

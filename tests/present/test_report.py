@@ -16,7 +16,7 @@ from support.samples import REJECTED, Sample, made_up
 
 from visioncal.calibration.pipeline import Run, run
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import matched, significant
+from visioncal.core.number_format import significant
 from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
@@ -105,21 +105,6 @@ def test_three_findings_are_read_first_and_the_rest_is_folded(sample: Sample) ->
     assert "Possibly (30 %): The lens is another." in first
     assert "Its z is weakly determined." in first
     assert "It was cold." in folded.split("</details>")[0]
-
-
-def test_sources_of_uncertainty_are_told_with_their_shares(sample: Sample) -> None:
-    page = Page(render(with_findings(sample, sick()), sample.session, sample.evidence))
-    words = section(page, "Where the uncertainty comes from", "How it was obtained")
-    assert "0.50 m from the camera" in words
-    assert "in the frame of the flange with a sigma of 1.2 mm" in words
-    assert "right to within 0.16 mm" in words
-    assert "94 % of the variance, comes from the arm; what of it looks the same in all" in words
-    # The bars, the largest first.
-    labels = ["errors of the arm's links", "the robot, from stop to stop", "total"]
-    assert sorted(labels, key=words.index) == labels
-    assert "1.2 (94 %)" in words
-    assert "robot translation 0.051 mm 95 %: 0.041 to 0.062" in words
-    assert "sigma / largest accepted" in words
 
 
 def test_exact_cells_and_single_markers_have_a_report() -> None:
@@ -371,22 +356,6 @@ def test_report_is_whole_or_absent(sample: Sample, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(DataError, match="cannot be written"):
         write_report(tmp_path / "absent" / "report.html", sample.calibration, None, ())
-
-
-@pytest.mark.parametrize(
-    ("value", "sigma", "text"),
-    [
-        (12.3456, 0.1, "12.35"),
-        (12.3456, 0.0996, "12.35"),
-        (12.3456, 0.0094, "12.3456"),
-        (1234.5, 30.0, "1234"),
-        (-0.004, 1.0, "0.0"),
-        (1.0, 0.0, "1.000000"),
-        (1.0, float("nan"), "1.000000"),
-    ],
-)
-def test_value_has_the_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
-    assert matched(value, sigma) == text
 
 
 @pytest.mark.parametrize(

@@ -105,46 +105,6 @@ def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
     assert refused > 500
 
 
-def test_what_was_given_and_what_is_needed_is_said(bench):
-    words = {
-        "correct: calibration is None; a Calibration or a CalibratedArm is needed.": (
-            lambda: visioncal.correct(None, bench.pose)
-        ),
-        "locate: calibration is text ('out'); a Calibration is needed. "
-        "Load it first: visioncal.Calibration.load('out').": (
-            lambda: visioncal.locate("out", [[1.0, 2.0]], visioncal.Plane.horizontal(0.0))
-        ),
-        "CellOptions: target is text ('charuco_9x6_30mm'); a Target is needed. "
-        "Load it first: visioncal.load_target('charuco_9x6_30mm').": (
-            lambda: CellOptions(target=BOARD)
-        ),
-        "Sight: seen is an array of float64, of the shape (2, 3); a Corners or an image of uint8 "
-        "is needed.": lambda: visioncal.Sight("1", np.zeros((2, 3))),
-        "image: an array of the shape (800, 1280, 3); (h, w) grey levels are needed. "
-        "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).": (
-            lambda: visioncal.identify(np.dstack([bench.image] * 3))
-        ),
-        "out/recording.rrd is a recording; a calibration.json, or the folder with one, is needed. "
-        "Name the output folder of visioncal calibrate. Of a recording alone, "
-        "visioncal.present.recording.read_calibration reads the result.": (
-            lambda: visioncal.Calibration.load("out/recording.rrd")
-        ),
-        "batch: sessions[1] is of the type int; a path or text is needed.": (
-            lambda: visioncal.batch(["a", 3])
-        ),
-        "Session.from_arrays: mount is text ('eye-on-hand'); 'eye-in-hand', 'eye-to-hand' or "
-        "'instrument' is needed. Did you mean eye-to-hand or eye-in-hand?": (
-            lambda: visioncal.Session.from_arrays(
-                [bench.image], bench.pose[None], BOARD, mount="eye-on-hand"
-            )
-        ),
-    }
-    for expected, call in words.items():
-        with pytest.raises(DataError) as refused:
-            call()
-        assert str(refused.value) == expected
-
-
 def test_files_are_taken_by_text_and_a_folder_is_no_file(bench, tmp_path):
     written = visioncal.convert(str(bench.folder), str(tmp_path / "copy"))
     assert written.digest() == bench.session.digest()

@@ -132,11 +132,6 @@ def test_a_board_without_markers_has_to_be_stated(target):
     assert 'target = "board.toml" in session.toml' in caught.value.next_step
 
 
-def test_a_uniform_image_is_called_so():
-    with pytest.raises(DataError, match="almost uniform"):
-        identify(np.full((600, 800), 90, dtype=np.uint8))
-
-
 @pytest.mark.parametrize("name", MARKED)
 def test_a_description_loads_once_the_size_is_known(name):
     target = SHIPPED[name]
