@@ -71,11 +71,6 @@ def _pair_words(view: ViewResult) -> str:
     return f"{view.seer} of {view.seen}" if view.seer else ""
 
 
-def outlying_views(suspects: Sequence[FlaggedViews]) -> tuple[int, ...]:
-    """Numbers of the used views among suspects, ascending."""
-    return tuple(sorted(view for group in suspects if group.used for view in group.views))
-
-
 def contradicts(view: ViewResult) -> bool:
     """Whether a view was left out because it contradicts the others."""
     return not view.used and view.reason.startswith(_CONTRADICTION_PREFIX)

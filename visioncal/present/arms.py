@@ -47,13 +47,6 @@ _CONVENTIONS = {
     "modified": "Craig's modified form, each joint's link before it",
     "hayati": "Hayati's form, which has no leap where axes are parallel",
 }
-_INDICES = (
-    ("o1", "O1", "geometric mean, over the root of the number of stops (Borm and Menq 1991)"),
-    ("o2", "O2", "smallest over largest (Driels and Pathre 1990)"),
-    ("o3", "O3", "smallest (Nahvi, Hollerbach and Hayward 1994)"),
-    ("o4", "O4", "square of the smallest over the largest (Nahvi and Hollerbach 1996)"),
-    ("o5", "O5", "inverse of the sum of their inverses (Sun and Hollerbach 2008)"),
-)
 # Number of most influential stops that are listed, beside the least influential one.
 _MOST_INFLUENTIAL = 5
 
@@ -249,18 +242,6 @@ def stop_table(arm: ArmResult) -> Table | None:
         for stop, suffix in labelled
     ]
     return Table.of(("without", "grows by"), rows) if rows else None
-
-
-def index_facts(arm: ArmResult) -> Iterator[Fact]:
-    """Observability indices."""
-    observability = arm.observability
-    if observability is not None:
-        note = "both transforms' and the arm's, redundant ones among them"
-        yield Fact("values carried", str(observability.columns), note)
-        for name, label, note in _INDICES:
-            value = getattr(observability, name)
-            if value is not None:
-                yield Fact(label, f"{value:.3g}", note)
 
 
 def drift_sentence(thermal: ThermalResult) -> str:

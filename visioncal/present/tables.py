@@ -55,7 +55,12 @@ class Table:
         ]
         return cls(
             tuple(titles[column] for column in kept),
-            tuple(replace(row, cells=_some(row.cells, kept)) for row in all_rows),
+            tuple(
+                replace(row, cells=tuple(row.cells[at] for at in kept))
+                if len(row.cells) > 1
+                else row
+                for row in all_rows
+            ),
             tuple(index for index, column in enumerate(kept) if column in words),
         )
 
@@ -64,7 +69,3 @@ class Table:
         size = max(-(-len(self.rows) // count), 1)
         for start in range(0, len(self.rows), size):
             yield replace(self, rows=self.rows[start : start + size])
-
-
-def _some(cells: tuple[str, ...], kept: Sequence[int]) -> tuple[str, ...]:
-    return tuple(cells[at] for at in kept) if len(cells) > 1 else cells

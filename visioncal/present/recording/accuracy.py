@@ -281,7 +281,10 @@ class Uncertainty:
         for frame in self._target_frames:
             # For other targets, an empty part clears the mark of the previous view.
             marked = [
-                self._positions_m([view] if self._frame_of(view) == frame else []) for view in views
+                self._positions_m(
+                    [view] if view in self.scatter_m and self.frames[view] == frame else []
+                )
+                for view in views
             ]
             entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
             radius = 1.5 * _POINT * self.size_m
@@ -290,9 +293,6 @@ class Uncertainty:
             points = rr.Points3D.columns(positions=np.vstack(marked))
             parts = points.partition([len(array) for array in marked])
             send_rows(stream, entity, range(len(views)), parts)
-
-    def _frame_of(self, view: int) -> str:
-        return self.frames[view] if view in self.scatter_m else ""
 
     def _positions_m(self, views: Sequence[int]) -> FloatArray:
         """(k, 3) drawn positions of targets by some views, in their frames."""

@@ -1,6 +1,6 @@
 """Drawing of a robot arm, a capsule per link and a ball per joint, and of obstacles."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import rerun as rr
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
+from visioncal.robot import Robot
 
 # Radii of links at the base and at the flange, as shares of the arm's length; about a UR's.
 _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
@@ -29,6 +30,28 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
     capsules, balls = _shapes(link_frames[None])
     stream.log(f"{paths.ROBOT}/links", rr.Capsules3D(**capsules, **_LINKS))
     stream.log(f"{paths.ROBOT}/joints", rr.Ellipsoids3D(**balls, **_JOINTS))
+
+
+def log_pose(
+    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray
+) -> None:
+    """Places a frame in the base at the stream's current time."""
+    stream.log(entity, placed(base_from_frame, paths.BASE_FRAME, frame))
+
+
+def log_arm_motion(
+    stream: rr.RecordingStream,
+    robot: Robot,
+    q: FloatArray,
+    times: Iterable[float] | Iterable[np.timedelta64],
+) -> None:
+    """Draws an arm and its flange over time, by (m, n) joint angles [rad] and their times [s]."""
+    for time, q_then in zip(times, q, strict=True):
+        stream.set_time(paths.MOTION_TIMELINE, duration=time)
+        links = robot.link_frames(q_then)
+        log_arm(stream, links)
+        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, links[-1])
+    stream.reset_time()
 
 
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:

@@ -12,7 +12,7 @@ from visioncal.core.files import replacing_file
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.arm import log_arm, log_frames
+from visioncal.present.recording.arm import log_arm_motion, log_frames
 from visioncal.present.recording.notes import markdown, plain, table_lines
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.writer import RecordingWriter
@@ -61,7 +61,11 @@ def _log_run(run: Run, recorder: Recorder) -> None:
     for prediction in run.predictions:
         times_s = start_s + prediction.times_s - prediction.times_s[0]
         _log_series(recorder.stream, prediction, times_s)
-        _log_motion(recorder, run.identified, prediction, times_s)
+        steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
+        drawn = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
+        robot = run.identified.robot
+        log_arm_motion(recorder.stream, robot, prediction.q[drawn], times_s[drawn].tolist())
+        recorder.keep()
         start_s = float(times_s[-1]) + _PAUSE_S
 
 
@@ -108,19 +112,6 @@ def _log_series(stream: rr.RecordingStream, prediction: Prediction, times_s: Flo
         for entity, values in columns.items():
             scalars = rr.Scalars.columns(scalars=[*values, np.nan])
             stream.send_columns(entity, [index], scalars)
-
-
-def _log_motion(
-    recorder: Recorder, identified: Identified, prediction: Prediction, times_s: FloatArray
-) -> None:
-    steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
-    rows = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
-    recorder.stream.reset_time()
-    for row in rows:
-        recorder.stream.set_time(paths.MOTION_TIMELINE, duration=float(times_s[row]))
-        log_arm(recorder.stream, identified.robot.link_frames(prediction.q[row]))
-    recorder.stream.reset_time()
-    recorder.keep()
 
 
 def _torque_lines(identified: Identified) -> Iterator[str]:

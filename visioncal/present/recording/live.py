@@ -1,19 +1,17 @@
 """Live drawing of a session while it is recorded."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import rerun as rr
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
 from visioncal.present.coverage import corners_chart
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm, log_frames
+from visioncal.present.recording.arm import log_arm, log_frames, log_pose
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.notes import markdown
-from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
+from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane
 from visioncal.robot import Robot
 
 # Sizes of axes, lines and points [m].
@@ -108,21 +106,19 @@ class LiveDrawing:
         stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
         if cell.x is None or cell.z is None:
             return
-        in_hand = cell.mount == "eye-in-hand"
-        poses = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
-        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, poses[0])
-        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, poses[1])
-        strips = [line for pose in self._flange_poses for line in self._carried(pose)]
+        if cell.mount == "eye-in-hand":
+            base_from_cam, base_from_target, flange_from_carried = flange @ cell.x, cell.z, cell.x
+            shapes = [] if cell.camera is None else frustum(cell.camera, SMALL_FRUSTUM)
+        else:
+            base_from_cam, base_from_target, flange_from_carried = cell.x, flange @ cell.z, cell.z
+            shapes = [board.closed_outline(cell.target)]
+        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
+        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
+        strips = [
+            apply(pose @ flange_from_carried, shape)
+            for pose in self._flange_poses
+            for shape in shapes
+        ]
         if strips:
             lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
             stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)
-
-    def _carried(self, flange: FloatArray) -> Sequence[FloatArray]:
-        """(k, 3) lines of the camera's frustum or the board's rim, at a flange pose."""
-        cell = self.cell
-        if cell.mount == "eye-in-hand":
-            shapes = [] if cell.camera is None else frustum(cell.camera, SMALL_FRUSTUM)
-            pose = flange @ np.asarray(cell.x)
-        else:
-            shapes, pose = [board.closed_outline(cell.target)], flange @ np.asarray(cell.z)
-        return [apply(pose, shape) for shape in shapes]

@@ -87,7 +87,9 @@ def log_views(
     texts = [
         view_markdown(sights[row], () if view.is_of_lens else unposed.get(row, ()))
         if row in sights
-        else _unseen_markdown(view)
+        # Without any observation of the cell.
+        else f"# View {view.number}\n\n"
+        + ("for the lens alone" if view.is_of_lens else "it has a robot's pose alone")
         for row, view in rows.items()
     ]
     columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
@@ -179,12 +181,6 @@ def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
         names = ", ".join(map(plain, unposed))
         lines += ["", f"The pose of {names} is not known at this stop: drawn as it was last."]
     return "\n".join(lines)
-
-
-def _unseen_markdown(view: View) -> str:
-    """Text of a view without any observation of the cell."""
-    reason = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
-    return f"# View {view.number}\n\n{reason}"
 
 
 def plain(text: str) -> str:

@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
@@ -16,11 +15,18 @@ from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.dynamics.model import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import Obstacle, log_arm, log_frames, log_obstacles
+from visioncal.present.recording.arm import (
+    Obstacle,
+    log_arm,
+    log_arm_motion,
+    log_frames,
+    log_obstacles,
+    log_pose,
+)
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder
-from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
+from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
@@ -138,8 +144,7 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
     _log_carried(stream, preview, size_m)
     charts.log_static(stream)
-    note = markdown(preview.note)
-    stream.log(paths.PLAN_NOTE, note, static=True)
+    stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
     finite = np.isfinite(preview.sigmas_mm)
     if finite.any():
         bars = rr.BarChart(
@@ -153,22 +158,16 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
 def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) -> None:
     """Draws what the flange carries at all stops, and its path between them."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
-    flange = preview.base_from_flange
-    strips, centres = [], []
-    for pose in flange:
-        base_from_cam, base_from_target = preview.placed(pose)
-        if preview.mount == "eye-in-hand":
-            base_from_carried = base_from_cam
-            shapes = frustum(preview.camera, SMALL_FRUSTUM * size_m)
-        else:
-            base_from_carried = base_from_target
-            shapes = [board.closed_outline(preview.target)]
-        centres.append(base_from_carried[:3, 3])
-        strips += [shape @ base_from_carried[:3, :3].T + centres[-1] for shape in shapes]
+    flange_from_carried, shapes = preview.z, [board.closed_outline(preview.target)]
+    if preview.mount == "eye-in-hand":
+        flange_from_carried = preview.x
+        shapes = frustum(preview.camera, SMALL_FRUSTUM * size_m)
+    base_from_carried = preview.base_from_flange @ flange_from_carried
+    strips = [apply(pose, shape) for pose in base_from_carried for shape in shapes]
     lines = rr.LineStrips3D(strips, colors=colours.USED, radii=0.5 * _LINE * size_m)
     stream.log(f"{paths.STOPS}/{paths.USED}/carried", frame, lines, static=True)
     points = rr.Points3D(
-        centres,
+        base_from_carried[:, :3, 3],
         colors=colours.USED,
         radii=_POINT * size_m,
         labels=[str(stop.view) for stop in preview.stops],
@@ -176,7 +175,6 @@ def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) ->
     )
     stream.log(f"{paths.STOPS}/{paths.USED}", frame, points, static=True)
     path = np.array([q for _, steps in _path(preview) for q in steps])
-    flange_from_carried = preview.x if preview.mount == "eye-in-hand" else preview.z
     positions = (preview.robot.base_from_flange(path) @ flange_from_carried)[:, :3, 3]
     line = rr.LineStrips3D([positions], colors=colours.THIS_VIEW, radii=0.7 * _LINE * size_m)
     stream.log(paths.WAY, frame, line, static=True)
@@ -284,9 +282,17 @@ def write_motion_preview(
         _log_motions(recorder.stream, preview)
         start_s = 0.0
         for part in preview.parts:
-            _log_curves(recorder.stream, part, start_s)
-            _log_arm_motion(recorder.stream, preview, part, start_s)
-            start_s += float(part.motion.times_s[-1])
+            motion = part.motion
+            # In the recording's resolution, so that curves and arm agree to the last bit.
+            times = np.round(1e9 * (start_s + motion.times_s)).astype("timedelta64[ns]")
+            curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
+            curves += [] if part.torques_nm is None else [part.torques_nm]
+            index = rr.TimeColumn(paths.MOTION_TIMELINE, duration=times)
+            for kind, values in zip(paths.MOTION_KINDS, curves, strict=False):
+                columns = rr.Scalars.columns(scalars=values)
+                recorder.stream.send_columns(f"{paths.MOTION}/{kind}", [index], columns)
+            log_arm_motion(recorder.stream, preview.robot, motion.q, times)
+            start_s += float(motion.times_s[-1])
             recorder.keep()
 
 
@@ -310,31 +316,3 @@ def _log_motions(stream: rr.RecordingStream, preview: MotionPreview) -> None:
         lines = rr.SeriesLines(names=names, colors=tints)
         stream.log(f"{paths.MOTION}/{kind}", lines, static=True)
     stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
-
-
-def _log_curves(stream: rr.RecordingStream, part: MotionPart, start_s: float) -> None:
-    motion = part.motion
-    curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
-    if part.torques_nm is not None:
-        curves.append(part.torques_nm)
-    times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=_durations(start_s + motion.times_s))
-    for kind, values in zip(paths.MOTION_KINDS, curves, strict=False):
-        columns = rr.Scalars.columns(scalars=values)
-        stream.send_columns(f"{paths.MOTION}/{kind}", indexes=[times], columns=columns)
-
-
-def _log_arm_motion(
-    stream: rr.RecordingStream, preview: MotionPreview, part: MotionPart, start_s: float
-) -> None:
-    motion = part.motion
-    for duration, q in zip(_durations(start_s + motion.times_s), motion.q, strict=True):
-        stream.set_time(paths.MOTION_TIMELINE, duration=duration)
-        links = preview.robot.link_frames(q)
-        log_arm(stream, links)
-        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, links[-1])
-    stream.reset_time()
-
-
-def _durations(times_s: FloatArray) -> npt.NDArray[np.timedelta64]:
-    """Times in the recording's resolution, so that curves and arm agree to the last bit."""
-    return np.round(1e9 * times_s).astype("timedelta64[ns]")

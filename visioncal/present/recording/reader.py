@@ -83,7 +83,8 @@ def read_session(path: Path) -> Session:
 
 def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> ImageStore:
     """Images of complete rows, or the substitute for images that are stored elsewhere."""
-    images = RecordedImages(path, records.images_by_name(complete))
+    found = {records.image_name(at): records.images[at] for at in complete if at in records.images}
+    images = RecordedImages(path, found)
     kept = _ELSEWHERE.get(records.header.images)
     if kept is None:
         return images
@@ -159,20 +160,9 @@ class _Records:
     closed: int | None  # Number of rows by the end mark; None without the mark.
     damaged: int  # Number of chunks that could not be read.
 
-    @property
-    def is_incomplete(self) -> bool:
-        """Whether a view lacks its row or its image."""
-        if self.header.images:
-            return False
-        with_image = {key for key, row in self.rows.items() if row.image_sha256}
-        return with_image != set(self.images)
-
     def image_name(self, row: int) -> str:
         cells = self.header.cells(self.rows[row])
         return dict(zip(self.header.columns, cells, strict=True))["image"]
-
-    def images_by_name(self, rows: Sequence[int]) -> dict[str, _Image]:
-        return {self.image_name(row): self.images[row] for row in rows if row in self.images}
 
 
 def chunks(
@@ -290,9 +280,9 @@ def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
                 "results that were added last may not be."
             )
     elif announced == codec.UNKNOWN:
-        lost = (
-            " A view that had been begun is lost." if scanned.cut or records.is_incomplete else ""
-        )
+        with_image = {key for key, row in records.rows.items() if row.image_sha256}
+        is_begun = not records.header.images and with_image != set(records.images)
+        lost = " A view that had been begun is lost." if scanned.cut or is_begun else ""
         yield (
             f"{name}: the recording was not closed: its writer was stopped, or the file was cut "
             f"off. {complete} views are complete.{lost}"

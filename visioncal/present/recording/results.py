@@ -60,7 +60,18 @@ def log_results(
         _log_evidence(recorder.stream, seen, result, index)
     # Rerun may reorder what it buffers, and the message that validates the result must be last.
     recorder.keep()
-    _log_result(recorder.stream, calibration, result, len(evidence))
+    text = "" if calibration is None else calibration.text
+    components = {
+        "result": pa.array([result], pa.string()),
+        "evidence_count": pa.array([len(evidence)], pa.int64()),
+        "seal": pa.array([sha256(text.encode())], pa.string()),
+    }
+    recorder.stream.log(
+        paths.CALIBRATION,
+        rr.TextDocument(text, media_type="application/json"),
+        rr.DynamicArchetype(_RESULT, components=components),
+        static=True,
+    )
     recorder.keep()
 
 
@@ -141,23 +152,6 @@ def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, i
     seal = _seal({name: values.to_pylist() for name, values in components.items()})
     components["seal"] = pa.array([seal], pa.string())
     stream.log(paths.EVIDENCE, rr.DynamicArchetype(_EVIDENCE, components=components))
-
-
-def _log_result(
-    stream: rr.RecordingStream, calibration: Calibration | None, result: str, evidence_count: int
-) -> None:
-    text = "" if calibration is None else calibration.text
-    components = {
-        "result": pa.array([result], pa.string()),
-        "evidence_count": pa.array([evidence_count], pa.int64()),
-        "seal": pa.array([sha256(text.encode())], pa.string()),
-    }
-    stream.log(
-        paths.CALIBRATION,
-        rr.TextDocument(text, media_type="application/json"),
-        rr.DynamicArchetype(_RESULT, components=components),
-        static=True,
-    )
 
 
 def _exact(values: FloatArray | float) -> pa.Array:

@@ -416,13 +416,6 @@ def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
     return [rim, *(np.stack([np.zeros(3), corner]) for corner in rim[:4])]
 
 
-def log_pose(
-    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray
-) -> None:
-    """Places a frame in the base at the stream's current time."""
-    stream.log(entity, placed(base_from_frame, paths.BASE_FRAME, frame))
-
-
 def _log_poses(
     stream: rr.RecordingStream, parent: str, frame: str, poses: Sequence[FloatArray | None]
 ) -> None:

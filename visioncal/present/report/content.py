@@ -21,7 +21,7 @@ from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
-from visioncal.results.sections import ClockResult, TouchTest
+from visioncal.results.sections import ClockResult
 from visioncal.session import Session
 from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
@@ -31,12 +31,6 @@ _MOUNTS = {
     "eye-to-hand": "the camera stands still and the robot carries the target",
     "instrument": "a measuring instrument stands still and reads what the robot carries",
 }
-
-
-def edge_meaning(name: str) -> str:
-    """Meaning of a transform's name, such as `flange_from_cam`."""
-    parent, _, child = name.partition("_from_")
-    return f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}."
 
 
 def edge_facts(name: str, edge: Edge) -> list[Fact]:
@@ -62,12 +56,6 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
     rotation_sigma = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
     return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")]
-
-
-def matrix_text(matrix: FloatArray) -> str:
-    """A (4, 4) transform as text to copy."""
-    rows = [", ".join(f"{value: .9f}" for value in row) for row in matrix]
-    return "[[" + "],\n [".join(rows) + "]]"
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
@@ -177,15 +165,6 @@ def method_facts(calibration: Calibration, session: Session | None = None) -> tu
     for name, clock in calibration.by_name.details.clocks.items():
         facts += _clock_facts(clock, f"clock{of(name)}" if name else "camera's clock")
     return tuple(facts)
-
-
-def touch_table(test: TouchTest) -> Table:
-    """Measured and predicted gaps of a touch test."""
-    rows = []
-    for point in test.points:
-        cells = (point.name, significant(point.gap_mm), significant(point.radius95_mm))
-        rows.append(TableRow(cells, "left-out" if point.gap_mm > point.radius95_mm else ""))
-    return Table.of(("point", "gap [mm]", "predicted, 95 % [mm]"), rows)
 
 
 def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:

@@ -68,7 +68,7 @@ def render(
         evidence=evidence if calibration.cell is None else (),
         review=f"{review} --view" if review else "",
         suspects=suspects,
-        outlying=advice.outlying_views(suspects),
+        outlying=tuple(sorted(at for group in suspects if group.used for at in group.views)),
         observed="probe" if calibration.mount == "instrument" else "target",
         **_pictures(calibration, session, {view.view: view for view in evidence}),
     )

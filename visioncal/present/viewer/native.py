@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import Popen
@@ -105,6 +105,10 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     Yields:
         The process, which leads its own process group.
     """
+    # It sends no statistics under continuous integration, and checks for a newer version through
+    # the proxy; neither changes the user's settings of rerun.
+    quiet = {key: name for key, name in os.environ.items() if key != "FORCE_RERUN_ANALYTICS"}
+    proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
     process = subprocess.Popen(
         [sys.executable, "-m", "rerun_cli", *arguments],
         stdin=subprocess.DEVNULL,
@@ -113,13 +117,20 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         text=True,
         encoding="utf-8",
         errors="replace",
-        env=_quiet(os.environ),
+        env=quiet | proxies | {"CI": "1", "NO_COLOR": "1"},
         start_new_session=True,
     )
     try:
         yield process
     finally:
-        _end_group(process)
+        # Rerun's command starts the viewer as a child, and may have ended before it.
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_END_S)
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def free_port() -> int:
@@ -134,24 +145,3 @@ def until_interrupted() -> Iterator[None]:
     """Runs a block that Ctrl-C or SIGTERM ends without an error."""
     with suppress(KeyboardInterrupt), signals_as_interrupts("SIGINT", "SIGTERM"):
         yield
-
-
-def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
-    """Environment in which the viewer sends no statistics and checks for no newer version."""
-    # It sends none under continuous integration, and checks through the proxy; neither changes the
-    # user's settings of rerun.
-    quiet = {key: name for key, name in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
-    proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
-    return quiet | proxies | {"CI": "1", "NO_COLOR": "1"}
-
-
-def _end_group(process: subprocess.Popen[str]) -> None:
-    """Ends a process and its children; rerun's command starts the viewer as a child."""
-    # Both signals, as the command may have ended before its child.
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, number)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_END_S)
-    if process.stdout is not None:
-        process.stdout.close()

@@ -3,7 +3,6 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from visioncal.core.types import FloatArray
 from visioncal.dynamics import Run
 from visioncal.present.recording import paths
 from visioncal.present.recording.preview import MotionPreview, Preview
@@ -31,10 +30,6 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
     places = np.array(
         [np.zeros(3), *flange[:, :3, 3], *(pose_in_base[:3, 3] for pose_in_base in poses)]
     )
-    return with_panels(rrb.Tabs(_overview(places), _coverage(), active_tab=0))
-
-
-def _overview(places: FloatArray) -> rrb.Container:
     kinds = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET, paths.OBSTACLES)
     entities = (*kinds, paths.STOPS, paths.WAY)
     # The predicted corners would clutter the frustum.
@@ -45,22 +40,20 @@ def _overview(places: FloatArray) -> rrb.Container:
     stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
     image = image_view("The board in the image, as predicted", paths.IMAGE)
     right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
-    return rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
-
-
-def _coverage() -> rrb.Container:
-    image = image_view("Corners of all stops in the image", paths.IMAGE_COVERAGE)
+    overview = rrb.Horizontal(cell, right, name="Plan", column_shares=[1.5, 1])
+    corners = image_view("Corners of all stops in the image", paths.IMAGE_COVERAGE)
     sigma = rrb.BarChartView(
         name="Predicted sigma [mm] after so many stops, the most informative first",
         origin=paths.PREDICTED_SIGMA,
         plot_legend=rrb.PlotLegend(visible=False),
     )
-    return rrb.Horizontal(
-        rrb.Vertical(image, sigma, row_shares=[2, 1]),
+    coverage = rrb.Horizontal(
+        rrb.Vertical(corners, sigma, row_shares=[2, 1]),
         rrb.Vertical(*disc_views()),
         name="Coverage",
         column_shares=[1.6, 1],
     )
+    return with_panels(rrb.Tabs(overview, coverage, active_tab=0))
 
 
 def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
@@ -99,10 +92,6 @@ def dynamics_blueprint(run: Run) -> rrb.Blueprint:
         rrb.TextDocumentView(name="Base parameters", origin=paths.PARAMETERS_NOTE),
         name="Figures",
     )
-    return with_panels(rrb.Tabs(_torques(run), figures, active_tab=0), paths.MOTION_TIMELINE)
-
-
-def _torques(run: Run) -> rrb.Container:
     robot = run.identified.robot
     joints, names = range(robot.joint_count), robot.joint_names
     torques = [
@@ -118,9 +107,10 @@ def _torques(run: Run) -> rrb.Container:
         series("Speeds [rad/s]", paths.SPEEDS),
         row_shares=[2, 1, 1],
     )
-    return rrb.Horizontal(
+    over_time = rrb.Horizontal(
         left,
         rrb.Grid(*torques, grid_columns=2),
         name="Torques: measured grey, predicted blue, by what was known before brown",
         column_shares=[1, 2],
     )
+    return with_panels(rrb.Tabs(over_time, figures, active_tab=0), paths.MOTION_TIMELINE)
