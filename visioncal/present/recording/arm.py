@@ -43,7 +43,7 @@ def log_arm_motion(
     stream: rr.RecordingStream,
     robot: Robot,
     q: FloatArray,
-    times: Iterable[float] | Iterable[np.timedelta64],
+    times: Iterable[float | np.timedelta64],
 ) -> None:
     """Draws an arm and its flange over time, by (m, n) joint angles [rad] and their times [s]."""
     for time, q_then in zip(times, q, strict=True):

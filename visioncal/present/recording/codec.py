@@ -130,19 +130,13 @@ class StoredRow:
 
 def log_header(stream: rr.RecordingStream, header: Header) -> None:
     """Logs session.toml, the columns, the target and the robot."""
+    stored = {"format": FORMAT, "visioncal": __version__, **vars(header), "seal": header.seal()}
     components = {
-        "format": pa.array([FORMAT], pa.int64()),
-        "visioncal": pa.array([__version__], pa.string()),
-        "rows": pa.array([header.rows], pa.int64()),
-        "columns": pa.array(header.columns, pa.string()),
-        "number_columns": pa.array(header.number_columns, pa.string()),
-        "session_toml": pa.array([header.session_toml], pa.string()),
-        "target_json": pa.array([header.target_json], pa.string()),
-        "robot_json": pa.array([header.robot_json], pa.string()),
-        "streams": pa.array(header.streams, pa.string()),
-        "corners": pa.array([header.corners], pa.string()),
-        "images": pa.array([header.images], pa.string()),
-        "seal": pa.array([header.seal()], pa.string()),
+        name: pa.array(
+            value if isinstance(value, tuple) else [value],
+            pa.int64() if isinstance(value, int) else pa.string(),
+        )
+        for name, value in stored.items()
     }
     stream.log(paths.SESSION, rr.DynamicArchetype(_HEADER, components=components), static=True)
 

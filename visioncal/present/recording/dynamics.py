@@ -1,6 +1,6 @@
 """Recording of a dynamic identification: the arm's motion and its torques over time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -83,11 +83,14 @@ def _log_static(
         for group in (paths.TORQUE_ERRORS, paths.SPEEDS):
             line = rr.SeriesLines(names=[identified.robot.joint_names[joint]])
             stream.log(paths.of_joint(group, joint), line, static=True)
-    for entity, text in (
-        (paths.DYNAMICS_NOTE, "\n".join(_torque_lines(identified))),
-        (paths.PARAMETERS_NOTE, "\n".join(table_lines(base_parameter_table(identified)))),
-    ):
-        stream.log(entity, markdown(text), static=True)
+    lines = [f"## {plain(identified.robot.name)}: {identified.base.rank} base parameters"]
+    lines += [*table_lines(torque_table(identified)), "", plain(torque_note(identified))]
+    for motion in identified.streams:
+        for note in motion.notes:
+            lines += ["", plain(note)]
+    stream.log(paths.DYNAMICS_NOTE, markdown("\n".join(lines)), static=True)
+    parameters = "\n".join(table_lines(base_parameter_table(identified)))
+    stream.log(paths.PARAMETERS_NOTE, markdown(parameters), static=True)
 
 
 def _log_series(stream: rr.RecordingStream, prediction: Prediction, times_s: FloatArray) -> None:
@@ -112,12 +115,3 @@ def _log_series(stream: rr.RecordingStream, prediction: Prediction, times_s: Flo
         for entity, values in columns.items():
             scalars = rr.Scalars.columns(scalars=[*values, np.nan])
             stream.send_columns(entity, [index], scalars)
-
-
-def _torque_lines(identified: Identified) -> Iterator[str]:
-    """How well torques are predicted, in Markdown."""
-    yield f"## {plain(identified.robot.name)}: {identified.base.rank} base parameters"
-    yield from (*table_lines(torque_table(identified)), "", plain(torque_note(identified)))
-    for stream in identified.streams:
-        for note in stream.notes:
-            yield from ("", plain(note))

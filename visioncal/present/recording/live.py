@@ -73,7 +73,13 @@ class LiveDrawing:
         """Draws a view, and the charts of all views so far."""
         stream = self.stream
         stream.set_time(paths.TIMELINE, sequence=view.view)
-        self._draw_image(view)
+        in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
+        model = rr.ColorModel.L if view.image.ndim == 2 else rr.ColorModel.BGR
+        picture = rr.Image(view.image, color_model=model).compress(jpeg_quality=_JPEG)
+        stream.log(paths.IMAGE, in_image, picture)
+        # Rerun's origin is the image's corner, not the first pixel's centre.
+        points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
+        stream.log(paths.DETECTED, in_image, points)
         self._draw_cell(view)
         self._px[view.view] = view.px
         chart = corners_chart(self.cell.resolution, self._px)
@@ -83,15 +89,6 @@ class LiveDrawing:
         if view.sigma_mm is not None:
             stream.log(paths.LIVE_SIGMA, rr.Scalars(view.sigma_mm))
         stream.log(paths.LIVE_NOTE, markdown(view.note))
-
-    def _draw_image(self, view: LiveView) -> None:
-        in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
-        model = rr.ColorModel.L if view.image.ndim == 2 else rr.ColorModel.BGR
-        picture = rr.Image(view.image, color_model=model).compress(jpeg_quality=_JPEG)
-        self.stream.log(paths.IMAGE, in_image, picture)
-        # Rerun's origin is the image's corner, not the first pixel's centre.
-        points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
-        self.stream.log(paths.DETECTED, in_image, points)
 
     def _draw_cell(self, view: LiveView) -> None:
         cell, stream, flange = self.cell, self.stream, view.base_from_flange

@@ -194,7 +194,10 @@ def _path(preview: Preview) -> Iterator[tuple[PreviewStop, list[FloatArray]]]:
 
 
 def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
-    stream, step = recorder.stream, 0
+    stream, step, in_image = recorder.stream, 0, rr.CoordinateFrame(paths.IMAGE_FRAME)
+    outline = board.closed_outline(preview.target)
+    shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
+    sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
     for index, (stop, steps) in enumerate(_path(preview)):
         for q in steps[:-1]:
             stream.reset_time()
@@ -206,23 +209,15 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
         step += 1
         cam_from_target = _log_cell(stream, preview, stop.q)
         charts.log_view(stream, stop.view)
-        _log_image(stream, preview, cam_from_target)
+        seen = apply(cam_from_target, sides)
+        # Rerun's origin is the image's corner, not the first pixel's centre.
+        rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
+        stream.log(f"{paths.IMAGE}/board", in_image, rim)
+        px = _corners_px(preview, cam_from_target) + 0.5
+        points = rr.Points2D(px, colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))
+        stream.log(paths.PREDICTED, in_image, points)
         stream.log(paths.STOP_NOTE, markdown(stop.note))
     recorder.keep()
-
-
-def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray) -> None:
-    frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
-    outline = board.closed_outline(preview.target)
-    shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
-    sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
-    seen = apply(cam_from_target, sides)
-    # Rerun's origin is the image's corner, not the first pixel's centre.
-    rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
-    stream.log(f"{paths.IMAGE}/board", frame, rim)
-    px = _corners_px(preview, cam_from_target) + 0.5
-    points = rr.Points2D(px, colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))
-    stream.log(paths.PREDICTED, frame, points)
 
 
 def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> FloatArray:

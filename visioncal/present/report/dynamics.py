@@ -17,7 +17,6 @@ from visioncal.dynamics import (
     stribeck_rows,
 )
 from visioncal.present import facts
-from visioncal.present.facts import PLUS_MINUS
 from visioncal.present.report.plotting import (
     ACCENT,
     BAD,
@@ -65,7 +64,8 @@ def render_dynamics(run: Run) -> str:
             f"{kind}: {identified.determined.count(kind)}"
             for kind in dict.fromkeys(("2 %", "10 %", *identified.determined))
         ),
-        humps=tuple(_hump_facts(identified)),
+        humps=stribeck_rows(identified),
+        matched=matched,
         plots=tuple((f"{each.label}, {use}", torques(each)) for each, use in shown),
         friction_plot=friction(identified, run.predictions),
     )
@@ -83,18 +83,6 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
         yield Fact("error on unseen motion", f"{median} %", f"up to {high} % (joint {worst + 1})")
     samples = sum(stream.samples for stream in identified.streams)
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
-
-
-def _hump_facts(identified: Identified) -> Iterator[Fact]:
-    for row in stribeck_rows(identified):
-        share, share_sigma = row["static_over_coulomb"], row["static_over_coulomb_sigma"]
-        speed, speed_sigma = 1e3 * row["speed_rad_s"], 1e3 * row["speed_sigma_rad_s"]
-        yield Fact(
-            identified.robot.joint_names[row["joint"] - 1],
-            f"{matched(share, share_sigma)} {PLUS_MINUS} {significant(share_sigma)} times",
-            f"fading over {matched(speed, speed_sigma)} {PLUS_MINUS} "
-            f"{significant(speed_sigma)} mrad/s",
-        )
 
 
 @drawn
