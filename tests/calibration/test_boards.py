@@ -1,6 +1,5 @@
 """Several boards in one chain: where they are, what they tell together, and what is wrong."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +15,8 @@ from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
-from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
-from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -103,20 +100,6 @@ def test_a_wrong_view_of_one_board_is_named():
     assert set(range(len(corners))) - set(known.used) == {slipped}
     assert "disagrees with the other views" in known.reasons[slipped]
     assert any(f"View {slipped} was left out" in reason for reason in known.verdict.reasons)
-
-
-def test_files_from_before_boards_were_sheared_mean_the_same_values():
-    result = result_of(calibrated(simulate(replace(TWO, second=Second(scale=1.01), seed=5))))
-    document = to_document(result)
-    first, second = document["joint_fit"]["looks"]
-    assert second == first + len(BOARD_NAMES)
-    document["joint_fit"]["looks"] = [first, second - 1]
-    for board in document["boards"].values():
-        del board["shape"]["shear"]
-    before = CalibrationPrior.of(Calibration.from_json(json.dumps(document), "before"))
-    now = CalibrationPrior.of(result)
-    np.testing.assert_array_equal(before.free.columns, now.free.columns)
-    np.testing.assert_array_equal(before.free.appearance.board, now.free.appearance.board)
 
 
 def test_one_view_places_a_board():

@@ -90,6 +90,9 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     total = np.sqrt(sum(part**2 for name, part in parts.items() if name != "total"))
     assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
     looks = {"look"} if mount == "eye-in-hand" else set()
+    if not looks:
+        # A focus that varies by what noise alone shows is next to nothing.
+        assert parts.pop("look", 0.0) < 0.2 * parts["total"]
     assert set(parts) == {"board", "calibration", "pick", "total"} | looks
 
 
@@ -201,7 +204,7 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
     # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
     assert 0.7 < away_mm / picks.budget_mm["total"] < 2.0
     # More views would not help, and are not the advice.
-    needing = replace(known.findings, need=Need(0.3), corrects_targets=True)
+    needing = replace(known.findings, need=Need(0.15), corrects_targets=True)
     cause = judge(needing).causes[0]
     assert cause.kind == "unmeasured_board"
     assert "square_sigma_m" in cause.do.words

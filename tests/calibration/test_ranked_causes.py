@@ -417,7 +417,7 @@ def test_weak_motion_comes_first_and_its_advice_once(states_lens: bool) -> None:
         tilt_rad=(0.0, 0.06),
         distance_m=(0.25, 0.9),
         robot_sigma_m=1e-4,
-        robot_sigma_rad=3e-4,
+        robot_sigma_rad=4e-4,
         state_intrinsics=states_lens,
     )
     verdict = calibrated(simulate(options)).verdict

@@ -50,8 +50,9 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert result.verdict.status == "check"
     assert any("The board is not flat" in reason for reason in result.verdict.reasons)
     assert any("larger than stated" in reason for reason in result.verdict.reasons)
-    # A fifth of its sigma: one more unknown of the board's shape moves it by less.
-    assert result.board.shape["scale"] == pytest.approx(0.0047, abs=2e-4)
+    # Of the 0.5 % a size that is shrunk by its own uncertainty leaves some.
+    away = result.board.shape["scale"] - 0.0047
+    assert abs(away) < 2.0 * result.board.sigma["scale"]
     # Park's camera, within what 15 views leave open; he takes the board as stated, and half a per
     # cent of the 0.9 m to it is 4 mm.
     away = result.transforms["base_from_cam"].translation - [-0.0184, 1.2637, 0.2900]
@@ -89,10 +90,8 @@ def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     assert result.verdict.status != "good"
     assert any("8 views" in reason for reason in result.verdict.reasons)
     assert any("disagree with the others by" in reason for reason in result.verdict.reasons)
-    # The stated side of 23.6 mm does not fit the robot's motion, by 14.5 %.
-    (size,) = [reason for reason in result.verdict.reasons if "By the robot's motion" in reason]
-    assert "larger than stated" in size
-    assert abs(result.board.shape["scale"] - 0.145) < 2 * result.board.sigma["scale"]
+    # Beside errors by the arm's posture, its motion says nothing against the stated side.
+    assert result.board.shape["scale"] == 0.0
     assert result.camera.estimated
     assert any("The given intrinsics do not fit" in reason for reason in result.verdict.reasons)
     away = result.transforms["flange_from_cam"].translation - [0.0582, -0.0342, -0.0426]
@@ -104,7 +103,7 @@ def test_an_arm_that_errs_by_posture_does_not_overrule_a_stated_board(real_data)
     # Its motion would have the board 4.5 % smaller; beside such errors that is known to 2.3 %.
     result = visioncal.calibrate(real_data / "sessions/kuka_checkerboard_in_hand")
     assert result.board.shape["scale"] == 0.0
-    assert result.verdict.causes[0].kind == "arm_errors"
+    assert "arm_errors" in [cause.kind for cause in result.verdict.causes[:2]]
     away = 1e3 * result.transforms["flange_from_cam"].translation - [14.9, -108.0, -81.5]
     # Six of eight halves are so near by plain least squares.
     assert np.linalg.norm(away) < 1.0

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from support.cells import calibrated, known_of
 
-from visioncal.calibration.stages import refine
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
 from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
@@ -98,19 +97,14 @@ def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():
     assert likely.value == pytest.approx(at(best).value, abs=1e-6)
 
 
-def test_a_focus_that_is_fixed_neither_breathes_nor_jitters(monkeypatch):
-    estimated = []
-    original = refine.estimate_levels
-    monkeypatch.setattr(
-        refine, "estimate_levels", lambda *them: estimated.append(original(*them)) or estimated[-1]
-    )
+def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     cell = simulate(replace(FINE, views=12))
     session = known_of(cell).session
     camera = session.document["camera"] | {"focus": "fixed"}
-    calibrated(
+    fixed = calibrated(
         cell,
         joints=False,
         session=replace(session, document=session.document | {"camera": camera}),
     )
-    assert estimated
-    assert all((item.breathing, item.jitter) == (0.0, 0.0) for item in estimated)
+    (levels,) = fixed.cell_fit.camera_parameters.levels.values()
+    assert (levels.breathing, levels.jitter) == (0.0, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from visioncal.estimation.mixed import CommonRows, MixedModel, SizePrior, Units, likely_sigma
+from visioncal.estimation.mixed import CommonRows, MixedModel, SizePrior, Units, level_weight
 
 # Sizes: the noise of the first units and of common rows, two errors of units, and of two groups of
 # common unknowns, of which one has a share of the other, too.
@@ -200,12 +200,8 @@ def test_a_size_of_nothing_is_found_beside_a_large_one():
     assert np.exp(found.logs[1]) < 1e-5
 
 
-def test_a_size_is_expected_as_large_as_values_are_beyond_their_noise():
-    covariance = np.diag([1.0, 4.0])
-    assert likely_sigma(np.array([0.5, -1.0]), covariance) == 0.0
-    # Values of fifty times their noise: their own root mean square, two of them.
-    values = np.array([50.0, 80.0])
-    expected = np.sqrt(np.mean(values**2))
-    assert likely_sigma(values, covariance) == pytest.approx(expected, rel=0.01)
-    # At twice the noise the size is as likely to be nothing.
-    assert 0.3 < likely_sigma(np.array([2.0]), np.eye(1)) < 1.0
+def test_a_size_counts_by_its_evidence_and_its_prior():
+    # Akaike: a parameter costs one in log-likelihood.
+    assert level_weight(2.0) == pytest.approx(0.5)
+    assert level_weight(2.0 + 2.0 * np.log(9.0), prior=0.1) == pytest.approx(0.5)
+    assert (level_weight(1e5, prior=1e-3), level_weight(-1e5)) == pytest.approx((1.0, 0.0))

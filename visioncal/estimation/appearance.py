@@ -19,7 +19,13 @@ from scipy.linalg import block_diag
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
-from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, field_modes
+from visioncal.estimation.lens_field import (
+    Coefficients,
+    LensLevels,
+    breathing_columns,
+    field_modes,
+    lens_part,
+)
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.poses import fit_poses
@@ -41,9 +47,6 @@ BOARD_NAMES = (
 # Exponents of the polynomial's terms.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
-# Prior of any printed board: its aspect ratio is right to about 0.1 %, its right angles to about
-# 1 mrad, and its bend is at most a hundredth of its size.
-_ASPECT_SIGMA, _SHEAR_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-3, 1e-2
 # Rigs with more points are taken as exact: each point adds three unknowns common to all views.
 MOST_LOOSE = 100
 
@@ -79,7 +82,7 @@ def shape_basis(target: Target) -> FloatArray:
     positions = corner_positions(target)
     if target.kind != "points":
         return board_basis(positions)
-    size = len(board_prior(target))
+    size = len(stated_board_sigma(target))
     return np.eye(3 * len(positions), size).reshape(len(positions), 3, size)
 
 
@@ -92,19 +95,18 @@ def boards_basis(targets: Sequence[Target]) -> FloatArray:
 
 def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]:
     """Slice of each target's shape among all shapes, which begin at index `first`."""
-    ends = first + np.cumsum([0, *(len(board_prior(target)) for target in targets)])
+    ends = first + np.cumsum([0, *(len(stated_board_sigma(target)) for target in targets)])
     return tuple(slice(*pair) for pair in pairwise(ends.tolist()))
 
 
-def board_prior(target: Target) -> FloatArray:
-    """Prior standard deviations (s,) of the target's shape."""
+def stated_board_sigma(target: Target) -> FloatArray:
+    """(s,) stated standard deviations of the target's shape; zero where nothing is stated."""
     if target.kind == "points":
         sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
         return np.repeat(sigmas, 3).astype(float)
-    positions = corner_positions(target)
-    half = float(np.ptp(positions, axis=0).max()) / 2
-    bows = np.full(len(_POWERS), _BOW_SIGMA_SHARE * half)
-    return np.array([target.square_sigma_m / target.square_m, _ASPECT_SIGMA, *bows, _SHEAR_SIGMA])
+    shape = np.zeros(len(BOARD_NAMES))
+    shape[SCALE] = target.square_sigma_m / target.square_m
+    return shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,10 +258,11 @@ def compress_points(
     poses, unscaled, coefficients = fit.cam_from_target, projected.residuals, None
     by_field = np.zeros((len(poses), 6, 0))
     if levels is not None and levels.field + levels.breathing > 0.0:
-        modes = np.zeros((len(stack.px), 0))
+        modes, by_lens = np.zeros((len(stack.px), 0)), np.zeros((0, 0))
         if levels.field > 0.0:
             modes = levels.field * field_modes(stack.px, camera.resolution, levels.length)
-        following, products = without.with_modes(modes)
+            by_lens = levels.field * lens_part(camera, levels.length)
+        following, products = without.with_modes(modes, by_lens)
         # Columns: shared values, breathing, residuals, field. Coefficients: field, then breathing.
         last = all_columns.shape[2] - 1
         beyond = np.r_[last + 1 : len(products), shared:last]
@@ -279,6 +282,9 @@ def compress_points(
         of_modes = coefficients.mean[: 2 * modes.shape[1]].reshape(2, -1)
         shift = modes @ of_modes.T
         stack.weigh(shift)
+        shift -= projected.by_intrinsics[:, :, : len(by_lens)] @ (
+            by_lens @ coefficients.mean[: 2 * modes.shape[1]]
+        )
         shift += all_columns[:, :, shared:last] @ coefficients.mean[2 * modes.shape[1] :]
         shift += stack.products_with_views(projected.by_pose, moved_poses[:, :, None])[:, :, 0]
         residuals, unscaled = residuals + roots * shift, unscaled + shift

@@ -258,7 +258,7 @@ class WithoutPoses:
         """(c, c) products of the projected columns."""
         return gram(self.left, self.left)
 
-    def with_modes(self, modes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_modes(self, modes: FloatArray, lens_part: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Appends the modes of a distortion field to the columns.
 
         Each mode moves corners along one axis only, and poses absorb little of it: a difference of
@@ -266,6 +266,7 @@ class WithoutPoses:
 
         Args:
             modes: (n, e) along one axis of the image, unweighted.
+            lens_part: (k, 2 e) multiples of the first k columns that are subtracted from the modes.
 
         Returns:
             (v, 6, c + 2 e) response of the poses, and (c + 2 e, c + 2 e) products of all projected
@@ -299,15 +300,21 @@ class WithoutPoses:
             along *= (self.roots / np.sqrt(1.0 + squares))[:, None]
             products -= along.T @ along
         all_products[count:, count:] = products
+        lens = len(lens_part)
+        answer -= self.answer[:, :, :lens] @ lens_part
+        all_products[:, count:] -= all_products[:, :lens] @ lens_part
+        all_products[count:] -= lens_part.T @ all_products[:lens]
         return np.concatenate([self.answer, answer], axis=2), all_products
 
-    def by_view(self, column: int, modes: FloatArray) -> FloatArray:
+    def by_view(self, column: int, modes: FloatArray, lens_part: FloatArray) -> FloatArray:
         """(v, c + 2 e) products of one column with all, by view; for stacks without `zooms`."""
         stack, own = self.stack, self.left[:, :, column : column + 1]
         if stack.weights is not None:
             modes = modes * stack.weights[:, None]
         by_modes = stack.products_with_modes(self.roots[stack.view_of, None, None] * own, modes)
-        return np.concatenate([stack.products_by_view(own, self.left), by_modes], axis=2)[:, 0]
+        by_columns = stack.products_by_view(own, self.left)
+        by_modes -= by_columns[:, :, : len(lens_part)] @ lens_part
+        return np.concatenate([by_columns, by_modes], axis=2)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,29 +7,29 @@ Relinearising at the solution until convergence is Gauss-Newton's method on the 
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.linalg import covariance_among, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
     fit_problem,
     fitted_covariance,
+    held_shift,
 )
 
 # False-alarm probability of the test for freeing unknowns.
@@ -42,7 +42,7 @@ FOLLOWS, _HALVINGS = 2.0, 12
 _CONTRADICTION = 3.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
 # by this factor.
-_UNEVEN = 2.0
+UNEVEN_LINKS = 2.0
 # Information on a size below this share of its prior is rounding.
 _UNMEASURED = 1e-6
 
@@ -80,8 +80,6 @@ class ConvergedFit:
     linearised: LinearisedCorners
     problem: Problem
     fit: Solution
-    # Cache of `Scores.of`.
-    _scores: list[tuple[FrameModel, "Scores"]] = field(default_factory=list, init=False, repr=False)
 
     @property
     def columns(self) -> slice:
@@ -120,16 +118,14 @@ class ConvergedFit:
         """(p, p) covariance of the fitted unknowns, at the measured poses."""
         return fitted_covariance(self.problem, self.fit.state, self.fit.noise)
 
-    @property
-    def moving(self) -> IntArray:
-        """Indices of the fitted lens and board values."""
-        return self.linearised.moving
+    def columns_of(self, places: IntArray) -> IntArray:
+        """Columns of free lens and board values, given their indices."""
+        return np.asarray(self.columns.start + np.searchsorted(self.linearised.free, places))
 
 
 def fit_jointly(
     optics: CameraParameters,
     side: FrameModel,
-    moving: IntArray,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
     before: LinearisedCorners | None = None,
@@ -139,7 +135,6 @@ def fit_jointly(
     Args:
         optics: Corners, and initial lens and board parameters.
         side: Frame part of the fit.
-        moving: Indices of the lens and board values to fit.
         frames: Initial poses of the unknown frames.
         others: Initial values of all other effects; their linearisation point if None.
         before: Previous linearisation of the corners; see `CameraParameters.linearised`.
@@ -148,7 +143,7 @@ def fit_jointly(
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
-        return _settled(side, _fitted(side, optics.linearised(moving, before), frames, others))
+        return _settled(side, _fitted(side, optics.linearised(before), frames, others))
 
 
 @contextmanager
@@ -174,13 +169,12 @@ def diverging() -> Iterator[None]:
 
 
 def refit_jointly(
-    fitted: ConvergedFit, side: FrameModel, moving: IntArray, optics: CameraParameters | None = None
+    fitted: ConvergedFit, side: FrameModel, optics: CameraParameters | None = None
 ) -> ConvergedFit:
-    """Refits from a converged fit, with other free values or other priors."""
+    """Refits from a converged fit, with other sizes of errors of lenses and boards."""
     return fit_jointly(
         optics or fitted.camera_parameters,
         side,
-        moving,
         fitted.frames,
         fitted.others,
         before=fitted.linearised,
@@ -215,7 +209,7 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
         if candidate.has_lenses:
-            corners = candidate.linearised(fitted.moving)
+            corners = candidate.linearised()
             if all(sigma <= limit for sigma, limit in zip(corners.sigmas_px, limits, strict=True)):
                 return corners
     return fitted.linearised
@@ -255,23 +249,22 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
-    """Measures a board's scale by the robots' motion; infinite sigma if it is unobservable."""
-    optics = fitted.linearised.camera_parameters
-    (index,) = optics.scale_of(board)
-    stated, prior = optics.stated_scale_sigma(board), float(optics.prior_sigma[index] ** -2.0)
-    step, covariance = Scores.of(side, fitted).asked_for(np.array([index]), fitted.moving)
-    # The prior is subtracted afterwards: without it the scale may be undetermined.
-    measured = 1.0 / float(covariance[0, 0]) - prior
+def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
+    """A board's scale by the robots' motion; infinite sigma if it is unobservable."""
+    optics, place = fitted.camera_parameters, fitted.camera_parameters.scale_of(board)
+    stated = optics.stated_scale_sigma(board)
+    if place[0] not in fitted.linearised.free:
+        return MeasuredScale(board, 0.0, np.inf, stated)
+    covariance = covariance_of(fitted.problem, fitted.fit)
+    ((column,), prior) = fitted.columns_of(place), float(optics.prior_information[place, place][0])
+    scale = float(optics.values[place[0]] + held_shift(fitted.problem, fitted.fit)[column])
+    # The estimate is the mean of the measured and the stated scale, weighted by their information.
+    measured = 1.0 / float(covariance[column, column]) - prior
     if measured <= _UNMEASURED * prior:
         return MeasuredScale(board, 0.0, np.inf, stated)
-    with_stated = float(fitted.camera_parameters.values[index] + step[0])
-    return MeasuredScale(
-        board,
-        with_stated * (1.0 + prior / measured),
-        (_UNEVEN if side.has_links else 1.0) * measured**-0.5,
-        stated,
-    )
+    scale *= 1.0 + prior / measured
+    sigma = (UNEVEN_LINKS if side.has_links else 1.0) * measured**-0.5
+    return MeasuredScale(board, scale, sigma, stated)
 
 
 def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
@@ -290,7 +283,7 @@ def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -
     extended = State(state.edges, np.append(state.values, 0.0))
     information, gradient = normal_equations(problem, extended, fitted.fit.noise)
     covariance = covariance_among(information, problem.moving)
-    sigma = (_UNEVEN if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
+    sigma = (UNEVEN_LINKS if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
     return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
 
 
@@ -341,79 +334,30 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
 
 
 def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
-    """Squared Mahalanobis distance of fitted lens and board values from the stated ones.
+    """Squared Mahalanobis distance of lens and board values from the stated ones, by the data.
 
     Args:
         fitted: A fit in which these values are free.
         places: (k,) indices of the values.
     """
-    at = fitted.columns.start + np.searchsorted(fitted.linearised.free, places)
-    offset = (fitted.camera_parameters.values - fitted.camera_parameters.stated)[places]
-    return float(offset @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], offset))
+    at, optics = fitted.columns_of(places), fitted.camera_parameters
+    covariance = fitted.covariance()[np.ix_(at, at)]
+    # The prior of these values given the others draws them towards the stated ones.
+    prior = optics.prior_information[np.ix_(places, places)]
+    information = covariance_from(covariance)
+    offset = information @ (optics.values - optics.stated)[places]
+    values, vectors = np.linalg.eigh(information - prior)
+    kept = values > _UNMEASURED * np.diag(information).max()
+    return float(np.sum((offset @ vectors[:, kept]) ** 2 / values[kept]))
 
 
-def contradicted_lens(fitted: ConvergedFit, camera: str) -> bool:
-    """Whether stated intrinsics deviate by more than their prior explains."""
-    optics = fitted.camera_parameters
-    deviation = (optics.values - optics.stated)[optics.lenses[camera]]
-    return contradicts(deviation, lens_prior(optics.problems[camera].scene))
-
-
-def contradicts(away: FloatArray, prior_sigma: FloatArray) -> bool:
-    """Whether any of (k,) deviations from stated values exceeds what its prior sigma explains."""
-    return bool(np.any(np.abs(away) > _CONTRADICTION * prior_sigma))
+def contradicted_lens(optics: CameraParameters, camera: str) -> bool:
+    """Whether intrinsics deviate by more than their stated standard deviation explains."""
+    deviation = (optics.values - optics.stated)[optics.lens_of(camera)[:4]]
+    stated = optics.problems[camera].stated_sigma[:4]
+    return bool(np.any(np.abs(deviation) > _CONTRADICTION * stated))
 
 
 def chance_limit(freedom: int) -> float:
     """Chi-square limit of the squared error's decrease by chance for additional free values."""
     return float(chi2_limit(_FALSE_ALARM, freedom))
-
-
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """Normal equations for score tests of the values that a fit holds (Rao)."""
-
-    information: FloatArray  # (p, p) with all values free.
-    gradient: FloatArray  # (p,) of half the squared error, at the fit.
-    moving: Mask  # (p,) mask of the columns that are free in the problem.
-    columns: slice  # Columns of the lens and board values.
-    places: IntArray  # Indices of the values in these columns.
-
-    @classmethod
-    def of(cls, side: FrameModel, fitted: ConvergedFit) -> "Scores":
-        """Computes the scores of all values at a converged fit."""
-        for cached_side, scores in fitted._scores:
-            if cached_side is side:
-                return scores
-        freed = fitted.linearised.freed(np.arange(len(fitted.linearised.camera_parameters.values)))
-        values = fitted.fit.state.values[len(fitted.linearised.free) :]
-        values = np.concatenate([fitted.camera_parameters.values, values])
-        problem, state = side.problem(freed), State(fitted.fit.state.edges, values)
-        first = fitted.columns.start
-        scores = cls(
-            *normal_equations(problem, state, fitted.fit.noise),
-            problem.moving,
-            slice(first, first + len(freed.free)),
-            freed.free,
-        )
-        fitted._scores[:] = [(side, scores)]
-        return scores
-
-    def gain(self, moving: IntArray) -> float:
-        """Decrease of the squared error if these values are free (Rao's score statistic)."""
-        free = self.moving.copy()
-        free[self.columns] = np.isin(self.places, moving)
-        return float(self.gradient @ covariance_among(self.information, free) @ self.gradient)
-
-    def asked_for(self, places: IntArray, moving: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Step (k,) of held values if they were free, and its (k, k) covariance.
-
-        Args:
-            places: (k,) indices of the held values.
-            moving: Indices of the values that are free as well.
-        """
-        free = self.moving.copy()
-        free[self.columns] = np.isin(self.places, np.union1d(moving, places))
-        covariance = covariance_among(self.information, free)
-        columns = self.columns.start + np.searchsorted(self.places, places)
-        return -covariance[columns] @ self.gradient, covariance[np.ix_(columns, columns)]

@@ -2,9 +2,10 @@
 
 A corner is displaced by `(b (d / d0 - 1) + j) (px - centre) + field(px)`: b is focus breathing, by
 the view's distance d over the mean one, j is focus jitter, one per view, and the field is a
-Gaussian process over the image with a squared exponential kernel of one length. Each has zero mean
-and a size of its own, which `lens_levels` estimates. Sizes are in units of the corners' noise:
-corners with these effects still have 1 px noise.
+Gaussian process over the image with a squared exponential kernel of one length, less what the
+intrinsics can explain of it over the image: otherwise it would trade with the focal length. Each
+has zero mean and a size of its own, which `lens_levels` estimates. Sizes are in units of the
+corners' noise: corners with these effects still have 1 px noise.
 """
 
 from dataclasses import dataclass
@@ -15,9 +16,15 @@ import numpy as np
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.linalg import gram
+from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
 
 # Grid points per axis for the field's modes, and the share of its variance they keep.
-_POINTS, _KEPT = 64, 0.99
+_POINTS, _KEPT = 64, 0.999
+# Grid points per axis of the image over which the intrinsics' part is removed, and the relative
+# singular value below which a combination of intrinsics is undetermined there.
+_IMAGE_GRID, _DETERMINED = 20, 1e-8
+# Least error of each mode of a lens that has errors [px].
+_LEAST_ERROR_PX = 1e-3
 # Combinations that move all poses together by less than this share of a pose's variance are
 # neglected.
 _MOVED = 1e-2
@@ -33,6 +40,40 @@ class LensLevels:
     jitter: float = 0.0  # Relative change of the focal length from view to view [1/px].
     # Fall of twice the log-likelihood without each of the three.
     gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class LensSizes:
+    """Sizes of a given lens's errors: standard deviations of its `lens_modes` [px]."""
+
+    focal: float = 0.0  # Of the focal lengths: of both together, and of their ratio.
+    centre: float = 0.0  # Of the principal point, per axis.
+    shape: float = 0.0  # Of each mode of the distortion.
+
+    def variances(self, count: int) -> FloatArray:
+        """(k,) variances of the modes [px^2]; zeros for a lens without errors."""
+        sizes = np.repeat([self.focal, self.centre, self.shape], [2, 2, count - 4])
+        return np.maximum(sizes, _LEAST_ERROR_PX) ** 2 if sizes.any() else sizes
+
+
+def lens_modes(camera: Camera) -> FloatArray:
+    """(k, k) intrinsics by modes whose displacements over the image are 1 px (rms), each.
+
+    The first changes both focal lengths by one factor, the second their ratio, the next two the
+    principal point, and the others, orthogonal to these, the distortion.
+    """
+    values = intrinsics(camera)
+    order = np.eye(len(values))
+    order[:2, 0], order[:2, 1] = values[:2], values[:2] * (1.0, -1.0)
+    columns = _over_image(camera)[1].reshape(-1, len(values)) @ order
+    columns /= np.sqrt(len(columns) / 2)
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    root = np.asarray(np.linalg.qr(columns / scale, mode="r"))
+    # Combinations that displace nothing have no errors.
+    nothing = np.abs(np.diag(root)) < _DETERMINED
+    root[nothing, nothing] = 1.0 / _DETERMINED
+    return np.asarray(order / scale @ np.linalg.inv(root))
 
 
 def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> FloatArray:
@@ -55,6 +96,32 @@ def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> F
     enough = int(np.searchsorted(np.cumsum(sizes.ravel()[order]), _KEPT * sizes.sum())) + 1
     at_x, at_y = np.unravel_index(order[:enough], sizes.shape)
     return np.asarray(by_x[:, at_x] * by_y[:, at_y])
+
+
+def lens_part(camera: Camera, length: float) -> FloatArray:
+    """(k, 2 e) intrinsics that explain most of each mode over the image (least squares).
+
+    The modes along x come first, then those along y. A random field must be orthogonal to the fixed
+    columns beside it (Hodges and Reich 2010).
+    """
+    px, columns = _over_image(camera)
+    flat = columns.reshape(-1, columns.shape[2])
+    scale = np.linalg.norm(flat, axis=0)
+    scale[scale == 0.0] = 1.0
+    inverse = np.linalg.pinv(flat / scale, rcond=_DETERMINED) / scale[:, None]
+    by_axis = inverse.reshape(len(scale), -1, 2)
+    modes = field_modes(px, camera.resolution, length)
+    return np.concatenate([by_axis[:, :, 0] @ modes, by_axis[:, :, 1] @ modes], axis=1)
+
+
+def _over_image(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) pixels all over the image, and (n, 2, k) their derivatives by the intrinsics."""
+    axes = (np.linspace(0.0, size - 1.0, _IMAGE_GRID) for size in camera.resolution)
+    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    rays = normalise(camera, px)
+    seen = np.isfinite(rays).all(axis=1)
+    points = np.column_stack([rays[seen], np.ones(int(seen.sum()))])
+    return px[seen], project_with_jacobian(camera, points).jacobian_intrinsics
 
 
 def _modes(at: FloatArray, extent: float) -> tuple[FloatArray, FloatArray]:
@@ -119,6 +186,10 @@ def displacements(
     if levels.field > 0.0:
         modes = levels.field * field_modes(px, camera.resolution, levels.length)
         columns = np.einsum("ij,ne->nije", np.eye(2), modes).reshape(len(px), 2, -1)
+        rays = normalise(camera, px)
+        points = np.column_stack([np.nan_to_num(rays), np.ones(len(px))])
+        by_lens = project_with_jacobian(camera, points).jacobian_intrinsics
+        columns -= by_lens @ (levels.field * lens_part(camera, levels.length))
     if levels.breathing > 0.0:
         share = levels.breathing * np.broadcast_to(far, len(px))
         breath = share[:, None] * (px - camera.matrix[2:])

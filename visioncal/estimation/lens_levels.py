@@ -2,26 +2,44 @@
 
 The corners of one camera and its observations (the chains of frames through it) are linearised
 once. Random effects are the modes of the distortion field, focus breathing, one focus jitter a
-view, and one error of each flange a stop; fixed effects are frames, lens, board and whatever else
-the fit moves. Errors of single views are eliminated view by view, so that an evaluation of the
-restricted likelihood costs one Cholesky factorisation of some hundred unknowns.
+view, the errors of a given lens and of the boards, and one error of each flange a stop; fixed
+effects are frames, an estimated lens, and whatever else the fit moves. Errors of single views are
+eliminated view by view, so that an evaluation of the restricted likelihood costs one Cholesky
+factorisation of some hundred unknowns.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
-from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
+from visioncal.estimation.lens_field import (
+    LensLevels,
+    LensSizes,
+    distances,
+    field_modes,
+    lens_modes,
+    lens_part,
+    zooms,
+)
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.mixed import HARDLY, CommonRows, MixedEstimate, MixedModel, Units
+from visioncal.estimation.mixed import (
+    HARDLY,
+    CommonRows,
+    MixedEstimate,
+    MixedModel,
+    Units,
+    level_weight,
+)
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import ratio_prior
+from visioncal.estimation.scene import BoardSizes, CornerProblem
 
 # Candidate correlation lengths of the field, as shares of the image's width; index of the first
 # that is tried, and least gain in log-likelihood of a change to another one.
@@ -42,8 +60,20 @@ _FLANGE_RANGE = (1e-7, 1e-1)
 SIGNIFICANT = float(chi2_limit(2e-4, 1))
 # Breathing and jitter are not identifiable with fewer stops.
 _FEWEST_STOPS = 6
-# Indices of the levels: corner noise, field, breathing, jitter, and then two for each flange.
-_NOISE, _FIELD, _BREATHING, _JITTER, _FLANGES = range(5)
+# Indices of the sizes: corner noise, field, breathing, jitter, one that is not estimated, three of
+# a given lens; then three of each printed board, and two of each flange.
+_NOISE, _FIELD, _BREATHING, _JITTER, _ONE, _FOCAL, _CENTRE, _SHAPE, _BOARDS = range(9)
+# Lower and upper bounds and start values of errors of a given lens [px], and of a board's scale,
+# plane (shares of its size) and bend [m].
+_LENS_ERRORS, _BOARD_ERRORS = (
+    (1e-3, 1e2, 1.0),
+    ((1e-6, 0.2, 1e-3), (1e-6, 2e-2, 3e-4), (1e-7, 5e-2, 1e-4)),
+)
+# Share of boards whose size is not within what is stated; of boards that are not flat, or not drawn
+# to one scale, and of given lenses that have errors.
+_WRONG_SIZE, _WRONG_SHAPE = 1e-2, 0.1
+# Weight of a size below which it is zero.
+_NO_WEIGHT = 0.05
 _RIDGE = 1e-9
 
 
@@ -61,7 +91,11 @@ class _Rows:
     by_errors: FloatArray  # (o, 6, 6 w) Jacobian by the flange errors.
     away: FloatArray  # (o, 6) the residuals.
     robots: IntArray  # (o, w) indices of these flanges' robots; -1 for none.
-    places: IntArray  # (c - 1,) indices of lens and board among the unknowns.
+    # (c - 1, r + z) lens and board by those r of them that are unknowns by themselves, and by the z
+    # modes of a given lens; indices (r,) of the former among the unknowns.
+    values: FloatArray
+    places: IntArray
+    shares: FloatArray  # (r + z, k) their variance by the square of each size; zeros where flat.
     known: FloatArray  # (t, t) information on the unknowns from everything else.
     gradient: FloatArray  # (t,) half the gradient of everything else.
 
@@ -74,6 +108,7 @@ class _Likelihood:
     counts: FloatArray  # (k,) number of random values of each level; zero for the corner noise.
     # RMS corner residuals with lens, board and field all free, and with lens and board alone [px].
     noise_px: tuple[float, float]
+    flanges: int  # Index of the first size of a flange.
 
     def minimised(
         self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
@@ -83,7 +118,7 @@ class _Likelihood:
         hardly = HARDLY * np.maximum(self.counts, 1.0)
         found = self.model.maximised(logs, low, high, enough=enough, hardly=hardly)
         # Insignificant levels decrease by ever smaller gains: tries their lower bounds directly.
-        for level in (_FIELD, _BREATHING, _JITTER):
+        for level in (_FIELD, _BREATHING, _JITTER, *range(_FOCAL, self.flanges)):
             if found.gradient[level] <= 0.0 or found.logs[level] <= low[level]:
                 continue
             without = found.logs.copy()
@@ -101,7 +136,8 @@ class _Likelihood:
         without[level] = least
         upper_bound = 2.0 * (self.model.at(without, is_sloped=False).value - found.value)
         # The other levels are only refitted where it matters.
-        if upper_bound < SIGNIFICANT:
+        is_beyond_stated = level >= _BOARDS and (level - _BOARDS) % 3 == 0
+        if upper_bound < SIGNIFICANT or (level >= _FOCAL and not is_beyond_stated):
             return upper_bound
         return 2.0 * (self.minimised(without, (*closed, level)).value - found.value)
 
@@ -109,6 +145,10 @@ class _Likelihood:
         """Lower and upper bounds of the levels' logarithms."""
         low = np.repeat([_FLANGE_RANGE[0]], len(self.counts))
         high = np.repeat([_FLANGE_RANGE[1]], len(low))
+        low[_ONE] = high[_ONE] = 1.0
+        low[_FOCAL:_BOARDS], high[_FOCAL:_BOARDS] = _LENS_ERRORS[:2]
+        for at in range(_BOARDS, self.flanges):
+            low[at], high[at] = _BOARD_ERRORS[(at - _BOARDS) % 3][:2]
         low[_NOISE], high[_NOISE] = np.multiply(_NOISE_RANGE, self.noise_px)
         low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px[0], 1.0, 1.0))
         high[_FIELD : _JITTER + 1] = _MOST
@@ -116,68 +156,110 @@ class _Likelihood:
         return np.log(low), np.log(high)
 
 
-def are_beyond(levels: LensLevels, sigma_px: float, share: float = 1.2) -> bool:
-    """Whether levels exceed those of any real lens, given the corner noise of a fit with them.
+@dataclass(frozen=True)
+class CameraSizes:
+    """Sizes of the errors that one camera's corners and motion show."""
 
-    They are in units of that noise: both grow where the poses diverge.
-    """
-    sizes = sigma_px * np.array([levels.field, levels.breathing, levels.jitter])
-    # The noise was estimated again, and differs by some percent.
-    return bool(np.any(sizes > share * np.array(_MOST)))
+    levels: LensLevels  # Of its lens, beyond the model.
+    lens: LensSizes  # Of its intrinsics, if given, beyond what is stated.
+    boards: tuple[BoardSizes, ...]  # Of the printed boards, beyond what is stated.
 
 
-def estimate_levels(
+def estimate_sizes(
     seen: LinearisedCorners,
     problem: Problem,
     rows: IntArray,
     state: State,
     noise: Noise,
     camera: str,
-) -> LensLevels:
-    """Estimates the error levels of one camera's lens, beyond its model.
+    uneven: float = 1.0,
+) -> CameraSizes:
+    """Estimates the sizes of errors of one camera's lens and of the boards.
 
     Args:
-        seen: The linearised corners of all cameras, with all values of lenses and boards free.
+        seen: The linearised corners of all cameras, with all values free.
         problem: The inlier observations, with these corners.
         rows: (n,) the view of each observation; -1 for none.
         state: The linearisation point.
         noise: The levels of robots and sensors.
         camera: Name of the camera.
+        uneven: Factor by which errors of arms that look like a board's scale may be larger than
+            their size says.
     """
-    mine = seen.camera_parameters.problems[camera]
-    if not mine.has_spare_corners:
-        return LensLevels()
+    mine, count = seen.camera_parameters.problems[camera], len(noise.robots)
     linearised = _rows(seen, problem, rows, state, noise, camera)
-    has_focus_levels = (
-        len(np.unique(linearised.chained)) >= _FEWEST_STOPS and not mine.scene.is_focus_fixed
-    )
-    closed = () if has_focus_levels else (_BREATHING, _JITTER)
+    closed = _closed(mine, len(np.unique(linearised.chained)))
     before = mine.levels
     at = _FIRST if before is None else _LENGTHS.index(before.length)
-    likelihood = _assembled(linearised, _LENGTHS[at], len(noise.robots))
+    likelihood = _assembled(linearised, _LENGTHS[at], count)
     left_px, noise_px = likelihood.noise_px
     if left_px > _WRONG_PX:
-        return LensLevels()
+        return CameraSizes(LensLevels(), mine.lens_sizes, mine.board_sizes)
     sizes = np.array([noise_px, _START[0] * left_px, *_START[1:]])
     if before is not None:
         stated = [1.0, before.field, before.breathing, before.jitter]
         sizes = np.maximum(noise_px * np.array(stated), np.array([0.0, 0.1, 0.1, 0.1]) * sizes)
-    logs = np.log(np.concatenate([sizes, np.maximum(noise.robots, 1e-6).ravel()]))
+    starts = [1.0, *[_LENS_ERRORS[2]] * 3]
+    starts += [error[2] for _ in mine.board_sizes for error in _BOARD_ERRORS]
+    logs = np.log(np.concatenate([sizes, starts, np.maximum(noise.robots, 1e-6).ravel()]))
     found = likelihood.minimised(logs, closed)
-    for step in (1, -1):
+    if found.logs[_JITTER] > np.log(2.0 * _LEAST[-1]):
+        # A focus that varies may have been taken for errors of the flange: then these are far
+        # smaller from above. Else it would only stand in for whatever corners have in common.
+        logs[[_BREATHING, _JITTER]] = np.log(0.5 * np.array(_MOST[1:]))
+        above, flanges = likelihood.minimised(logs, closed), slice(likelihood.flanges, None)
+        if above.value < found.value and np.any(above.logs[flanges] < found.logs[flanges] - 1.0):
+            found = above
+    for step in (1, -1) if _FIELD not in closed else ():
         while 0 <= at + step < len(_LENGTHS):
-            candidate = _assembled(linearised, _LENGTHS[at + step], len(noise.robots))
+            candidate = _assembled(linearised, _LENGTHS[at + step], count)
             other = candidate.minimised(found.logs, closed, found.value - _GAIN)
             if other.value > found.value - _GAIN:
                 break
             found, at, likelihood = other, at + step, candidate
-    sizes = np.exp(found.logs[: _JITTER + 1])
-    low = np.exp(likelihood.limits(closed)[0][: _JITTER + 1])
-    field, breathing, jitter = np.where(sizes > 2.0 * low, sizes, 0.0)[1:] / sizes[_NOISE]
+    low = np.exp(likelihood.limits(closed)[0])
+    sizes = np.where(np.exp(found.logs) > 2.0 * low, np.exp(found.logs), 0.0)
+    field, breathing, jitter = sizes[_FIELD : _JITTER + 1] / np.exp(found.logs[_NOISE])
     gains = [likelihood.gain(found, closed, index) for index in (_FIELD, _BREATHING, _JITTER)]
-    return LensLevels(
-        float(field), _LENGTHS[at], float(breathing), float(jitter), (gains[0], gains[1], gains[2])
+    for index in np.flatnonzero(sizes[: likelihood.flanges]):
+        if index >= _FOCAL:
+            # Averaged over a size of zero, too.
+            is_scale = index >= _BOARDS and (index - _BOARDS) % 3 == 0
+            prior = _WRONG_SIZE if is_scale else _WRONG_SHAPE
+            gain = likelihood.gain(found, closed, int(index))
+            weight = level_weight(gain / uneven**2 if is_scale else gain, prior)
+            sizes[index] *= weight**0.5 if weight > _NO_WEIGHT else 0.0
+    return CameraSizes(
+        LensLevels(
+            float(field),
+            _LENGTHS[at],
+            float(breathing),
+            float(jitter),
+            (gains[0], gains[1], gains[2]),
+        ),
+        LensSizes(*sizes[_FOCAL:_BOARDS].tolist()),
+        tuple(
+            BoardSizes(*sizes[first : first + 3].tolist())
+            for first in range(_BOARDS, likelihood.flanges, 3)
+        ),
     )
+
+
+def _closed(problem: CornerProblem, stops: int) -> tuple[int, ...]:
+    """The sizes that are zero: those that too few corners or stops do not tell."""
+    boards = range(_BOARDS, _BOARDS + 3 * len(problem.board_sizes))
+    closed = set[int]()
+    if not problem.has_spare_corners:
+        closed |= {_FIELD, _BREATHING, _JITTER, _SHAPE}
+        # A lens that is known to some pixels may be off by more; another one is held.
+        if problem.scene.matrix_sigma_px is None:
+            closed |= {_FOCAL, _CENTRE}
+        closed |= {at for at in boards if (at - _BOARDS) % 3}
+    if stops < _FEWEST_STOPS or problem.scene.is_focus_fixed:
+        closed |= {_BREATHING, _JITTER}
+    if problem.is_flat[0]:
+        closed |= {_FOCAL, _CENTRE, _SHAPE}
+    return tuple(sorted(closed))
 
 
 def _rows(
@@ -203,6 +285,12 @@ def _rows(
         array[:, :, None] for array in (breath, focus, now.residuals)
     )]  # fmt: skip
     all_columns = np.concatenate(columns, axis=2)
+    values, shares, alone = _values(corners, len(noise.robots))
+    # Errors are deviations from the stated values.
+    deviation = np.where(
+        corners.is_flat, 0.0, (optics.values - optics.stated)[optics.places(camera)]
+    )
+    all_columns[:, :, -1] -= all_columns[:, :, : len(deviation)] @ deviation
     own_rows = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))
     linear, (of, members) = problem.linear(state), problem.units
     jacobian = linear.jacobian_of(own_rows)
@@ -216,12 +304,16 @@ def _rows(
     known[np.ix_(places, places)] -= weight * seen.compressed[which].shared_information
     gradient[places] -= weight * seen.compressed[which].shared_gradient
     kept = problem.moving & jacobian.any(axis=(0, 1))
-    kept[places] = problem.moving[places]
+    kept[places] = alone
     # The fit's coefficients of this lens's errors are left out: they are estimated again here.
     sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
     first = problem.effect_columns[LENSES].start + len(seen.free) + sum(sizes[:which])
     kept[first : first + sizes[which]] = False
-    known, gradient = _without(known, gradient, problem.moving & ~kept, kept)
+    out = problem.moving & ~kept
+    out[places] = False
+    known, gradient = _without(known, gradient, out, kept)
+    own = np.searchsorted(np.flatnonzero(kept), places[alone])
+    gradient -= known[:, own] @ deviation[alone]
     return _Rows(
         stack,
         lens,
@@ -231,10 +323,39 @@ def _rows(
         linear.by_errors[own_rows],
         linear.residuals[own_rows],
         np.where((of[own_rows] >= 0)[:, None], members[of[own_rows]], -1),
-        np.searchsorted(np.flatnonzero(kept), places),
+        values,
+        own,
+        shares,
         known,
         gradient,
     )
+
+
+def _values(problem: CornerProblem, robots: int) -> tuple[FloatArray, FloatArray, Mask]:
+    """Lens and board by random and flat unknowns.
+
+    Returns:
+        (c, r + z) and (r + z, k) `values` and `shares` of `_Rows`, and (c,) mask of the values that
+        are unknowns by themselves: all but those of a lens that is given without a sigma.
+    """
+    count, lens = len(problem.stated_sigma), len(problem.lens)
+    alone = (problem.stated_sigma > 0.0) | (np.arange(count) >= lens)
+    values = np.eye(count)[:, alone]
+    sizes = _BOARDS + 3 * len(problem.board_sizes) + 2 * robots
+    by_value = np.zeros((count, sizes))
+    by_value[:, _ONE] = np.where(problem.is_flat, 0.0, problem.stated_sigma) ** 2
+    for at, board in zip(range(_BOARDS, sizes, 3), problem.printed, strict=False):
+        aspect, *bends, shear = problem.shape_of(board)
+        by_value[problem.scale_of(board), at] = 1.0
+        by_value[[aspect, shear], at + 1] = by_value[bends, at + 2] = 1.0
+    shares = by_value[alone]
+    if not problem.is_flat[0]:
+        modes = np.zeros((count, lens))
+        modes[:lens] = lens_modes(problem.scene.camera)
+        of_modes = np.zeros((lens, sizes))
+        of_modes[:2, _FOCAL] = of_modes[2:4, _CENTRE] = of_modes[4:, _SHAPE] = 1.0
+        values, shares = np.hstack([values, modes]), np.vstack([shares, of_modes])
+    return values, shares, alone
 
 
 def _without(
@@ -259,14 +380,20 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     """
     stack, without, chained = rows.stack, rows.without, rows.chained
     modes = field_modes(stack.px, rows.camera.resolution, length)
-    answer, products = without.with_modes(modes)
+    by_lens = lens_part(rows.camera, length)
+    answer, products = without.with_modes(modes, by_lens)
     # Columns: lens, board, breathing, a change of focus, residuals, and the modes.
     focus = without.left.shape[2] - 2
-    residual, shared = focus + 1, np.r_[:focus, focus + 2 : len(products)]
-    by_focus = without.by_view(focus, modes)
-    views, t, levels = len(stack.views), len(rows.known), _FLANGES + 2 * robots
-    size = t + len(shared) - len(rows.places)
+    residual, beside = focus + 1, np.r_[focus - 1, focus + 2 : len(products)]
+    shared = np.r_[:focus, focus + 2 : len(products)]
+    # From values of lens and board to the unknowns.
+    by_values = np.asarray(block_diag(rows.values, np.eye(len(beside))))
+    by_focus = without.by_view(focus, modes, by_lens)
+    views, t, flanges = len(stack.views), len(rows.known), rows.shares.shape[1] - 2 * robots
+    levels = flanges + 2 * robots
+    size = t + by_values.shape[1] - len(rows.places)
     columns = np.concatenate([rows.places, np.arange(t, size)])
+    following_values = answer[:, :, shared] @ by_values
     noise, known_noise = np.zeros((2, views, 7, 7))
     jacobian, residuals = np.zeros((views, 7, size)), np.zeros((views, 7))
     # Views without an observation have no pose rows; theirs are of no consequence.
@@ -275,7 +402,7 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     noise[chained, :6, :6] = without.inverse[chained]
     # Lens and board move the measured poses, as breathing and the field do.
     following = np.zeros((len(chained), 6, size))
-    following[:, :, :t], following[:, :, columns] = rows.jacobian, answer[chained][:, :, shared]
+    following[:, :, :t], following[:, :, columns] = rows.jacobian, following_values[chained]
     jacobian[chained, :6] = following
     residuals[chained, :6] = rows.away + answer[chained, :, residual]
     zoomed = np.zeros((views, 7))
@@ -284,7 +411,8 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     # Corners of a view without extent do not determine its focus.
     focus_information = np.maximum(by_focus[:, focus], _RIDGE)
     noise[:, 6, 6] = 1.0 / focus_information
-    jacobian[:, 6, columns] = by_focus[:, shared] / focus_information[:, None]
+    by_shared = by_focus[:, shared] @ by_values
+    jacobian[:, 6, columns] = by_shared / focus_information[:, None]
     residuals[:, 6] = by_focus[:, residual] / focus_information
     parts = np.zeros((2 + 2 * robots, views, 7, 7))
     parts[0], parts[1] = noise, zoomed[:, :, None] * zoomed[:, None, :]
@@ -296,11 +424,9 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
             parts[2 + 2 * of_slot[seen] + axes, chained[seen], :6, :6] += moved @ np.swapaxes(
                 moved, 1, 2
             )
-    by_shared = by_focus[:, shared]
-    shared_products = products[np.ix_(shared, shared)] - by_shared.T @ (
-        by_shared / focus_information[:, None]
-    )
-    pulled = products[shared, residual] - residuals[:, 6] @ by_shared
+    shared_products = by_values.T @ products[np.ix_(shared, shared)] @ by_values
+    shared_products -= by_shared.T @ (by_shared / focus_information[:, None])
+    pulled = by_values.T @ products[shared, residual] - residuals[:, 6] @ by_shared
     information, gradient = np.zeros((size, size)), np.zeros(size)
     information[np.ix_(columns, columns)], gradient[columns] = shared_products, pulled
     among, cost = products[np.ix_(shared, shared)], products[residual, residual]
@@ -314,22 +440,25 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
         return floored_sigma_px(float(np.sqrt(max(rest, 0.0) / max(freedom - free, 1.0))))
 
     shares = np.zeros((size, levels))
-    shares[t, _BREATHING] = shares[t + 1 :, _FIELD] = 1.0
+    own = len(rows.shares) - len(rows.places)
+    shares[rows.places], shares[t : t + own] = np.split(rows.shares, [len(rows.places)])
+    shares[t + own, _BREATHING] = shares[t + own + 1 :, _FIELD] = 1.0
     of_corners = CommonRows(
         information, gradient, float(cost - by_focus[:, residual] @ residuals[:, 6]),
         freedom - views, _NOISE,
     )  # fmt: skip
     known = CommonRows(rows.known, rows.gradient).beside(size - t)
-    sizes = np.r_[_NOISE, _JITTER, _FLANGES:levels]
+    sizes = np.r_[_NOISE, _JITTER, flanges:levels]
     units = Units(residuals, jacobian, known_noise, parts, sizes)
-    prior = ratio_prior(range(robots), levels, _FLANGES)
-    counts = shares.sum(axis=0)
+    prior = ratio_prior(range(robots), levels, flanges)
+    counts = np.sum(shares > 0.0, axis=0).astype(float)
     counts[_JITTER] = views
-    counts[_FLANGES:] = [
+    counts[flanges:] = [
         3 * np.sum(rows.robots == robot) for robot in range(robots) for _ in range(2)
     ]
     return _Likelihood(
         MixedModel((units,), (of_corners, known), shares, prior),
         counts,
         (left_px(len(shared)), left_px(focus)),
+        flanges,
     )

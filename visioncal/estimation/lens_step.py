@@ -38,7 +38,11 @@ class LensStep:
 
 
 def lens_step(
-    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, order: IntArray
+    stack: CornerStack,
+    camera: Camera,
+    cam_from_target: FloatArray,
+    beyond: FloatArray,
+    order: IntArray,
 ) -> LensStep | None:
     """The most significant step of a lens; None if it is explained by noise or view order.
 
@@ -46,13 +50,17 @@ def lens_step(
         stack: The corners of v views.
         camera: The lens common to all.
         cam_from_target: (v, 4, 4) the views' poses.
+        beyond: (n, 2) displacements of the corners beyond the lens's model [px].
         order: (v,) the views by their time.
     """
     count, tried = len(order), len(order) + 1 - 2 * _FEWEST
     if tried < 1:
         return None
     seen = reproject(stack, camera, cam_from_target)
-    columns = np.concatenate([seen.by_intrinsics, seen.residuals[:, :, None]], axis=2)
+    beyond = beyond.copy()
+    stack.weigh(beyond)
+    residuals = seen.residuals + beyond
+    columns = np.concatenate([seen.by_intrinsics, residuals[:, :, None]], axis=2)
     eliminated = WithoutPoses.of(stack, seen.by_pose, columns, None).left
     products = stack.products_by_view(eliminated, eliminated)[order]
     steps = np.zeros((products.shape[1] - 1, 3))

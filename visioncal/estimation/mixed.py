@@ -43,9 +43,8 @@ _SIZE_STEP = 0.2
 # Eigenvalues of the remaining information below this share of the original trace are rounding.
 _ROUNDING = 1e-9
 
-# Bounds of the logarithm of the ratio of a value's variance to its measurement variance; shrinkage
-# factor below which the value counts as zero.
-_LIKELY_RANGE, _FOLLOWED = (-7.0, 12.0), 1e-2
+# Larger logarithms of odds are certainty.
+_FAR = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,40 +387,15 @@ def _bounded_step(
     return step
 
 
-def level_weight(gain: float) -> float:
+def level_weight(gain: float, prior: float = 0.5) -> float:
     """Akaike weight of a non-zero level (Akaike 1974: each parameter costs 1 in log-likelihood).
 
     Args:
         gain: Decrease of twice the log-likelihood without the level.
+        prior: Its probability a priori.
     """
-    return float(1.0 / (1.0 + np.exp(1.0 - 0.5 * gain)))
-
-
-def likely_sigma(found: FloatArray, covariance: FloatArray) -> float:
-    """Model-averaged standard deviation of k values that may be zero.
-
-    Args:
-        found: (k,) measured values.
-        covariance: (k, k) of the measurement.
-
-    Returns:
-        The prior standard deviation that gives the average of the shrinkage at the most likely
-        size and at zero, weighted by their Akaike weights.
-    """
-    from scipy.optimize import minimize_scalar
-
-    variances, axes = np.linalg.eigh(covariance)
-    squares, typical = (axes.T @ found) ** 2, float(variances.mean())
-
-    def deviance(log_ratio: float) -> float:
-        total = variances + typical * np.exp(log_ratio)
-        return float(np.sum(np.log(total) + squares / total))
-
-    best = minimize_scalar(deviance, bounds=_LIKELY_RANGE, method="bounded")
-    weight = level_weight(deviance(-np.inf) - best.fun)
-    ratio = float(np.exp(best.x))
-    shrinkage = weight * ratio / (1.0 + ratio)
-    return float(np.sqrt(typical * shrinkage / (1.0 - shrinkage))) if shrinkage > _FOLLOWED else 0.0
+    odds = (1.0 - prior) / prior * np.exp(np.clip(1.0 - 0.5 * gain, -_FAR, _FAR))
+    return float(1.0 / (1.0 + odds))
 
 
 def profile_interval(

@@ -3,26 +3,30 @@
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
     Compressed,
-    board_prior,
     boards_basis,
     shape_slices,
+    stated_board_sigma,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels, zooms
+from visioncal.estimation.lens_field import LensLevels, LensSizes, lens_modes, zooms
+from visioncal.estimation.linalg import covariance_from
 from visioncal.vision.targets import first_corners, numbered_positions
 
 # Frame of a single camera.
 ONLY_CAMERA = "cam"
 # Least residuals per unknown of lens and board.
 _SPARE = 10
-# Prior sigmas of given intrinsics once they are estimated: focal length and centre as shares of the
+# Share of the information of values that is added where they have none.
+_RIDGE = 1e-12
+# Prior sigmas of intrinsics that are given to be refined: focal length and centre as shares of the
 # focal length, and distortion coefficients.
 _FOCAL_SHARE, _DISTORTION_SIGMA = 0.05, 0.3
 
@@ -53,6 +57,15 @@ def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
     return {view: 1.0 / counts[key] for view, key in shown.items()}
 
 
+@dataclass(frozen=True)
+class BoardSizes:
+    """Sizes of a printed board's errors beyond what is stated: standard deviations."""
+
+    scale: float = 0.0  # Of its size, relative.
+    plane: float = 0.0  # Of its aspect ratio and its shear.
+    bend: float = 0.0  # Of each term of its bend [m].
+
+
 @dataclass(frozen=True, eq=False)
 class CornerProblem:
     """The corners of m views with the priors of lens and boards."""
@@ -61,15 +74,17 @@ class CornerProblem:
     stack: CornerStack
     positions: FloatArray  # (c, 3) corners of the flat boards, each in its own frame [m].
     basis: FloatArray  # (c, 3, s) of `boards_basis`.
-    # (k + s,) prior sigmas of lens and boards; inf where there is no prior.
-    prior_sigma: FloatArray
+    # (k + s,) stated sigmas of lens and boards; inf where they are estimated from the corners.
+    stated_sigma: FloatArray
     shares: FloatArray  # (m,) weight of each view for lens and board; see `repeat_shares`.
-    # Whether given intrinsics are held although the corners contradict them.
-    contested: bool = False
     # Sizes of lens errors beyond the model; None before their estimation.
     levels: LensLevels | None = None
-    # Columns of given intrinsics whose prior sigma counts in the covariance.
-    doubted: IntArray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    # Sizes of a given lens's errors beyond what is stated.
+    lens_sizes: LensSizes = field(default_factory=LensSizes)
+    board_sizes: tuple[BoardSizes, ...] = ()  # The same of each printed board.
+    # Whether boards keep their stated scales unless these are wrong by more than is stated: errors
+    # of an arm by its posture look like a scale, and weigh more than white noise does.
+    holds_scales: bool = False
 
     @classmethod
     def of(
@@ -84,14 +99,21 @@ class CornerProblem:
         stack = CornerStack.of(corners, positions)
         if stack.stated_px is None:
             stack = replace(stack, weights=None)
-        priors = [board_prior(target) for target in scene.targets]
-        return cls(
+        stated = [stated_lens_sigma(scene), *map(stated_board_sigma, scene.targets)]
+        problem = cls(
             scene,
             stack,
             positions,
             boards_basis(scene.targets),
-            np.concatenate([lens_prior(scene), *priors]),
+            np.concatenate(stated),
             np.array([shares.get(view, 1.0) for view in corners]),
+        )
+        problem = replace(problem, board_sizes=(BoardSizes(),) * len(problem.printed))
+        if scene.mode != "refine" or scene.estimated or not problem.has_spare_corners:
+            return problem
+        # Corners too few to judge by leave a lens as it is.
+        return replace(
+            problem, stated_sigma=np.concatenate([refined_lens_sigma(scene), *stated[1:]])
         )
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
@@ -104,21 +126,51 @@ class CornerProblem:
         """Returns the problem without lens errors beyond the model."""
         return replace(self, stack=replace(self.stack, zooms=None), levels=None)
 
-    def with_lens_sigma(self, sigma: FloatArray, doubted: IntArray) -> "CornerProblem":
-        """Returns the problem with prior sigmas (k,) of the intrinsics, and those that count."""
-        boards = self.prior_sigma[len(self.lens) :]
-        return replace(self, prior_sigma=np.concatenate([sigma, boards]), doubted=doubted)
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """(k + s, k + s) prior covariance of lens and boards; zero where it is flat."""
+        known = np.where(np.isinf(self.stated_sigma), 0.0, self.stated_sigma)
+        covariance, count = np.diag(known**2), len(self.lens)
+        if (variances := self.lens_sizes.variances(count)).any():
+            modes = lens_modes(self.scene.camera)
+            covariance[:count, :count] += modes * variances @ modes.T
+        for board, sizes in zip(self.printed, self.board_sizes, strict=True):
+            scale, (aspect, *bends, shear) = self.scale_of(board), self.shape_of(board)
+            covariance[scale, scale] += sizes.scale**2
+            covariance[[aspect, shear], [aspect, shear]] += sizes.plane**2
+            covariance[bends, bends] += sizes.bend**2
+        return covariance
 
-    def without_prior(self, columns: IntArray) -> "CornerProblem":
-        """Returns the problem without priors of some values."""
-        sigma = self.prior_sigma.copy()
-        sigma[columns] = np.inf
-        return replace(self, prior_sigma=sigma)
+    @property
+    def is_flat(self) -> Mask:
+        """(k + s,) mask of the values without a prior."""
+        return np.isinf(self.stated_sigma)
+
+    @property
+    def is_uncertain(self) -> Mask:
+        """(k + s,) mask of the values that are not exactly as stated."""
+        return np.asarray(self.is_flat | (np.diag(self.covariance) > 0.0))
+
+    @property
+    def is_held(self) -> Mask:
+        """(k + s,) mask of the values that no fit moves, however uncertain they are."""
+        held = np.zeros(len(self.stated_sigma), dtype=bool)
+        held[self.lens] = self.scene.mode == "hold" and not self.scene.estimated
+        for board, sizes in zip(self.printed, self.board_sizes, strict=True):
+            held[self.scale_of(board)] = self.holds_scales and sizes.scale == 0.0
+        return held
+
+    @cached_property
+    def prior_information(self) -> FloatArray:
+        """(k + s, k + s) inverse of `covariance` of the uncertain values; zero elsewhere."""
+        information, kept = np.zeros_like(self.covariance), self.is_uncertain & ~self.is_flat
+        information[np.ix_(kept, kept)] = covariance_from(self.covariance[np.ix_(kept, kept)])
+        return information
 
     @property
     def lens(self) -> IntArray:
         """Columns of the intrinsics; they come first."""
-        return np.arange(len(self.prior_sigma) - self.basis.shape[2])
+        return np.arange(len(self.stated_sigma) - self.basis.shape[2])
 
     @property
     def printed(self) -> list[int]:
@@ -168,60 +220,34 @@ class CornerProblem:
         residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
         return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
-    @property
-    def is_refined_by_prior(self) -> bool:
-        """Whether a given matrix is refined within its stated sigma, by corners too few to test it.
-
-        The robot's motion determines it, too. Without a stated sigma it is held.
-        """
-        scene = self.scene
-        is_stated = scene.matrix_sigma_px is not None and not scene.estimated
-        return is_stated and scene.mode != "hold" and not self.has_spare_corners
-
-    def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
+    def unknowns(self, compressed: Compressed) -> int:
         """Number of unknowns that the corners have determined, including the poses.
 
-        Where a rig's points have a tight prior, corners determine little of them, and reduce no
-        residuals.
+        Values with a tight prior are hardly determined by the corners, and reduce no residuals.
         """
-        rigs = np.intersect1d(self.points, moving)
         sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
-        information = np.diag(compressed.shared_information)[rigs] * self.prior_sigma[rigs] ** 2
-        share = information / (information + floored_sigma_px(sigma_px) ** 2)
-        exact = len(moving) - len(rigs) + round(compressed.field_freedom)
-        return 6 * len(compressed.information) + exact + round(float(share.sum()))
+        kept = self.is_uncertain & ~self.is_held
+        information = compressed.shared_information[np.ix_(kept, kept)]
+        prior = floored_sigma_px(sigma_px) ** 2 * self.prior_information[np.ix_(kept, kept)]
+        # Values that nothing determines are none.
+        ridge = _RIDGE * np.diag(np.diag(information) + 1.0)
+        own = float(np.trace(np.linalg.solve(information + prior + ridge, information)))
+        return 6 * len(compressed.information) + round(own + compressed.field_freedom)
 
-    def sigma_px(self, compressed: Compressed, moving: IntArray) -> float:
+    def sigma_px(self, compressed: Compressed) -> float:
         """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""
-        return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed, moving))
-
-    @property
-    def first(self) -> IntArray:
-        """Columns that are free from the start."""
-        if self.scene.estimated:
-            return np.union1d(self.lens, self.points)
-        if self.scene.mode == "refine" and self.has_spare_corners:
-            return np.concatenate([self.lens, np.union1d(self.shape, self.points)])
-        if self.is_refined_by_prior:
-            return np.concatenate([self.lens[:4], self.points])
-        return self.points
-
-    @property
-    def counted(self) -> IntArray:
-        """Columns that count in the covariance, whether free or held."""
-        if self.scene.estimated or self.contested:
-            return np.concatenate([self.lens, np.union1d(self.scale, self.points)])
-        stated = self.scene.matrix_sigma_px is not None
-        lens = self.lens[:4] if stated else self.doubted
-        return np.concatenate([lens, np.union1d(self.scale, self.points)])
+        return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed))
 
 
-def lens_prior(scene: Scene) -> FloatArray:
-    """Prior sigmas of a camera's intrinsics; inf where there is no prior."""
-    camera = scene.camera
+def stated_lens_sigma(scene: Scene) -> FloatArray:
+    """(k,) stated sigmas of a camera's intrinsics; inf where they are estimated."""
+    count = len(scene.camera.distortion)
     if scene.estimated:
-        return np.full(4 + len(camera.distortion), np.inf)
-    matrix = np.full(4, _FOCAL_SHARE * float(camera.matrix[:2].max()))
-    if scene.matrix_sigma_px is not None:
-        matrix = np.full(4, scene.matrix_sigma_px)
-    return np.concatenate([matrix, np.full(len(camera.distortion), _DISTORTION_SIGMA)])
+        return np.full(4 + count, np.inf)
+    return np.repeat([scene.matrix_sigma_px or 0.0, 0.0], [4, count])
+
+
+def refined_lens_sigma(scene: Scene) -> FloatArray:
+    """(k,) prior sigmas of given intrinsics that are to be refined."""
+    matrix = scene.matrix_sigma_px or _FOCAL_SHARE * float(scene.camera.matrix[:2].max())
+    return np.repeat([matrix, _DISTORTION_SIGMA], [4, len(scene.camera.distortion)])

@@ -91,8 +91,7 @@ class CellFit:
         for (camera, problem), corners in zip(
             optics.problems.items(), self.linearised_corners.compressed, strict=True
         ):
-            moving = np.flatnonzero(np.isin(optics.places(camera), self.linearised_corners.moving))
-            unknowns = problem.unknowns(corners, moving)
+            unknowns = problem.unknowns(corners)
             sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
         return sigmas_px
 

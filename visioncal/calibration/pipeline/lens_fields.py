@@ -12,7 +12,7 @@ from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
+from visioncal.estimation.lens_field import LensLevels, depths_m, displacements, distances
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.lens_step import LensStep, lens_step
 from visioncal.estimation.residual_tests import common_errors, lens_field
@@ -162,8 +162,13 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         stack = replace(problem.stack, zooms=None)
         stack = stack.with_points(optics.points[stack.ids]).keep(timed[stack.view_of])
         order = np.argsort([stations[view] for view in stack.views], kind="stable")
-        poses = seen.compressed[which].cam_from_target[timed]
-        step = lens_step(stack, optics.camera(name), poses, order)
+        compressed, camera = seen.compressed[which], optics.camera(name)
+        poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
+        if compressed.coefficients is not None and problem.levels is not None:
+            far = distances(stack, poses)[stack.view_of]
+            columns = displacements(stack.px, camera, far, problem.levels)
+            beyond = columns @ compressed.coefficients.mean
+        step = lens_step(stack, camera, poses, beyond, order)
         if step is None:
             continue
         first = stations[stack.views[int(order[step.first])]]

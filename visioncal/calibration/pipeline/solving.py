@@ -23,7 +23,7 @@ from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
-from visioncal.calibration.stages.refine import lens_levels, refine_jointly
+from visioncal.calibration.stages.refine import refine_jointly, with_sizes
 from visioncal.calibration.stages.turned_images import ImageTurn, find_image_turn
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
@@ -31,8 +31,6 @@ from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalEr
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
-from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.lens_levels import are_beyond
 from visioncal.estimation.observability import (
     check_observability,
     refuse_open_motion,
@@ -219,18 +217,9 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
     """Fits lenses, boards and frames, and updates the inliers until they do not change."""
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
-    solved, levels = start, dict[str, LensLevels]()
+    solved = start
     for _ in range(_ROUNDS):
-        solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, levels, sizes)
-        if (corners := solved.linearised_corners) is not None:
-            # Levels at their bounds come from outliers that are still in the fit: the next one
-            # estimates them anew.
-            cameras = corners.camera_parameters.problems.items()
-            levels = {
-                name: camera.levels
-                for (name, camera), sigma_px in zip(cameras, corners.sigmas_px, strict=True)
-                if camera.levels is not None and not are_beyond(camera.levels, sigma_px, 0.9)
-            }
+        solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, sizes)
         if solved.cell.mount is None or observed.is_misread:
             break
         before = solved.inlier_fit.used
@@ -263,7 +252,6 @@ def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
 def _fit_lenses_and_frames(
     solved: CellFit,
     observed: Observed,
-    levels: Mapping[str, LensLevels],
     sizes: Mapping[str, float],
 ) -> CellFit:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
@@ -274,9 +262,9 @@ def _fit_lenses_and_frames(
     if observed.scenes and not solved.inlier_fit.problem.is_combined:
         side, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
-        optics = side.looks(observed.scenes, views).with_levels(levels)
+        optics = side.looks(observed.scenes, views)
         if observed.is_misread:
-            return solved.with_joint_fit(side, fit_jointly(optics, side, optics.first, frames))
+            return solved.with_joint_fit(side, fit_jointly(optics, side, frames))
         try:
             fitted, side = refine_jointly(side, optics, frames)
         except ConvergenceError:
@@ -286,7 +274,7 @@ def _fit_lenses_and_frames(
             far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
-            fitted, side = refine_jointly(side, optics.with_sizes(far), frames)
+            fitted, side = refine_jointly(side, optics.with_scales(far), frames)
         return solved.with_joint_fit(side, fitted)
     solved = replace(solved, linearised_corners=None)
     if drifts := tuple(arm_effects(solved.arms)):
@@ -347,12 +335,9 @@ def _converge_arms(solved: CellFit) -> CellFit:
             solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
         else:
             side, corners = solved.frame_model, solved.linearised_corners
-            fitted = fit_jointly(
-                corners.camera_parameters, side, corners.moving, solved.frames, None, corners
-            )
+            fitted = fit_jointly(corners.camera_parameters, side, solved.frames, None, corners)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                optics = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
-                fitted = fit_jointly(optics, side, fitted.moving, fitted.frames, fitted.others)
+                fitted = with_sizes(side, fitted)
             solved = solved.with_joint_fit(side, fitted)
         problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}

@@ -24,7 +24,7 @@ from visioncal.estimation.joint import (
     rig_by_stated_arms,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem, Scene
+from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem
 from visioncal.estimation.solve import (
     covariance_of,
     held_shift,
@@ -61,10 +61,7 @@ def lens_and_board_findings(
     optics = fitted.camera_parameters
     cameras = zip(optics.problems.items(), fitted.linearised.compressed, strict=True)
     for (camera, problem), compressed in cameras:
-        moving = np.flatnonzero(np.isin(optics.places(camera), fitted.moving))
-        noise = _noise_findings(
-            problem.stack, compressed.residuals, problem.unknowns(compressed, moving)
-        )
+        noise = _noise_findings(problem.stack, compressed.residuals, problem.unknowns(compressed))
         of = "" if camera == ONLY_CAMERA else camera
         yield from (finding.of(of) for finding in (*noise, *_lens_findings(fitted, camera)))
     scene = next(iter(optics.problems.values())).scene
@@ -78,10 +75,10 @@ def lens_and_board_findings(
             yield from _rig_size_findings(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
-        if _is_free(fitted, optics.scale_of(board)):
-            (place,) = optics.scale_of(board)
-            at = fitted.columns.start + int(np.searchsorted(fitted.linearised.free, place))
-            measured = measured_scale(side, fitted, board)
+        measured = measured_scale(side, fitted, board)
+        (place,) = optics.scale_of(board)
+        if measured.is_another and place in fitted.linearised.moving:
+            (at,) = fitted.columns_of(np.array([place]))
             written = replace(
                 measured, scale=float(optics.values[place]), sigma=float(covariance[at, at] ** 0.5)
             )
@@ -237,7 +234,7 @@ def _rig_size_findings(target: Target, measured: MeasuredScale) -> Iterator[Find
 def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     optics = fitted.camera_parameters
     problem, lens = optics.problems[camera], optics.lens_of(camera)
-    free = np.intersect1d(lens, fitted.moving)
+    free = np.intersect1d(lens, fitted.linearised.moving)
     if problem.scene.mode == "refine" and not len(free):
         words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
@@ -256,17 +253,17 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         if words:
             yield Finding("lens", f"{words} It was refined.", Remedy(do, CALIBRATE))
         else:
-            is_wrong = is_exact or contradicted_lens(fitted, camera)
+            is_wrong = is_exact or contradicted_lens(optics, camera)
             moved_px = _largest_shift_px(problem, optics.camera(camera))
             yield _refined_lens_finding(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
-    if problem.contested:
-        at = np.arange(fitted.problem.size)[fitted.columns]
-        at = at[np.searchsorted(fitted.linearised.free, lens[:4])]
+    if fitted.linearised.holds_lens(camera):
+        at = fitted.columns_of(lens[:4])
         moves = held_shift(fitted.problem, fitted.fit)[at]
         if np.abs(moves).max() > _LEAST_MOVE_PX:
             covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
             squared = float(moves @ np.linalg.solve(covariance, moves))
-            yield replace(_held_lens_finding(problem.scene, moves), mahalanobis_sq=squared)
+            if squared > chance_limit(len(at)):
+                yield replace(_held_lens_finding(moves), mahalanobis_sq=squared)
 
 
 def _largest_shift_px(problem: CornerProblem, refined: Camera) -> float:
@@ -294,29 +291,21 @@ def _refined_lens_finding(steps_px: FloatArray, *, is_doubtful: bool) -> Finding
     )
 
 
-def _held_lens_finding(scene: Scene, moves_px: FloatArray) -> Finding:
+def _held_lens_finding(moves_px: FloatArray) -> Finding:
     """Finding on intrinsics that are held although the corners contradict them."""
-    why = (
-        'intrinsics = "hold" keeps them'
-        if scene.mode == "hold"
-        else "they were kept, because views left out are predicted no better with others"
-    )
     return Finding(
         "lens",
         "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
-        f"{_px(moves_px)} px. But {why}; what this does to the result counts in its sigmas.",
+        f'{_px(moves_px)} px. But intrinsics = "hold" keeps them; what this does to the result '
+        "counts in its sigmas.",
         _NEW_LENS,
     )
 
 
-def _is_free(fitted: ConvergedFit, places: IntArray) -> bool:
-    return bool(np.isin(places, fitted.moving).all())
-
-
 def _has_changed(fitted: ConvergedFit, places: IntArray) -> bool:
     """Whether values differ significantly from the stated ones."""
-    limit = chance_limit(len(places))
-    return _is_free(fitted, places) and moved_mahalanobis_sq(fitted, places) > limit
+    free = np.intersect1d(places, fitted.linearised.moving)
+    return len(free) > 0 and moved_mahalanobis_sq(fitted, free) > chance_limit(len(free))
 
 
 def _px(values: FloatArray) -> str:

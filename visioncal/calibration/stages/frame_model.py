@@ -8,8 +8,8 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm, arm_effects
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.types import Corners, FloatArray, IntArray, Mask
-from visioncal.estimation.arm import ArmErrors, misfit_covariance
+from visioncal.core.types import Corners, IntArray, Mask
+from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -19,7 +19,6 @@ from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
 from visioncal.estimation.solve import (
     fit_problem,
-    fitted_covariance,
 )
 
 
@@ -95,23 +94,16 @@ class CellFrameModel:
         """The arms without joint angles."""
         return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
 
-    def covariance_with_pose_errors(self, fitted: ConvergedFit) -> FloatArray:
-        """(p, p) covariance of a fit, with the errors of arms without joint angles.
-
-        These are treated as noise, with sigmas by `find_pose_errors`.
-        """
+    def pose_errors(self, fitted: ConvergedFit) -> dict[str, ArmErrors]:
+        """Errors of the arms without joint angles beside a fit; see `find_pose_errors`."""
         problem, arms = fitted.problem, self.arms_without_joints
         for arm in arms.values():
             problem = arm.without_errors(problem)
         values, free = problem.start_values.copy(), len(fitted.linearised.free)
         values[:free] = fitted.fit.state.values[:free]
         fit = fit_problem(problem, State(fitted.fit.state.edges, values))
-        covariance = fitted_covariance(problem, fit.state, fit.noise)
-        for robot in arms:
-            errors = find_pose_errors(problem, fit.state, fit.noise, robot)
-            if errors is not None:
-                covariance += misfit_covariance(problem, fit.state, fit.noise, robot, errors)
-        return covariance
+        found = {robot: find_pose_errors(problem, fit.state, fit.noise, robot) for robot in arms}
+        return {robot: errors for robot, errors in found.items() if errors is not None}
 
     def freed(self, *, freely: bool) -> Self:
         """Frees all errors of the arms that were found, or only the estimated ones."""
@@ -126,7 +118,8 @@ class CellFrameModel:
             corners: dict[int, Corners] = {
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
-            problems[frame] = CornerProblem.of(scene, corners, shares)
+            problem = CornerProblem.of(scene, corners, shares)
+            problems[frame] = replace(problem, holds_scales=bool(self.arms_without_joints))
             with_corners = [view for view in views[frame] if view.view in corners]
             poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
         return CameraParameters.of(problems, poses)

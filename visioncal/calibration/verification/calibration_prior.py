@@ -12,8 +12,8 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.estimation.appearance import (
     Appearance,
     LensBoardParameters,
-    board_prior,
     boards_basis,
+    stated_board_sigma,
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
@@ -175,7 +175,7 @@ def _looks(
         return fit.looks
     is_shear = [False] * len(intrinsics(camera.camera))
     for target in targets.values():
-        is_shear += [False] * (len(board_prior(target)) - 1) + [target.kind != "points"]
+        is_shear += [False] * (len(stated_board_sigma(target)) - 1) + [target.kind != "points"]
     return tuple(np.flatnonzero(~np.array(is_shear))[list(fit.looks)].tolist())
 
 
@@ -232,7 +232,7 @@ def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArra
     only = calibration.board or calibration.rig
     if only is not None:
         shapes[""] = only
-    stated = {name: np.zeros(len(board_prior(target))) for name, target in targets.items()}
+    stated = {name: np.zeros(len(stated_board_sigma(target))) for name, target in targets.items()}
     return np.concatenate(
         [zeros + shapes[name].values if name in shapes else zeros for name, zeros in stated.items()]
     )

@@ -4,7 +4,7 @@ Each camera's corners are compressed to poses with their covariance and Jacobian
 lens and boards, and to information on lens and boards, which is summed here and joined by priors.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,10 +14,10 @@ from scipy.linalg import block_diag
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels
+from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.scene import CornerProblem
+from visioncal.estimation.scene import BoardSizes, CornerProblem
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.
@@ -31,7 +31,6 @@ class CameraParameters:
     problems: Mapping[str, CornerProblem]  # Each camera's corners, by camera name.
     values: FloatArray  # (k,) intrinsics of all lenses, camera by camera, then all boards' shapes.
     poses: FloatArray  # (v, 4, 4) `cam_from_target` of the views, camera by camera.
-    resized: tuple[int, ...] = ()  # Printed boards whose scales are free from the start.
 
     @classmethod
     def of(
@@ -99,10 +98,29 @@ class CameraParameters:
         return np.asarray(places - len(self._one.lens) + self.boards.start)
 
     @cached_property
-    def prior_sigma(self) -> FloatArray:
-        """(k,) prior standard deviations of the values; inf for no prior."""
-        lenses = [problem.prior_sigma[problem.lens] for problem in self.problems.values()]
-        return np.concatenate([*lenses, self._one.prior_sigma[len(self._one.lens) :]])
+    def prior_information(self) -> FloatArray:
+        """(k, k) information on the values by what is stated and the sizes of their errors."""
+        information = np.zeros((len(self.values),) * 2)
+        for name, problem in self.problems.items():
+            places = self.places(name)
+            information[np.ix_(places, places)] = problem.prior_information
+        return information
+
+    @cached_property
+    def free(self) -> IntArray:
+        """(f,) indices of the uncertain values, whether fitted or held."""
+        return self._chosen({name: item.is_uncertain for name, item in self.problems.items()})
+
+    @cached_property
+    def held(self) -> IntArray:
+        """Indices of the values that no fit moves."""
+        return self._chosen({name: item.is_held for name, item in self.problems.items()})
+
+    def _chosen(self, masks: Mapping[str, Mask]) -> IntArray:
+        chosen = np.zeros(len(self.values), dtype=bool)
+        for name, mask in masks.items():
+            chosen[self.places(name)[mask]] = True
+        return np.flatnonzero(chosen)
 
     @cached_property
     def stated(self) -> FloatArray:
@@ -110,23 +128,6 @@ class CameraParameters:
         return CameraParameters.of(
             self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
         ).values
-
-    @property
-    def first(self) -> IntArray:
-        """Indices of the values that are free from the start."""
-        indices = [self.places(name)[problem.first] for name, problem in self.problems.items()]
-        return np.unique(np.concatenate([*indices, *map(self.scale_of, self.resized)]))
-
-    @property
-    def counted(self) -> IntArray:
-        """Indices of the values that count in the covariance, whether free or held."""
-        indices = (self.places(name)[problem.counted] for name, problem in self.problems.items())
-        return np.unique(np.concatenate([*indices]))
-
-    @property
-    def shape(self) -> IntArray:
-        """Indices of the printed boards' aspects, shears and bends."""
-        return self._here(self._one.shape)
 
     def stated_scale_sigma(self, board: int) -> float:
         """Relative standard deviation of the stated size of a printed board."""
@@ -137,46 +138,50 @@ class CameraParameters:
         """Indices of one camera's intrinsics."""
         return np.arange(self.lenses[name].start, self.lenses[name].stop)
 
-    @property
-    def has_spare_corners(self) -> bool:
-        """Whether all cameras have enough corners to estimate lens and board."""
-        return all(problem.has_spare_corners for problem in self.problems.values())
-
-    def without_prior(self, places: Iterable[int]) -> "CameraParameters":
-        """Returns them without priors of some values."""
-        indices = np.array([*places])
-        problems = {
-            name: problem.without_prior(np.flatnonzero(np.isin(self.places(name), indices)))
-            for name, problem in self.problems.items()
-        }
-        return replace(self, problems=problems)
-
-    def doubting(self, lenses: Mapping[str, tuple[FloatArray, IntArray]]) -> "CameraParameters":
-        """Returns them with other uncertainties of given intrinsics.
+    def with_sizes(
+        self,
+        levels: Mapping[str, LensLevels],
+        lenses: Mapping[str, LensSizes],
+        boards: tuple[BoardSizes, ...],
+    ) -> "CameraParameters":
+        """Returns them with other sizes of errors; values without errors are the stated ones.
 
         Args:
-            lenses: By camera, (k,) prior standard deviations of its intrinsics, and indices among
-                these of the doubted ones, which count in the covariance.
+            levels: Sizes of the lens errors beyond the models, by camera.
+            lenses: Sizes of the errors of given lenses, by camera.
+            boards: Sizes of the errors of the printed boards.
         """
         problems = {
-            name: problem.with_lens_sigma(*lenses[name]) if name in lenses else problem
+            name: replace(
+                problem.with_levels(levels[name]) if name in levels else problem,
+                lens_sizes=lenses.get(name, problem.lens_sizes),
+                board_sizes=boards,
+            )
             for name, problem in self.problems.items()
         }
-        return replace(self, problems=problems)
+        sized = replace(self, problems=problems)
+        values, moving = self.stated.copy(), np.setdiff1d(sized.free, sized.held)
+        values[moving] = self.values[moving]
+        return replace(sized, values=values)
 
-    def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
-        """Returns them with given scales of printed boards, free from the start without a prior."""
-        places = [int(self.scale_of(board)[0]) for board in scales]
-        unstated = replace(self.without_prior(places), resized=tuple(scales))
-        return unstated.with_values(np.array(places), np.array([*scales.values()]))
+    @property
+    def lens_sizes(self) -> dict[str, LensSizes]:
+        """Sizes of the errors of the lenses, by camera."""
+        return {name: problem.lens_sizes for name, problem in self.problems.items()}
 
-    def contesting(self, names: Collection[str]) -> "CameraParameters":
-        """Returns them with intrinsics of cameras held although their corners contradict them."""
-        problems = {
-            name: replace(problem, contested=name in names)
-            for name, problem in self.problems.items()
-        }
-        return replace(self, problems=problems)
+    @property
+    def board_sizes(self) -> tuple[BoardSizes, ...]:
+        """Sizes of the errors of the printed boards."""
+        return self._one.board_sizes
+
+    def with_scales(self, scales: Mapping[int, float]) -> "CameraParameters":
+        """Returns them with scales of printed boards far from the stated ones."""
+        sizes = tuple(
+            replace(item, scale=abs(scales[board])) if board in scales else item
+            for board, item in zip(self.printed, self.board_sizes, strict=True)
+        )
+        places = np.array([int(self.scale_of(board)[0]) for board in scales])
+        return self.with_sizes({}, {}, sizes).with_values(places, np.array([*scales.values()]))
 
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
         """Returns them with views reweighted by the residuals of all corners."""
@@ -185,14 +190,6 @@ class CameraParameters:
             for (name, corner_problem), compressed in zip(
                 self.problems.items(), seen.compressed, strict=True
             )
-        }
-        return replace(self, problems=problems)
-
-    def with_levels(self, levels: Mapping[str, LensLevels]) -> "CameraParameters":
-        """Returns them with other levels of lens errors beyond the models."""
-        problems = {
-            name: problem.with_levels(levels[name]) if name in levels else problem
-            for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
@@ -225,15 +222,11 @@ class CameraParameters:
         values[free] = found
         return replace(self, values=values)
 
-    def linearised(
-        self, moving: IntArray, before: "LinearisedCorners | None" = None
-    ) -> "LinearisedCorners":
-        """Compresses all corners with (f,) free values.
+    def linearised(self, before: "LinearisedCorners | None" = None) -> "LinearisedCorners":
+        """Compresses all corners.
 
-        Args:
-            moving: Indices of these values.
-            before: A previous linearisation, reused for cameras whose lens, boards, poses and
-                weights have not changed since.
+        `before` is a previous linearisation, reused for cameras whose lens, boards, poses and
+        weights have not changed since.
         """
         by_camera, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
@@ -241,7 +234,7 @@ class CameraParameters:
         for name, problem in self.problems.items():
             compressed = None if before is None else before.still(self, name)
             compressed, places = compressed or self.compressed(name), self.places(name)
-            sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
+            sigma = problem.sigma_px(compressed)
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             gradient[places] += weight * compressed.shared_gradient
@@ -250,7 +243,7 @@ class CameraParameters:
         poses = np.concatenate([compressed.cam_from_target for compressed in by_camera])
         corners = PriorInformation(information, gradient)
         optics = replace(self, poses=poses)
-        return LinearisedCorners(optics, np.sort(moving), tuple(by_camera), tuple(sigmas), corners)
+        return LinearisedCorners(optics, tuple(by_camera), tuple(sigmas), corners)
 
     def compressed(self, name: str) -> Compressed:
         """Compresses one camera's corners, linearised at its poses."""
@@ -287,46 +280,45 @@ class LinearisedCorners:
     """All corners, linearised in poses, lenses and boards."""
 
     camera_parameters: CameraParameters  # The linearisation point.
-    moving: IntArray  # Indices of the values that a fit moves.
     compressed: tuple[Compressed, ...]  # Normal equations of each camera's corners.
     sigmas_px: tuple[float, ...]  # Each camera's noise of a corner's coordinate [px].
     corners: PriorInformation  # Information of the corners on all values, with free poses.
+    # Whether all values are free, without priors.
+    is_flat: bool = False
 
     @cached_property
     def free(self) -> IntArray:
-        """(f,) indices of the uncertain values: moving ones, and held ones that count."""
-        return np.union1d(self.moving, self.camera_parameters.counted)
+        """(f,) indices of the uncertain values: those that a fit moves, and held ones."""
+        optics = self.camera_parameters
+        return np.arange(len(optics.values)) if self.is_flat else optics.free
 
     @property
     def held(self) -> Mask:
         """(f,) mask of the held ones among the `free` values."""
-        return ~np.isin(self.free, self.moving)
+        return np.isin(self.free, self.camera_parameters.held) & (not self.is_flat)
+
+    @property
+    def moving(self) -> IntArray:
+        """Indices of the values that a fit moves."""
+        return self.free[~self.held]
 
     def holds_lens(self, name: str) -> bool:
         """Whether the intrinsics of a camera are uncertain but held."""
         optics = self.camera_parameters
         if name not in optics.lenses:
             return False
-        lens = optics.lens_of(name)
-        return bool(np.isin(lens, self.free).any() and not np.isin(lens, self.moving).any())
+        return bool(np.isin(optics.lens_of(name), self.free[self.held]).any())
 
     @property
     def known(self) -> PriorInformation:
         """Information on the free values from corners and priors, without any robot."""
         optics, free = self.camera_parameters, self.free
-        prior = 1.0 / optics.prior_sigma[free] ** 2
-        return PriorInformation(
-            self.corners.information[np.ix_(free, free)] + np.diag(prior),
-            self.corners.gradient[free] + prior * (optics.values - optics.stated)[free],
-        )
-
-    def freed(
-        self, moving: IntArray, optics: CameraParameters | None = None
-    ) -> "LinearisedCorners":
-        """Returns it with other moving values, or other priors."""
-        return replace(
-            self, moving=np.sort(moving), camera_parameters=optics or self.camera_parameters
-        )
+        corners = self.corners.information[np.ix_(free, free)]
+        if self.is_flat:
+            return PriorInformation(corners, self.corners.gradient[free])
+        prior = optics.prior_information[np.ix_(free, free)]
+        gradient = prior @ (optics.values - optics.stated)[free]
+        return PriorInformation(corners + prior, self.corners.gradient[free] + gradient)
 
     def still(self, optics: CameraParameters, name: str) -> Compressed | None:
         """Normal equations of one camera, if they also hold for other parameters; else None."""

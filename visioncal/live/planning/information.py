@@ -18,9 +18,9 @@ from visioncal.estimation.appearance import (
     SCALE,
     Appearance,
     LensBoardParameters,
-    board_prior,
     compress,
     shape_basis,
+    stated_board_sigma,
 )
 from visioncal.estimation.arm import ArmErrors, link_basis
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
@@ -221,7 +221,7 @@ def stop_factors(
 def stated(cell: PlanCell) -> LensBoardParameters:
     """Stated lens and board; the board's size is free within its stated uncertainty."""
     positions = corner_positions(cell.target)
-    shape = board_prior(cell.target)
+    shape = stated_board_sigma(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
     # The positions of a rig's points are taken as exact.
     sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)

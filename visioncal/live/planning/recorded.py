@@ -279,15 +279,14 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     ((frame, scene),) = run.scenes.items()
     problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
     optics = CellFrameModel(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
-    observed = replace(
-        observed, free=free_parameters_of_camera(optics.linearised(optics.first))
-    ).posed(poses)
+    free = free_parameters_of_camera(optics.linearised())
+    observed = replace(observed, free=free).posed(poses)
     problem = observed.problem(chosen).merged()
     return _RecordedStart(
         problem,
         problem.start(observed.frames),
         _TYPICAL,
-        observed.free or free_parameters_of_camera(optics.linearised(optics.first)),
+        observed.free or free,
         observed.arm_at_stops,
         board,
         tuple(observed.first_of_stops(chosen)),
