@@ -164,7 +164,8 @@ class CornerProblem:
     def prior_information(self) -> FloatArray:
         """(k + s, k + s) inverse of `covariance` of the uncertain values; zero elsewhere."""
         information, kept = np.zeros_like(self.covariance), self.is_uncertain & ~self.is_flat
-        information[np.ix_(kept, kept)] = covariance_from(self.covariance[np.ix_(kept, kept)])
+        if kept.any():
+            information[np.ix_(kept, kept)] = covariance_from(self.covariance[np.ix_(kept, kept)])
         return information
 
     @property

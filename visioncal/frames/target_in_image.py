@@ -106,7 +106,7 @@ def target_pose_candidates(
         # A rig's size is exact.
         np.array(
             [
-                (target.kind != "points") * compressed.by_shared[0, :, lens + SCALE]
+                np.zeros(6) if target.kind == "points" else compressed.by_shared[0, :, lens + SCALE]
                 for compressed, _ in fits
             ]
         ),
