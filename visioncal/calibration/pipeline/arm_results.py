@@ -10,12 +10,13 @@ from visioncal.calibration.stages.arms import IdentifiedArm, RobotArm
 from visioncal.calibration.stages.cause_ranking import MOVED_AT_ONCE
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.kinematics import doubts, findings
+from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.residual_findings import ResidualTest
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, Remedy, remarks
-from visioncal.estimation.arm import covariance_of_size, misfit_covariance
+from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -252,10 +253,17 @@ def with_pose_errors(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
 ) -> dict[str, RobotArm]:
     """Estimates pose-dependent errors of arms without joint angles."""
+
+    def found(name: str) -> ArmErrors | None:
+        errors = find_pose_errors(problem, fit.state, fit.noise, name)
+        if errors is None or errors.white is None:
+            return errors
+        # What grows with time, reach or gravity is another at a pick, and in another session.
+        varies = random_effect_rms(problem, fit.state, name)
+        return replace(errors, white=np.hypot(errors.white, varies))
+
     return {
-        name: arm
-        if arm.is_modelled
-        else replace(arm, errors=find_pose_errors(problem, fit.state, fit.noise, name))
+        name: arm if arm.is_modelled else replace(arm, errors=found(name))
         for name, arm in arms.items()
     }
 

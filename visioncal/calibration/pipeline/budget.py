@@ -13,12 +13,16 @@ from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
+from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import solve_without
 from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
+
+# Sources of a single pair that are not clocks.
+_SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 
 def left_out(solved: CellFit) -> HeldOutResiduals:
@@ -141,7 +145,7 @@ def _sources(solved: CellFit) -> Sources:
             source = name
             if is_pair:
                 source = name.partition(" of ")[0]
-                source = source if source in ("temperature", "arm") else "clock"
+                source = source if source in _SOURCES else "clock"
             columns[source] = np.append(
                 columns.get(source, np.zeros(0, np.int64)), np.arange(column.start, column.stop)
             )

@@ -34,7 +34,8 @@ class CellFit:
     unconnected: tuple[str, ...]  # Frames that no observation links to the rest.
     arms: Mapping[str, RobotArm]  # The robots' arms, as far as they were calibrated.
     level: str  # The requested calibration level of the arms.
-    clock_effects: tuple[Effect, ...]  # The errors of clocks, as effects.
+    # Errors of clocks, and those that grow with time, reach or gravity.
+    other_effects: tuple[Effect, ...]
     # How images of outliers were turned or mirrored, by view.
     turned: Mapping[int, ImageTurn] = field(default_factory=dict)
     solver: str = "joint"  # The solver of the edges.
@@ -49,7 +50,7 @@ class CellFit:
         """The frames' side of the joint fit."""
         agreed, views = self.inlier_fit, [row.view for row in self.cell.rows]
         return CellFrameModel(
-            agreed.problem, agreed.used, views, self.arms, self.clock_effects, agreed.fit.noise
+            agreed.problem, agreed.used, views, self.arms, self.other_effects, agreed.fit.noise
         )
 
     @property

@@ -33,6 +33,7 @@ from visioncal.calibration.stages.findings import (
 )
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.stages.priors import prior_findings
+from visioncal.calibration.stages.random_effects import random_effect_findings
 from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
@@ -75,6 +76,7 @@ def findings_of(run: RunState) -> Findings:
     of_rest = [
         *prior_findings(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.camera_findings(answer.covariance),
+        *random_effect_findings(solved.inlier_problem, solved.inlier_fit.fit, answer.covariance),
     ]
     of_lenses = [*lens_findings(answer.lenses)]
     doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}

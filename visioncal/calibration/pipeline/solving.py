@@ -23,6 +23,7 @@ from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
+from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
 from visioncal.calibration.stages.refine import refine_jointly, with_sizes
 from visioncal.calibration.stages.turned_images import ImageTurn, find_image_turn
 from visioncal.calibration.stages.validate import predict_corners
@@ -120,6 +121,9 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Their corners would be explained by a lens that changes from view to view.
         observed = replace(observed, turned=turned)
         solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
+    if not observed.is_misread and (found := _random_effects(solved)):
+        initial = replace(initial, other_effects=(*clock_errors, *found), turned=solved.turned)
+        solved = _fit_with_inliers(initial, observed, sizes)
     solved = replace(
         solved, arms=with_drifts(solved.arms, solved.inlier_problem, solved.inlier_fit.fit, level)
     )
@@ -136,6 +140,14 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     return replace(
         solved, arms=with_pose_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
     )
+
+
+def _random_effects(solved: CellFit) -> tuple[Effect, ...]:
+    """Errors that grow with time, reach or gravity, which the fit's residuals show."""
+    corners, side = solved.linearised_corners, solved.frame_model
+    rows = None if corners is None else side.rows(corners)
+    problem, fit = solved.inlier_problem, solved.inlier_fit.fit
+    return random_effects(problem, fit, solved.arms, corners, rows)
 
 
 def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
@@ -187,7 +199,8 @@ def _calibrate_arms(solved: CellFit, observed: Observed, final: InlierFit | None
             arms = _choose_levels(solved)
             erring = [name for name, arm in arms.items() if arm.has_free_errors()]
             clock_errors = clock_effects(solved.cell, observed.clocks, erring)
-            solved = _converge_arms(replace(solved, arms=arms, clock_effects=clock_errors))
+            effects = (*clock_errors, *of_random_effects(solved.other_effects))
+            solved = _converge_arms(replace(solved, arms=arms, other_effects=effects))
         before = solved.inlier_fit
         # The arms are calibrated with the last inliers.
         if iteration == _ROUNDS or before is final:
@@ -282,7 +295,7 @@ def _fit_lenses_and_frames(
     solved = replace(
         solved, arms=with_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
     )
-    effects = (*solved.clock_effects, *arm_effects(solved.arms))
+    effects = (*solved.other_effects, *arm_effects(solved.arms))
     return (
         replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects)) if effects else solved
     )
@@ -331,7 +344,7 @@ def _converge_arms(solved: CellFit) -> CellFit:
     for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):
         solved = solved.with_arm_poses()
         if solved.linearised_corners is None:
-            effects = (*solved.clock_effects, *arm_effects(solved.arms))
+            effects = (*solved.other_effects, *arm_effects(solved.arms))
             solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
         else:
             side, corners = solved.frame_model, solved.linearised_corners

@@ -40,6 +40,7 @@ from visioncal.core.verdict import (
     Remedy,
     Verdict,
 )
+from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import NeedMet
 
 # False-alarm probabilities of remarks, which no test is behind, and of facts.
@@ -95,6 +96,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_poses": Evidence(1e-3, _CHAIN),
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
+    **{effect.kind: Evidence(1e-4, _CHAIN) for effect in RANDOM_EFFECTS},
 }
 LENS_CHANGED = "lens_changed"
 MOVED_FRAME, BOARD_CHANGED = "moved_at_once", "board_changed"

@@ -1,0 +1,142 @@
+"""Errors that grow with time, reach or gravity, in the fit of a cell; see `RANDOM_EFFECTS`."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.arm import LEVER_M, stops_of
+from visioncal.estimation.effects import RANDOM_EFFECTS
+from visioncal.estimation.effects.lenses import LinearisedCorners
+from visioncal.estimation.effects.random_effect import (
+    RandomEffect,
+    Stops,
+    effect_of,
+    find_random_effects,
+)
+from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.solve import Solution
+
+# With fewer stops, no such error is told from noise.
+_FEWEST_STOPS = 12
+# False-alarm probability of a finding.
+_FALSE_ALARM = 1e-4
+_KINDS = {kind.kind: kind for kind in RANDOM_EFFECTS}
+
+
+def of_random_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Those of some effects that are random effects."""
+    return tuple(effect for effect in effects if effect.name.partition(" of ")[0] in _KINDS)
+
+
+def random_effects(
+    problem: Problem,
+    fit: Solution,
+    arms: Mapping[str, RobotArm],
+    corners: LinearisedCorners | None,
+    rows: IntArray | None,
+) -> tuple[Effect, ...]:
+    """The random effects that the residuals of a fit show.
+
+    Args:
+        problem: The inlier observations.
+        fit: Their fit.
+        arms: The robots' arms.
+        corners: Linearised corners of the cameras, if any.
+        rows: (n,) the view of each observation; -1 for none.
+    """
+    found = list[Effect]()
+    for robot, arm in arms.items():
+        stops = stops_of(problem, robot)
+        if len(stops) < _FEWEST_STOPS or f"arm of {robot}" in problem.effect_columns:
+            continue
+        candidates = [*_of_flange(problem, robot, stops)]
+        if corners is not None and rows is not None and len(arms) == 1:
+            candidates += _of_sensors(problem, corners, rows, stops)
+        count = arm.basis.shape[2]
+        flat = PriorInformation(np.zeros((count, count)), np.zeros(count))
+        nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
+        found += find_random_effects(problem, fit.state, fit.noise, candidates, [nuisance])
+    return tuple(found)
+
+
+def _time(stops: IntArray, count: int) -> FloatArray:
+    """(s,) share of the observed stops that are over, of all stops."""
+    return np.asarray(np.searchsorted(stops, np.arange(count)) / max(len(stops) - 1, 1))
+
+
+def _of_flange(
+    problem: Problem, robot: str, stops: IntArray
+) -> Iterator[tuple[RandomEffect, Effect]]:
+    poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
+    seen = Stops(poses, _time(stops, len(poses)), np.zeros((0, 6)))
+    for kind in RANDOM_EFFECTS:
+        if not kind.is_of_sensor:
+            effect = effect_of(kind, robot, seen, None)
+            columns = _without_constants(effect.flange_jacobian[robot], poses, stops)
+            yield kind, replace(effect, flange_jacobian={robot: columns})
+
+
+def _without_constants(columns: FloatArray, poses: FloatArray, stops: IntArray) -> FloatArray:
+    """Columns (s, 6, k) less what one twist of base and of flange explains at the observed stops.
+
+    Base and flange are those of which the robot reports: what is the same at all stops is theirs
+    (Hodges and Reich 2010, on random effects beside fixed ones).
+    """
+    flange = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
+    constant = np.concatenate([flange, adjoint(invert(poses))], axis=2)
+    weights = np.repeat([LEVER_M, 1.0], 3)[:, None]
+    among, target = (
+        (weights * array[stops]).reshape(6 * len(stops), -1) for array in (constant, columns)
+    )
+    return np.asarray(columns - constant @ np.linalg.lstsq(among, target, rcond=None)[0])
+
+
+def _of_sensors(
+    problem: Problem, corners: LinearisedCorners, rows: IntArray, stops: IntArray
+) -> Iterator[tuple[RandomEffect, Effect]]:
+    time = _time(stops, int(stops[-1]) + 1)
+    optics = corners.camera_parameters
+    for (name, camera), compressed in zip(
+        ((name, optics.camera(name)) for name in optics.problems), corners.compressed, strict=True
+    ):
+        views = optics.rows(name)
+        is_mine = (rows >= views.start) & (rows < views.stop)
+        by_focal = compressed.by_shared[rows[is_mine] - views.start, :, :2] @ camera.matrix[:2]
+        at = np.minimum(problem.observations.stops[is_mine], len(time) - 1)
+        places = np.where(is_mine, np.cumsum(is_mine) - 1, -1)
+        seen = Stops(np.zeros((0, 4, 4)), time[at], by_focal)
+        for kind in RANDOM_EFFECTS:
+            if kind.is_of_sensor and is_mine.any():
+                yield kind, effect_of(kind, name, seen, places)
+
+
+def random_effect_rms(problem: Problem, state: State, robot: str) -> FloatArray:
+    """(2,) rms of a robot's flange errors by random effects, of rotation [rad] and position [m]."""
+    error = np.zeros((len(problem.poses[robot]), 6))
+    for effect in of_random_effects(problem.effects):
+        if robot in effect.flange_jacobian:
+            error += effect.flange_jacobian[robot] @ problem.values_of(effect.name, state)
+    squares = error[stops_of(problem, robot)].reshape(-1, 2, 3) ** 2
+    return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
+
+
+def random_effect_findings(
+    problem: Problem, fit: Solution, covariance: FloatArray
+) -> Iterator[Finding]:
+    """Findings on the random effects of a fit, given the covariance (p, p) of its unknowns."""
+    for effect in of_random_effects(problem.effects):
+        name, _, owner = effect.name.partition(" of ")
+        kind, columns = _KINDS[name], problem.effect_columns[effect.name]
+        values = problem.values_of(effect.name, fit.state)
+        squared = float(values @ np.linalg.solve(covariance[columns, columns], values))
+        if squared > chi2_limit(_FALSE_ALARM, len(values)):
+            found = Finding(kind.kind, kind.says(values), Remedy(kind.do), mahalanobis_sq=squared)
+            yield found.of(owner if len(problem.robots) > 1 else "")

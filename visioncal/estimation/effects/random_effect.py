@@ -1,0 +1,123 @@
+"""Errors that grow with time, reach or gravity: columns with one size, found by their evidence.
+
+Each is a file with a `RandomEffect`, and an entry in `RANDOM_EFFECTS`. All sizes are estimated
+together in the restricted likelihood of the robots' noise, beside errors of the arm by its posture;
+an effect with a size is an unknown of the fit, whose prior is that size.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.mixed import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    MixedEstimate,
+    PriorInformation,
+    level_weight,
+)
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
+
+# Share of sessions that have one such error; weight from which on it is fitted.
+_RARE, _FITTED = 0.01, 0.5
+# Typical size of an arm's errors by its posture [rad].
+_ARM = 3e-4
+# The search for a size starts at this multiple of its typical one.
+_ABOVE = 3.0
+
+
+@dataclass(frozen=True)
+class Stops:
+    """What a robot's errors may depend on, at its s stops."""
+
+    base_from_flange: FloatArray  # (s, 4, 4) its poses.
+    time: FloatArray  # (s,) share of the session that is over, from 0 to 1.
+    # (s, 6) derivative of the measured pose by the relative focal length; of observations.
+    by_focal: FloatArray
+
+
+@dataclass(frozen=True)
+class RandomEffect:
+    """A kind of error, with columns of one size."""
+
+    kind: str  # The kind of its finding, and its name in the budget.
+    typical: float  # Its typical size, in the unit of its values.
+    # (s, 6, k) right Jacobian by its k values, of the flange at s stops or of s measured poses.
+    columns: Callable[[Stops], FloatArray]
+    says: Callable[[FloatArray], str]  # What (k,) estimated values mean, as a sentence.
+    do: str  # Advice.
+    is_of_sensor: bool = False  # Whether it moves the measured poses, not the flange.
+
+
+def find_random_effects(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    candidates: Sequence[tuple[RandomEffect, Effect]],
+    nuisance: Sequence[Effect],
+) -> tuple[Effect, ...]:
+    """Those of some effects that the residuals show, with their sizes as priors.
+
+    Args:
+        problem: The inlier observations.
+        state: Their fit.
+        noise: Its noise.
+        candidates: The kinds, each with its columns.
+        nuisance: Errors of arms by their posture, each of an unknown size.
+    """
+    effects = [*(effect for _, effect in candidates), *nuisance]
+    typical = [kind.typical for kind, _ in candidates] + [_ARM] * len(nuisance)
+    wide = problem.with_effects([*problem.effects, *effects])
+    values = np.append(state.values, np.zeros(sum(map(len, effects))))
+    likelihood = robot_likelihood(wide, State(state.edges, values), noise)
+    columns = np.full(wide.size, -1)
+    for index, effect in enumerate(effects):
+        columns[wide.effect_columns[effect.name]] = index
+    of_size = columns[likelihood.moving]
+    shares = (of_size[:, None] == np.arange(len(effects))).astype(float)
+    first, prior = likelihood.model.shares.shape[1], likelihood.model.prior
+    model = replace(
+        likelihood.model,
+        shares=np.concatenate([likelihood.model.shares, shares], axis=1),
+        prior=None if prior is None else prior.beside(np.zeros(len(effects)), np.inf),
+    )
+    levels = np.maximum(likelihood.white[0].ravel(), LEAST_SIGMA)
+    low = np.full(first + len(effects), np.log(LEAST_SIGMA))
+    logs = np.log(np.concatenate([levels, _ABOVE * np.array(typical)]))
+    found = model.maximised(logs, low, np.log(MOST_SIGMA))
+
+    def gain(index: int) -> float:
+        without, high = found.logs.copy(), np.full(len(low), np.log(MOST_SIGMA))
+        without[first + index] = high[first + index] = low[first + index]
+        least: MixedEstimate = model.maximised(without, low, high)
+        return 2.0 * (least.value - found.value)
+
+    chosen = []
+    for index, effect in enumerate(effects[: len(candidates)]):
+        size = float(np.exp(found.logs[first + index]))
+        if size > 10.0 * LEAST_SIGMA and level_weight(gain(index), _RARE) > _FITTED:
+            information = PriorInformation(np.eye(len(effect)) / size**2, np.zeros(len(effect)))
+            chosen.append(replace(effect, prior=information))
+    return tuple(chosen)
+
+
+def effect_of(kind: RandomEffect, robot: str, stops: Stops, rows: IntArray | None) -> Effect:
+    """A kind's columns as an effect without a prior; `rows` are those of a sensor's observations.
+
+    Args:
+        kind: The kind.
+        robot: The robot, or the camera of a sensor's.
+        stops: What it depends on.
+        rows: (n,) index of the columns of each observation; -1 for none. None for a flange.
+    """
+    columns = kind.columns(stops)
+    flat = PriorInformation(np.zeros((columns.shape[2],) * 2), np.zeros(columns.shape[2]))
+    name = f"{kind.kind} of {robot}"
+    if rows is None:
+        return Effect.free(name, flat, None, {robot: columns})
+    by_sensor = np.where((rows >= 0)[:, None, None], columns[rows], 0.0)
+    return Effect.free(name, flat, by_sensor)
