@@ -33,6 +33,8 @@ from visioncal.estimation.scene import BoardSizes
 
 # Size of a board's scale error at the start: prints are scaled to fit a page.
 _WIDE = 0.03
+# Largest error of a board's size, as a share.
+_FARTHEST = 0.2
 
 
 def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
@@ -67,6 +69,8 @@ def refine_jointly(
         # Sizes are estimated from above: near a wrong size, lines of sight restrain another one.
         wide = tuple(max(item, BoardSizes(_WIDE), key=_scale) for item in optics.board_sizes)
         stated = fit_jointly(optics.with_sizes({}, {}, wide), side, frames)
+        if _is_shrunk(stated):
+            stated = fit_jointly(optics, side, frames)
         fitted = with_sizes(side, stated)
         new_side = side.with_errors(fitted)
         if any(error.is_significant for error in new_side.errors):
@@ -74,7 +78,7 @@ def refine_jointly(
         weighed = fitted.camera_parameters.weighed(fitted.linearised)
         stacks = zip(weighed.problems.values(), optics.problems.values(), strict=True)
         if any(problem.stack is not before.stack for problem, before in stacks):
-            fitted = refit_jointly(fitted, new_side, weighed)
+            fitted = _follows(new_side, fitted, weighed) or fitted
         return with_sizes(new_side, fitted), new_side
 
 
@@ -135,6 +139,9 @@ def _follows(
     # image nothing: such a fit may converge, but no corner is where it was seen.
     try:
         refit = refit_jointly(fitted, side, sized)
+        if _is_shrunk(refit):
+            stated = tuple(replace(item, scale=0.0) for item in sized.board_sizes)
+            refit = refit_jointly(fitted, side, sized.with_sizes({}, {}, stated))
     except ConvergenceError:
         return None
     sigmas = zip(refit.linearised.sigmas_px, fitted.linearised.sigmas_px, strict=True)
@@ -143,6 +150,13 @@ def _follows(
         if all(sigma <= FOLLOWS * floored_sigma_px(before) for sigma, before in sigmas)
         else None
     )
+
+
+def _is_shrunk(fitted: ConvergedFit) -> bool:
+    """Whether a board's size is farther from the stated one than any board's."""
+    optics = fitted.camera_parameters
+    scales = [float(optics.values[optics.scale_of(board)[0]]) for board in optics.printed]
+    return any(abs(scale) > _FARTHEST for scale in scales)
 
 
 def _estimated(
