@@ -43,8 +43,9 @@ def test_the_cells_of_the_example_run(tmp_path, monkeypatch):
     assert verdict is calibration.verdict
     assert (verdict.status, by_corners, holds) == ("good", "good", True)
     assert len(table) == len(session.views)
-    # The same images and lens; without joint angles the poses are those that were reported.
-    assert np.linalg.norm(again.transforms["flange_from_cam"].translation - place) < 1e-4
+    # The same images and lens; without joint angles the poses are those that were reported, and the
+    # place is known to some 0.1 mm.
+    assert np.linalg.norm(again.transforms["flange_from_cam"].translation - place) < 2e-4
 
 
 def test_values_are_short_in_a_console_and_cards_in_a_notebook():

@@ -239,6 +239,26 @@ def bending(size_m):
     return moved
 
 
+def tilting(size_rad_m):
+    """The base tilts in proportion to the horizontal reach."""
+
+    def moved(poses, rng):
+        about = size_rad_m * np.array([*_unit(rng), 0.0])
+        reach = np.hypot(poses[:, 0, 3], poses[:, 1, 3])
+        return np.array([pose(far * about, np.zeros(3)) for far in reach]) @ poses
+
+    return moved
+
+
+def growing(size):
+    """A camera that warms up during the session."""
+
+    def focal(far, _):
+        return 1.0 + size * (1.0 - np.exp(-3.0 * np.arange(len(far)) / len(far)))
+
+    return focal
+
+
 WORLDS = {
     "clean": World(),
     "clean, 6 views": World(views=6),
@@ -251,6 +271,10 @@ WORLDS = {
     "field 0.03 px": World(shift=lens_field(0.03)),
     "field 0.1 px": World(shift=lens_field(0.1)),
     "field 0.2 px": World(shift=lens_field(0.2)),
+    "field 0.1 px, 80 views": World(shift=lens_field(0.1), views=80),
+    "field 0.2 px, 200 views": World(shift=lens_field(0.2), views=200),
+    "lens grows by 0.15 %, 30 views": World(focus=growing(0.0015), views=30),
+    "base tilts by 1.5 mrad/m, 30 views": World(robot=tilting(1.5e-3), views=30),
     "thin prism": World(shift=thin_prism(0.002)),
     "breathing 0.1 %": World(focus=breathing(0.001)),
     "breathing 0.3 %": World(focus=breathing(0.003)),

@@ -19,7 +19,8 @@ from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import rewrite_result
-from visioncal.present import recording, report
+from visioncal.present import recording
+from visioncal.present.report import page
 from visioncal.results import Calibration
 from visioncal.simulation import CellOptions, simulate, write_session
 
@@ -125,7 +126,7 @@ def breaking(*_: object, **__: object) -> None:
 @pytest.mark.parametrize(
     ("module", "name", "file"),
     [
-        (report, "write_report", "report.html"),
+        (page, "write_report", "report.html"),
         (recording, "write_recording", "recording.rrd"),
     ],
 )
@@ -164,7 +165,7 @@ def test_what_is_not_wanted_does_not_stay_of_an_earlier_result(tmp_path, file):
 def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch):
     sample = made_up()
     write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
-    monkeypatch.setattr(report, "write_report", breaking)
+    monkeypatch.setattr(page, "write_report", breaking)
     joined = with_frames(sample).calibration
     assert len(rewrite_result(tmp_path, joined).failed_drawings) == 1
     assert Calibration.load(tmp_path).frames.keys() == joined.frames.keys()
@@ -173,7 +174,7 @@ def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch
 @pytest.mark.parametrize("as_json", [False, True])
 def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, monkeypatch, as_json):
     cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
-    monkeypatch.setattr(report, "write_report", breaking)
+    monkeypatch.setattr(page, "write_report", breaking)
     out = tmp_path / "out"
     done = visioncal("calibrate", cell, "-o", out, *(["--json"] if as_json else []))
     assert done.status == 1

@@ -295,14 +295,14 @@ def test_lens_and_edge_have_one_covariance():
     assert min(together) > 0.8
 
 
-def test_given_intrinsics_of_a_stated_sigma_have_a_covariance_and_stay_given():
+def test_given_intrinsics_of_a_stated_sigma_are_fitted_within_it():
     camera = wide_camera()
     cell = simulate(CellOptions(views=12, seed=1, camera=camera, pixel_sigma_px=0.1))
     session = session_of(cell)
     session.document["camera"]["matrix_sigma_px"] = 1.0
     found = calibration_of(cell, session=session).camera
-    np.testing.assert_array_equal(found.camera.matrix, camera.matrix)
-    assert not found.estimated
+    # One of four is beyond two sigma once in six cells.
+    assert np.all(np.abs(found.camera.matrix - camera.matrix) < 2.0)
     sigmas = np.sqrt(np.diag(found.covariance))
     assert np.all((sigmas[:4] > 0) & (sigmas[:4] <= 1.0))
     assert np.all(sigmas[4:] == 0.0)

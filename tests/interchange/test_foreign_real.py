@@ -89,10 +89,10 @@ def test_industrial_calibration(real_data, calibrated):
     sigma_mm = result.edges["base_from_cam"].sigma_mm
     assert away_mm(result, "base_from_cam", [-18.4, 1263.7, 290.0]) < 4 + 3 * sigma_mm
     # The session that was made of the same data by hand states its squares to 0.06 %, and not to
-    # the 0.1 % that are taken where nothing is said, which moves the camera by less than its sigma.
+    # the 0.1 % that are taken where nothing is said: the camera moves by less than half its sigma.
     by_hand = visioncal.calibrate(real_data / "sessions/ric_charuco_eye_to_hand")
     x_mm = 1e3 * by_hand.transforms["base_from_cam"].translation
-    assert away_mm(result, "base_from_cam", x_mm) < 0.3 * sigma_mm
+    assert away_mm(result, "base_from_cam", x_mm) < 0.5 * sigma_mm
 
 
 def test_visp_to_the_hand(real_data, calibrated):

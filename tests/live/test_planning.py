@@ -189,7 +189,7 @@ def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
 def test_the_few_stops_that_a_recorded_cell_allows_are_added():
     """As before a fixed camera: of a guessed cell so few say that it is guessed wrong."""
     begun = start_from_session(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))
-    cell = replace(begun.cell, limits=replace(begun.cell.limits, edge_px=330.0))
+    cell = replace(begun.cell, limits=replace(begun.cell.limits, edge_px=334.0))
     request = PlanRequest(HAND_EYE, count=5)
     plan = make_plan(cell, request, begun=replace(begun, cell=cell))
     assert len(plan.stops) == 5

@@ -26,9 +26,10 @@ def test_its_covariance_agrees_with_central_differences():
         moved(calibration, sign * 1e-3 * error).ray_frame.transform.matrix for sign in (1, -1)
     )
     slope = log(invert(behind) @ ahead) / 2e-3
-    # Truncation of second order in a step of a thousandth, relative; rounding is less.
+    # Truncation of second order in a step of a thousandth, relative; and the field's columns follow
+    # the intrinsics, to which they are orthogonal, by a thousandth.
     expected = np.outer(slope, slope)
-    np.testing.assert_allclose(found.covariance, expected, atol=1e-4 * slope @ slope)
+    np.testing.assert_allclose(found.covariance, expected, atol=1e-3 * slope @ slope)
 
 
 def test_z_runs_along_the_ray_that_the_whole_lens_has():

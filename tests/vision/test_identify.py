@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from support.boards import charuco, checkerboard, circles, printed
+from support.commands import visioncal
 from support.marks import slow
-from typer.testing import CliRunner
 
-from visioncal.cli.app import target_app
 from visioncal.core.errors import DataError
 from visioncal.simulation import CellOptions, fisheye_camera, prepare_scene, render, simulate
 from visioncal.vision.finders.identify import identify
@@ -191,7 +190,7 @@ def test_real_photographs_are_named(real_data, pattern, expected):
 
 
 def run(*arguments):
-    return CliRunner().invoke(target_app, ["check", *(str(argument) for argument in arguments)])
+    return visioncal("target", "check", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -203,21 +202,21 @@ def photo(tmp_path_factory):
 
 def test_check_prints_a_description_and_writes_it(photo, tmp_path):
     done = run(photo)
-    assert done.exit_code == 0, done.exception
-    assert tomllib.loads(done.stdout)["columns"] == 9
-    assert "square_m" not in tomllib.loads(done.stdout)
+    assert done.status == 0, done.said
+    assert tomllib.loads(done.out)["columns"] == 9
+    assert "square_m" not in tomllib.loads(done.out)
     out = tmp_path / "found.toml"
-    assert isinstance(run(photo, "-o", out).exception, DataError)
+    assert run(photo, "-o", out).status == 2
     written = run(photo, "-o", out, "--square-mm", 30)
-    assert written.exit_code == 0
-    assert written.stdout.startswith("ChArUco board of 9 x 6 squares")
+    assert written.status == 0
+    assert written.out.startswith("ChArUco board of 9 x 6 squares")
     target = load_target("found.toml", tmp_path)
     assert (target.columns, target.rows, target.square_m) == (9, 6, 0.03)
-    assert isinstance(run(photo, "-o", out, "--square-mm", 30).exception, DataError)
+    assert run(photo, "-o", out, "--square-mm", 30).status == 2
 
 
 def test_check_prints_json(photo):
-    document = json.loads(run(photo, "--json", "--square-mm", 30).stdout)
+    document = json.loads(run(photo, "--json", "--square-mm", 30).out)
     assert (document["kind"], document["columns"], document["rows"]) == ("charuco", 9, 6)
     assert document["corners_seen"] == document["corners"] == 40
     assert document["target"]["square_m"] == 0.03
@@ -227,8 +226,8 @@ def test_check_prints_json(photo):
 
 def test_check_refuses_what_is_no_image_and_no_size(photo, tmp_path):
     (tmp_path / "notes.png").write_bytes(b"not an image")
-    assert "decoded" in str(run(tmp_path / "notes.png").exception)
+    assert "decoded" in run(tmp_path / "notes.png").said
     (tmp_path / "print.pdf").write_bytes(b"%PDF-1.4")
-    assert "a page of a PDF" in str(run(tmp_path / "print.pdf").exception)
+    assert "a page of a PDF" in run(tmp_path / "print.pdf").said
     for size_mm in (30000, "nan", "inf", -3):
-        assert f"--square-mm is {size_mm}" in str(run(photo, "--square-mm", size_mm).exception)
+        assert f"--square-mm is {size_mm}" in run(photo, "--square-mm", size_mm).said

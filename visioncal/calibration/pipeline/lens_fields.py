@@ -166,8 +166,9 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
         if compressed.coefficients is not None and problem.levels is not None:
             far = distances(stack, poses)[stack.view_of]
-            columns = displacements(stack.px, camera, far, problem.levels)
-            beyond = columns @ compressed.coefficients.mean
+            field = replace(problem.levels, breathing=0.0)
+            columns = displacements(stack.px, camera, far, field)
+            beyond = columns @ compressed.coefficients.mean[: columns.shape[2]]
         step = lens_step(stack, camera, poses, beyond, order)
         if step is None:
             continue

@@ -121,14 +121,14 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Their corners would be explained by a lens that changes from view to view.
         observed = replace(observed, turned=turned)
         solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
-    if not observed.is_misread and (found := _random_effects(solved)):
-        initial = replace(initial, other_effects=(*clock_errors, *found), turned=solved.turned)
-        solved = _fit_with_inliers(initial, observed, sizes)
     solved = replace(
         solved, arms=with_drifts(solved.arms, solved.inlier_problem, solved.inlier_fit.fit, level)
     )
     if any(arm.drift is not None for arm in solved.arms.values()):
         solved = _fit_with_inliers(solved, observed, sizes)
+    if not observed.is_misread and (found := _random_effects(solved)):
+        effects = (*clock_errors, *found)
+        solved = _fit_with_inliers(replace(solved, other_effects=effects), observed, sizes)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else solved.inlier_fit
     solved = replace(solved, inlier_fit=with_camera_levels(cell, poses, solved.inlier_fit))

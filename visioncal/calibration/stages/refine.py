@@ -160,7 +160,9 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 
 
 def _estimated(
-    side: FrameModel, fitted: ConvergedFit, posture: Mapping[str, ArmErrors] = MappingProxyType({})
+    side: CellFrameModel,
+    fitted: ConvergedFit,
+    posture: Mapping[str, ArmErrors] = MappingProxyType({}),
 ) -> CameraParameters:
     """Lenses and boards with the sizes of their errors, near a fit.
 
@@ -200,7 +202,9 @@ def _estimated(
         sizes = estimate_sizes(seen, problem, rows, state, noise, name, uneven)
         # What other cameras tell of the boards is known to each.
         levels[name], lenses[name], boards = sizes.levels, sizes.lens, sizes.boards
-    return fitted.camera_parameters.with_sizes(levels, lenses, boards)
+    # Errors of links look like a scale, too.
+    holds = bool(side.arms_without_joints) or side.has_links
+    return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 
 def recompute_poses(

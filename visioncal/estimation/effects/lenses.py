@@ -143,6 +143,8 @@ class CameraParameters:
         levels: Mapping[str, LensLevels],
         lenses: Mapping[str, LensSizes],
         boards: tuple[BoardSizes, ...],
+        *,
+        holds_scales: bool | None = None,
     ) -> "CameraParameters":
         """Returns them with other sizes of errors; values without errors are the stated ones.
 
@@ -150,12 +152,14 @@ class CameraParameters:
             levels: Sizes of the lens errors beyond the models, by camera.
             lenses: Sizes of the errors of given lenses, by camera.
             boards: Sizes of the errors of the printed boards.
+            holds_scales: See `CornerProblem`; unchanged if None.
         """
         problems = {
             name: replace(
                 problem.with_levels(levels[name]) if name in levels else problem,
                 lens_sizes=lenses.get(name, problem.lens_sizes),
                 board_sizes=boards,
+                holds_scales=problem.holds_scales if holds_scales is None else holds_scales,
             )
             for name, problem in self.problems.items()
         }
