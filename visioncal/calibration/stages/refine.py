@@ -1,4 +1,4 @@
-"""Joint fit of lenses, boards and frames, and the selection of the values that it frees."""
+"""Joint fit of lenses, boards and frames, with the sizes of their errors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +29,6 @@ from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.scene import BoardSizes
 
 # Size of a board's scale error at the start: prints are scaled to fit a page.
 _WIDE = 0.03
@@ -67,7 +66,7 @@ def refine_jointly(
     """
     with diverging():
         # Sizes are estimated from above: near a wrong size, lines of sight restrain another one.
-        wide = tuple(max(item, BoardSizes(_WIDE), key=_scale) for item in optics.board_sizes)
+        wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
         stated = fit_jointly(optics.with_sizes({}, {}, wide), side, frames)
         if _is_shrunk(stated):
             stated = fit_jointly(optics, side, frames)
@@ -80,10 +79,6 @@ def refine_jointly(
         if any(problem.stack is not before.stack for problem, before in stacks):
             fitted = _follows(new_side, fitted, weighed) or fitted
         return with_sizes(new_side, fitted), new_side
-
-
-def _scale(sizes: BoardSizes) -> float:
-    return sizes.scale
 
 
 def _beside_arms(
