@@ -197,7 +197,12 @@ def foreign(name: str):
 
 
 # First causes that are right, where a cell of `elsewhere` has a fault that is no source of noise.
-FOREIGN_CAUSES = {"camera bumped 1 mm": "moved|step|slip|drift", "drift 0.5 mm": "drift|moved"}
+FOREIGN_CAUSES = {
+    "camera bumped 1 mm": "moved|step|slip|drift",
+    "drift 0.5 mm": "drift|moved|base_creeps",
+    "lens grows by 0.15 %, 30 views": "lens_grows",
+    "base tilts by 1.5 mrad/m, 30 views": "base_tilts",
+}
 
 
 def network(cause: str = "", gauge_m: float = 0.0, **options):

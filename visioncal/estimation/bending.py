@@ -73,8 +73,8 @@ def payload_factor(arm: ArmData) -> Factor | None:
     flange_jacobian = np.zeros((len(problem.poses[arm.robot]), 6, 1))
     twists = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * load_torques)
     flange_jacobian[arm.stops] = twists[:, :, None]
-    no_prior = PriorInformation(np.zeros((1, 1)), np.zeros(1))
-    payload = Effect.free("payload", no_prior, flange_jacobian={arm.robot: flange_jacobian})
+    flanges = {arm.robot: flange_jacobian}
+    payload = Effect.free("payload", PriorInformation.flat(1), flange_jacobian=flanges)
     widened = problem.with_effects([*problem.effects, payload])
     widened_state = State(arm.state.edges, np.append(arm.state.values, 0.0))
     information, gradient = normal_equations(widened, widened_state, arm.noise)

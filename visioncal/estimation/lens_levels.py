@@ -136,10 +136,20 @@ class _Likelihood:
         without[level] = least
         upper_bound = 2.0 * (self.model.at(without, is_sloped=False).value - found.value)
         # The other levels are only refitted where it matters.
-        is_beyond_stated = level >= _BOARDS and (level - _BOARDS) % 3 == 0
-        if upper_bound < SIGNIFICANT or (level >= _FOCAL and not is_beyond_stated):
+        if upper_bound < SIGNIFICANT or (level >= _FOCAL and not _is_scale(level)):
             return upper_bound
         return 2.0 * (self.minimised(without, (*closed, level)).value - found.value)
+
+    def share(
+        self, found: MixedEstimate, closed: tuple[int, ...], size: int, uneven: float
+    ) -> float:
+        """Share of the variance of a size of lens or board, averaged over a size of zero, too."""
+        gain = self.gain(found, closed, size)
+        if _is_scale(size):
+            weight = level_weight(gain / uneven**2, _WRONG_SIZE)
+        else:
+            weight = level_weight(gain, _WRONG_SHAPE)
+        return weight if weight > _NO_WEIGHT else 0.0
 
     def limits(self, closed: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the levels' logarithms."""
@@ -221,14 +231,9 @@ def estimate_sizes(
     sizes = np.where(np.exp(found.logs) > 2.0 * low, np.exp(found.logs), 0.0)
     field, breathing, jitter = sizes[_FIELD : _JITTER + 1] / np.exp(found.logs[_NOISE])
     gains = [likelihood.gain(found, closed, index) for index in (_FIELD, _BREATHING, _JITTER)]
-    for index in np.flatnonzero(sizes[: likelihood.flanges]):
-        if index >= _FOCAL:
-            # Averaged over a size of zero, too.
-            is_scale = index >= _BOARDS and (index - _BOARDS) % 3 == 0
-            prior = _WRONG_SIZE if is_scale else _WRONG_SHAPE
-            gain = likelihood.gain(found, closed, int(index))
-            weight = level_weight(gain / uneven**2 if is_scale else gain, prior)
-            sizes[index] *= weight**0.5 if weight > _NO_WEIGHT else 0.0
+    for index in range(_FOCAL, likelihood.flanges):
+        if sizes[index]:
+            sizes[index] *= likelihood.share(found, closed, index, uneven) ** 0.5
     return CameraSizes(
         LensLevels(
             float(field),
@@ -245,6 +250,11 @@ def estimate_sizes(
     )
 
 
+def _is_scale(size: int) -> bool:
+    """Whether a size of a board, or one before those of the boards, is that of a board's scale."""
+    return size >= _BOARDS and (size - _BOARDS) % 3 == 0
+
+
 def _closed(problem: CornerProblem, stops: int) -> tuple[int, ...]:
     """The sizes that are zero: those that too few corners or stops do not tell."""
     boards = range(_BOARDS, _BOARDS + 3 * len(problem.board_sizes))
@@ -254,7 +264,7 @@ def _closed(problem: CornerProblem, stops: int) -> tuple[int, ...]:
         # A lens that is known to some pixels may be off by more; another one is held.
         if problem.scene.matrix_sigma_px is None:
             closed |= {_FOCAL, _CENTRE}
-        closed |= {at for at in boards if (at - _BOARDS) % 3}
+        closed |= {at for at in boards if not _is_scale(at)}
     if stops < _FEWEST_STOPS or problem.scene.is_focus_fixed:
         closed |= {_BREATHING, _JITTER}
     if problem.is_flat[0]:

@@ -54,6 +54,11 @@ class PriorInformation:
     information: FloatArray  # (p, p), zero for parameters without a prior.
     gradient: FloatArray  # (p,) half the gradient of the prior cost at the current state.
 
+    @classmethod
+    def flat(cls, count: int) -> "PriorInformation":
+        """Zero information on some parameters."""
+        return cls(np.zeros((count, count)), np.zeros(count))
+
     def beside(self, count: int) -> "PriorInformation":
         """The same with `count` parameters without a prior appended."""
         return PriorInformation(

@@ -183,7 +183,7 @@ def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Pro
         _stepped(jacobian, values) for jacobian in (cause.by_sensor, cause.flange_jacobian)
     )
     adjoints, observations = adjoint(invert(by_sensor.moved)), problem.observations
-    no_prior = PriorInformation(np.zeros((len(values), len(values))), np.zeros(len(values)))
+    no_prior = PriorInformation.flat(len(values))
     ((robot, poses),) = problem.poses.items()
     changed = Effect.free("change", no_prior, by_sensor.jacobian, {robot: flange_jacobian.jacobian})
     return replace(

@@ -153,7 +153,7 @@ def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | N
     jacobian = np.zeros((len(poses), 6, 6))
     time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
     jacobian[stops] = adjoint(invert(poses[stops])) * time
-    zeros, no_prior = np.zeros(6), PriorInformation(np.zeros((6, 6)), np.zeros(6))
+    zeros, no_prior = np.zeros(6), PriorInformation.flat(6)
     effect = Effect("creep", zeros, no_prior, zeros > 0.0, flange_jacobian={robot: jacobian})
     widened = problem.with_effects([*problem.effects, effect])
     widened_state = State(state.edges, np.concatenate([state.values, zeros]))

@@ -1,7 +1,7 @@
 """Scene of one camera: its targets and corners, with priors of lens and boards."""
 
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -181,18 +181,7 @@ class CornerProblem:
     @property
     def scale(self) -> IntArray:
         """Columns of the printed boards' scales."""
-        return self._joined(self.scale_of(board) for board in self.printed)
-
-    @property
-    def shape(self) -> IntArray:
-        """Columns of the printed boards' aspects, shears and bends."""
-        return self._joined(self.shape_of(board) for board in self.printed)
-
-    @property
-    def points(self) -> IntArray:
-        """Columns of the rigs' points, if these are not exact."""
-        rigs = set(range(len(self.scene.targets))) - set(self.printed)
-        return self._joined(self.points_of(rig) for rig in sorted(rigs))
+        return np.concatenate([self.lens[:0], *map(self.scale_of, self.printed)])
 
     def scale_of(self, board: int) -> IntArray:
         """Column (1,) of one printed board's scale."""
@@ -206,9 +195,6 @@ class CornerProblem:
         """Columns of all unknowns of one target's corner positions."""
         columns = shape_slices(self.scene.targets, len(self.lens))[target]
         return np.arange(columns.start, columns.stop)
-
-    def _joined(self, places: Iterable[IntArray]) -> IntArray:
-        return np.concatenate([self.lens[:0], *places])
 
     def corners_of(self, board: int) -> slice:
         """Rows of one board's corners in `positions`."""

@@ -199,7 +199,9 @@ def _of_joints(offsets: Mapping[str, FloatArray]) -> list[Effect]:
     """Offsets of joints as effects, by robot."""
     return [
         Effect.free(
-            f"offsets of {robot}", _no_prior(offset.shape[2]), flange_jacobian={robot: offset}
+            f"offsets of {robot}",
+            PriorInformation.flat(offset.shape[2]),
+            flange_jacobian={robot: offset},
         )
         for robot, offset in offsets.items()
     ]
@@ -214,12 +216,7 @@ def _of_size(problem: Problem, fit: Solution, board: str, some: Mask | None = No
     jacobian = np.zeros((len(observations), 6, 1))
     positions = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
     jacobian[:, 3:] = np.where(rows[:, None, None], positions, 0.0)
-    return Effect.free(f"size of {board}", _no_prior(1), jacobian)
-
-
-def _no_prior(count: int) -> PriorInformation:
-    """Zero information on some values."""
-    return PriorInformation(np.zeros((count, count)), np.zeros(count))
+    return Effect.free(f"size of {board}", PriorInformation.flat(1), jacobian)
 
 
 def _as_f_tests(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:

@@ -60,8 +60,7 @@ def random_effects(
         candidates = [*_of_flange(problem, robot, stops)]
         if corners is not None and rows is not None and len(arms) == 1:
             candidates += _of_sensors(problem, corners, rows, stops)
-        count = arm.basis.shape[2]
-        flat = PriorInformation(np.zeros((count, count)), np.zeros(count))
+        flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
         found += find_random_effects(problem, fit.state, fit.noise, candidates, [nuisance])
     return tuple(found)

@@ -115,7 +115,7 @@ def effect_of(kind: RandomEffect, robot: str, stops: Stops, rows: IntArray | Non
         rows: (n,) index of the columns of each observation; -1 for none. None for a flange.
     """
     columns = kind.columns(stops)
-    flat = PriorInformation(np.zeros((columns.shape[2],) * 2), np.zeros(columns.shape[2]))
+    flat = PriorInformation.flat(columns.shape[2])
     name = f"{kind.kind} of {robot}"
     if rows is None:
         return Effect.free(name, flat, None, {robot: columns})
