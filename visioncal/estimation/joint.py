@@ -125,7 +125,7 @@ class ConvergedFit:
 
 def fit_jointly(
     optics: CameraParameters,
-    side: FrameModel,
+    model: FrameModel,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
     before: LinearisedCorners | None = None,
@@ -134,7 +134,7 @@ def fit_jointly(
 
     Args:
         optics: Corners, and initial lens and board parameters.
-        side: Frame part of the fit.
+        model: Frame part of the fit.
         frames: Initial poses of the unknown frames.
         others: Initial values of all other effects; their linearisation point if None.
         before: Previous linearisation of the corners; see `CameraParameters.linearised`.
@@ -143,7 +143,7 @@ def fit_jointly(
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
-        return _settled(side, _fitted(side, optics.linearised(before), frames, others))
+        return _settled(model, _fitted(model, optics.linearised(before), frames, others))
 
 
 @contextmanager
@@ -169,19 +169,19 @@ def diverging() -> Iterator[None]:
 
 
 def refit_jointly(
-    fitted: ConvergedFit, side: FrameModel, optics: CameraParameters | None = None
+    fitted: ConvergedFit, model: FrameModel, optics: CameraParameters | None = None
 ) -> ConvergedFit:
     """Refits from a converged fit, with other sizes of errors of lenses and boards."""
     return fit_jointly(
         optics or fitted.camera_parameters,
-        side,
+        model,
         fitted.frames,
         fitted.others,
         before=fitted.linearised,
     )
 
 
-def _settled(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
+def _settled(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     for _ in range(_ROUNDS):
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
@@ -189,7 +189,7 @@ def _settled(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
         corners = _stepped(fitted)
         if corners is fitted.linearised:
             raise np.linalg.LinAlgError("the corners follow no part of the step")
-        previous, fitted = fitted, _fitted(side, corners, fitted.frames, fitted.others)
+        previous, fitted = fitted, _fitted(model, corners, fitted.frames, fitted.others)
         if not (previous.fit.settled or fitted.fit.settled):
             break
     return fitted
@@ -216,17 +216,17 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
 
 
 def _fitted(
-    side: FrameModel,
+    model: FrameModel,
     corners: LinearisedCorners,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None,
 ) -> ConvergedFit:
-    problem = side.problem(corners)
+    problem = model.problem(corners)
     start = problem.start(frames)
     if others is not None:
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
-    return ConvergedFit(corners, problem, fit_problem(problem, start, side.noise))
+    return ConvergedFit(corners, problem, fit_problem(problem, start, model.noise))
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
+def measured_scale(model: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
     """A board's scale by the robots' motion; infinite sigma if it is unobservable."""
     optics, place = fitted.camera_parameters, fitted.camera_parameters.scale_of(board)
     stated = optics.stated_scale_sigma(board)
@@ -263,17 +263,17 @@ def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int) -> Measur
     if measured <= _UNMEASURED * prior:
         return MeasuredScale(board, 0.0, np.inf, stated)
     scale *= 1.0 + prior / measured
-    sigma = (UNEVEN_LINKS if side.has_links else 1.0) * measured**-0.5
+    sigma = (UNEVEN_LINKS if model.has_links else 1.0) * measured**-0.5
     return MeasuredScale(board, scale, sigma, stated)
 
 
-def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
+def measured_rig(model: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
     """Measures the scale of a rig of points by the robots' motion, its table being taken as exact.
 
     Its views alone cannot determine it: a larger rig farther away looks the same.
 
     Args:
-        side: Frame part of the fit.
+        model: Frame part of the fit.
         fitted: The converged fit.
         frame: Frame of the rig.
         rig: Index of the rig among the targets.
@@ -283,7 +283,7 @@ def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -
     extended = State(state.edges, np.append(state.values, 0.0))
     information, gradient = normal_equations(problem, extended, fitted.fit.noise)
     covariance = covariance_among(information, problem.moving)
-    sigma = (UNEVEN_LINKS if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
+    sigma = (UNEVEN_LINKS if model.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
     return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
 
 

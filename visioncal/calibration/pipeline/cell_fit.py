@@ -47,7 +47,7 @@ class CellFit:
 
     @property
     def frame_model(self) -> CellFrameModel:
-        """The frames' side of the joint fit."""
+        """The frames' model of the joint fit."""
         agreed, views = self.inlier_fit, [row.view for row in self.cell.rows]
         return CellFrameModel(
             agreed.problem, agreed.used, views, self.arms, self.other_effects, agreed.fit.noise
@@ -65,11 +65,11 @@ class CellFit:
         inlier_fit = replace(self.inlier_fit, problem=replace(problem, poses=poses))
         return replace(self, inlier_fit=inlier_fit)
 
-    def with_joint_fit(self, side: CellFrameModel, fitted: ConvergedFit) -> Self:
+    def with_joint_fit(self, model: CellFrameModel, fitted: ConvergedFit) -> Self:
         """Takes over a joint fit of lenses, boards and frames."""
-        problem = side.full_problem(fitted.linearised)
+        problem = model.full_problem(fitted.linearised)
         inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.fit)
-        corners, arms = fitted.linearised, side.arms
+        corners, arms = fitted.linearised, model.arms
         return replace(self, inlier_fit=inlier_fit, linearised_corners=corners, arms=arms)
 
     def camera_findings(self, covariance: FloatArray) -> Iterator[Finding]:

@@ -144,8 +144,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
 
 def _random_effects(solved: CellFit) -> tuple[Effect, ...]:
     """Errors that grow with time, reach or gravity, which the fit's residuals show."""
-    corners, side = solved.linearised_corners, solved.frame_model
-    rows = None if corners is None else side.rows(corners)
+    corners, model = solved.linearised_corners, solved.frame_model
+    rows = None if corners is None else model.rows(corners)
     problem, fit = solved.inlier_problem, solved.inlier_fit.fit
     return random_effects(problem, fit, solved.arms, corners, rows)
 
@@ -273,13 +273,13 @@ def _fit_lenses_and_frames(
     )
     solved = solved.with_arm_poses()
     if observed.scenes and not solved.inlier_fit.problem.is_combined:
-        side, frames = solved.frame_model, solved.frames
+        model, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
-        optics = side.looks(observed.scenes, views)
+        optics = model.camera_parameters(observed.scenes, views)
         if observed.is_misread:
-            return solved.with_joint_fit(side, fit_jointly(optics, side, frames))
+            return solved.with_joint_fit(model, fit_jointly(optics, model, frames))
         try:
-            fitted, side = refine_jointly(side, optics, frames)
+            fitted, model = refine_jointly(model, optics, frames)
         except ConvergenceError:
             names = next(iter(observed.scenes.values())).names
             targets = [frame_name("target", name) for name in names]
@@ -287,8 +287,8 @@ def _fit_lenses_and_frames(
             far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
-            fitted, side = refine_jointly(side, optics.with_scales(far), frames)
-        return solved.with_joint_fit(side, fitted)
+            fitted, model = refine_jointly(model, optics.with_scales(far), frames)
+        return solved.with_joint_fit(model, fitted)
     solved = replace(solved, linearised_corners=None)
     if drifts := tuple(arm_effects(solved.arms)):
         solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, drifts))
@@ -347,11 +347,11 @@ def _converge_arms(solved: CellFit) -> CellFit:
             effects = (*solved.other_effects, *arm_effects(solved.arms))
             solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
         else:
-            side, corners = solved.frame_model, solved.linearised_corners
-            fitted = fit_jointly(corners.camera_parameters, side, solved.frames, None, corners)
+            model, corners = solved.frame_model, solved.linearised_corners
+            fitted = fit_jointly(corners.camera_parameters, model, solved.frames, None, corners)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                fitted = with_sizes(side, fitted)
-            solved = solved.with_joint_fit(side, fitted)
+                fitted = with_sizes(model, fitted)
+            solved = solved.with_joint_fit(model, fitted)
         problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}
         solved = replace(solved, arms={name: arm for name, (arm, _) in moved.items()})

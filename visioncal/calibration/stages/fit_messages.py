@@ -48,12 +48,12 @@ _NEW_LENS = Remedy(
 
 
 def lens_and_board_findings(
-    side: FrameModel, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
+    model: FrameModel, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
 ) -> Iterator[Finding]:
     """Findings of a joint fit on lenses and boards; those without reason for doubt are notes.
 
     Args:
-        side: The frames' side of the fit.
+        model: The frames' model of the fit.
         fitted: The converged fit.
         covariance: (p, p) covariance of its unknowns, including other errors than noise.
         stated: The same observations with nominal arms; None where none was calibrated.
@@ -69,13 +69,13 @@ def lens_and_board_findings(
         if board not in optics.printed:
             yield from _point_findings(target, optics.moved_points(board))
             frame = frame_name("target", scene.names[board])
-            measured = measured_rig(side, fitted, frame, board)
+            measured = measured_rig(model, fitted, frame, board)
             if stated is not None:
                 measured = rig_by_stated_arms(fitted, stated, frame, board) or measured
             yield from _rig_size_findings(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
-        measured = measured_scale(side, fitted, board)
+        measured = measured_scale(model, fitted, board)
         (place,) = optics.scale_of(board)
         if measured.is_another and place in fitted.linearised.moving:
             (at,) = fitted.columns_of(np.array([place]))

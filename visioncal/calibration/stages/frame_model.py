@@ -109,7 +109,7 @@ class CellFrameModel:
         """Frees all errors of the arms that were found, or only the estimated ones."""
         return replace(self, frees_all_errors=freely)
 
-    def looks(
+    def camera_parameters(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
     ) -> CameraParameters:
         """The corners of scenes and views (by camera frame), with stated lenses and boards."""

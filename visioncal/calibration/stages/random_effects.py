@@ -24,7 +24,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution
 
-# With fewer stops, no such error is told from noise.
+# With fewer stops, no such error is distinguished from noise.
 _FEWEST_STOPS = 12
 # False-alarm probability of a finding.
 _FALSE_ALARM = 1e-4

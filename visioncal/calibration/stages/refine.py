@@ -52,7 +52,7 @@ def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
 
 
 def refine_jointly(
-    side: CellFrameModel, optics: CameraParameters, frames: Mapping[str, FloatArray]
+    model: CellFrameModel, optics: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits lenses, boards and frames to all corners together, with the sizes of their errors.
 
@@ -62,27 +62,27 @@ def refine_jointly(
     `frames` the initial poses of unknown frames.
 
     Returns:
-        The fit, and the side with the errors of its arms.
+        The fit, and the model with the errors of its arms.
     """
     with diverging():
         # Sizes are estimated from above: near a wrong size, lines of sight restrain another one.
         wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
-        stated = fit_jointly(optics.with_sizes({}, {}, wide), side, frames)
+        stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
         if _is_shrunk(stated):
-            stated = fit_jointly(optics, side, frames)
-        fitted = with_sizes(side, stated)
-        new_side = side.with_errors(fitted)
-        if any(error.is_significant for error in new_side.errors):
-            fitted, new_side = _beside_arms(side, new_side, stated)
+            stated = fit_jointly(optics, model, frames)
+        fitted = with_sizes(model, stated)
+        new_model = model.with_errors(fitted)
+        if any(error.is_significant for error in new_model.errors):
+            fitted, new_model = _beside_arms(model, new_model, stated)
         weighed = fitted.camera_parameters.weighed(fitted.linearised)
         stacks = zip(weighed.problems.values(), optics.problems.values(), strict=True)
         if any(problem.stack is not before.stack for problem, before in stacks):
-            fitted = _follows(new_side, fitted, weighed) or fitted
-        return with_sizes(new_side, fitted), new_side
+            fitted = _follows(new_model, fitted, weighed) or fitted
+        return with_sizes(new_model, fitted), new_model
 
 
 def _beside_arms(
-    side: CellFrameModel, after: CellFrameModel, stated: ConvergedFit
+    model: CellFrameModel, after: CellFrameModel, stated: ConvergedFit
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """The fit with errors of the arms, which may have passed for those of lenses and boards.
 
@@ -90,53 +90,53 @@ def _beside_arms(
     hides a part of it. Errors of any arm's shape decide the sizes of the others, but not all are
     estimated.
     """
-    under_stated = side.with_errors(stated)
+    under_stated = model.with_errors(stated)
     freeing = (under_stated if under_stated.errors else after).freed(freely=True)
     sized = with_sizes(freeing, _with_other_effects(freeing, stated))
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
         return sized, estimating
     fitted = _with_other_effects(estimating, sized)
-    new_side = estimating.with_errors(fitted)
+    new_model = estimating.with_errors(fitted)
     # Errors that were not significant under the stated lenses may be so under these.
-    if [error.is_estimated for error in new_side.errors] != [
+    if [error.is_estimated for error in new_model.errors] != [
         error.is_estimated for error in estimating.errors
     ]:
-        fitted = _with_other_effects(new_side, fitted)
-    return fitted, new_side
+        fitted = _with_other_effects(new_model, fitted)
+    return fitted, new_model
 
 
-def _with_other_effects(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
+def _with_other_effects(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """Fits again with other effects beside lenses and boards, which start at their own values."""
-    return fit_jointly(fitted.camera_parameters, side, fitted.frames, before=fitted.linearised)
+    return fit_jointly(fitted.camera_parameters, model, fitted.frames, before=fitted.linearised)
 
 
-def with_sizes(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
+def with_sizes(model: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges."""
-    sized = _estimated(side, fitted)
-    follows = _follows(side, fitted, sized)
+    sized = _estimated(model, fitted)
+    follows = _follows(model, fitted, sized)
     if follows is None:
         return fitted
     scales = [item.scale for item in sized.board_sizes]
     focals = [item.focal for item in sized.lens_sizes.values()]
-    if not side.arms_without_joints or not any((*scales, *focals)):
+    if not model.arms_without_joints or not any((*scales, *focals)):
         return follows
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
-    sized = _estimated(side, follows, side.pose_errors(follows))
-    return _follows(side, follows, sized) or follows
+    sized = _estimated(model, follows, model.pose_errors(follows))
+    return _follows(model, follows, sized) or follows
 
 
 def _follows(
-    side: FrameModel, fitted: ConvergedFit, sized: CameraParameters
+    model: FrameModel, fitted: ConvergedFit, sized: CameraParameters
 ) -> ConvergedFit | None:
     """A refit with other sizes; None where it diverges."""
     # Cameras that disagree about a stop agree once the board has shrunk to nothing, or the lenses
     # image nothing: such a fit may converge, but no corner is where it was seen.
     try:
-        refit = refit_jointly(fitted, side, sized)
+        refit = refit_jointly(fitted, model, sized)
         if _is_shrunk(refit):
             stated = tuple(replace(item, scale=0.0) for item in sized.board_sizes)
-            refit = refit_jointly(fitted, side, sized.with_sizes({}, {}, stated))
+            refit = refit_jointly(fitted, model, sized.with_sizes({}, {}, stated))
     except ConvergenceError:
         return None
     sigmas = zip(refit.linearised.sigmas_px, fitted.linearised.sigmas_px, strict=True)
@@ -155,7 +155,7 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 
 
 def _estimated(
-    side: CellFrameModel,
+    model: CellFrameModel,
     fitted: ConvergedFit,
     posture: Mapping[str, ArmErrors] = MappingProxyType({}),
 ) -> CameraParameters:
@@ -166,7 +166,7 @@ def _estimated(
     optics = fitted.linearised.camera_parameters
     seen = replace(fitted.linearised, is_flat=True)
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
-    problem = side.problem(seen)
+    problem = model.problem(seen)
     problem = replace(problem, priors=with_loose_positions(problem.priors))
     noise, values = (
         fitted.fit.noise,
@@ -193,12 +193,12 @@ def _estimated(
     )
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
-        rows, uneven = side.rows(seen), UNEVEN_LINKS if side.has_links else 1.0
+        rows, uneven = model.rows(seen), UNEVEN_LINKS if model.has_links else 1.0
         sizes = estimate_sizes(seen, problem, rows, state, noise, name, uneven)
         # What other cameras tell of the boards is known to each.
         levels[name], lenses[name], boards = sizes.levels, sizes.lens, sizes.boards
     # Errors of links look like a scale, too.
-    holds = bool(side.arms_without_joints) or side.has_links
+    holds = bool(model.arms_without_joints) or model.has_links
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 

@@ -278,7 +278,9 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     ]
     ((frame, scene),) = run.scenes.items()
     problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
-    optics = CellFrameModel(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
+    optics = CellFrameModel(problem, alone, chosen, {}).camera_parameters(
+        {frame: scene}, {frame: poses}
+    )
     free = free_parameters_of_camera(optics.linearised())
     observed = replace(observed, free=free).posed(poses)
     problem = observed.problem(chosen).merged()
