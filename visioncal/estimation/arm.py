@@ -32,7 +32,7 @@ SIGNIFICANT, _LIKELY = 15.1, 3.84
 # Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
 # Fewer stops have hardly more residuals than edges and noise have parameters.
-_FEWEST_STOPS = 6
+FEWEST_STOPS = 6
 # Position by which the errors change in proportion [m]: typical reach of an arm.
 _REACH_M = 0.6
 
@@ -127,7 +127,6 @@ def find_arm_errors(
     basis: FloatArray,
     *,
     of_links: bool,
-    min_gain: float | None = None,
 ) -> ArmErrors | None:
     """Estimates the size of one robot's arm errors, if they are significant.
 
@@ -136,8 +135,6 @@ def find_arm_errors(
         robot: Index of the robot.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether the basis is of this arm's links.
-        min_gain: Least gain over white noise; None for the limit of likelihood, and of links for
-            any gain at all.
 
     Returns:
         The errors; None where the gain is no larger.
@@ -145,14 +142,13 @@ def find_arm_errors(
     # The basis is empty for an arm whose link errors all equal errors of its frames (parallel
     # axes).
     stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
-    if len(np.unique(stops)) < _FEWEST_STOPS or not size:
+    if len(np.unique(stops)) < FEWEST_STOPS or not size:
         return None
     levels, start = likelihood.start_beside(robot, basis)
     if start <= _NOTHING:
         return None
-    if min_gain is None:
-        # Every arm has link errors: their size counts even where it hardly gains likelihood.
-        min_gain = 0.0 if of_links else _LIKELY
+    # Every arm has link errors: their size counts even where it hardly gains likelihood.
+    min_gain = 0.0 if of_links else _LIKELY
     white_value = likelihood.white[1]
     sigmas, value = likelihood.beside(robot, basis, np.ones((size, 1))).most_likely(
         np.append(levels, start),

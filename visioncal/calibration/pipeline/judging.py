@@ -371,7 +371,7 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
                 has_posture_errors=arm.errors is not None and arm.errors.is_significant,
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
-                by_functions=arm.has_functions,
+                by_functions=arm.function_gain > 0.0,
                 can_tilt=arm.can_tilt,
                 name=robot if len(problem.robots) > 1 else "",
             )

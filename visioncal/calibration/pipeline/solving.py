@@ -301,32 +301,29 @@ def _fit_lenses_and_frames(
     )
 
 
-def _choose_levels(solved: CellFit) -> dict[str, RobotArm]:
-    """Chooses the calibration level of each arm."""
-    fit = solved.inlier_fit.fit
+def _choose_levels(solved: CellFit, *, functions: bool = False) -> dict[str, RobotArm]:
+    """Selects the errors of each arm; functions of its joints only where asked for."""
+    part, fit = solved.inlier_problem, solved.inlier_fit.fit
     views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        return arm.with_level(nominal, start, solved.level, views, fit.noise)
+        found = arm.with_level(nominal, start, solved.level, views, fit.noise, functions=functions)
+        if not functions:
+            return found
+        # They also explain much of a slipped joint: where the slip explains more, they are left
+        # out.
+        gain = found.function_gain
+        slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm})) if gain else None
+        slips = slip is not None and log_gain(part, fit, slip.mahalanobis_sq) > gain
+        return found if gain and not slips else arm
 
-    return change_each(solved.arms, solved.inlier_problem, fit, with_level)
+    return change_each(solved.arms, part, fit, with_level)
 
 
 def _with_functions(solved: CellFit) -> CellFit:
     """Fits error functions of the joints of each arm that supports them."""
-    # Their many unknowns would slow each update of the inliers down, so that they come last. They
-    # also explain much of a slipped joint: where the slip explains more, they are left out.
-    part, fit = solved.inlier_problem, solved.inlier_fit.fit
-
-    def with_functions(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        extended = arm.with_functions(nominal, start, solved.level, fit.noise)
-        if not extended.function_gain:
-            return extended
-        slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm}))
-        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > extended.function_gain
-        return arm if slips else extended
-
-    arms = change_each(solved.arms, part, fit, with_functions)
+    # Their many unknowns would slow each update of the inliers down, so that they come last.
+    arms = _choose_levels(solved, functions=True)
     if all(arms[name] is arm for name, arm in solved.arms.items()):
         return solved
     return _converge_arms(replace(solved, arms=arms))

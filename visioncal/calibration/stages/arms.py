@@ -14,8 +14,7 @@ from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import (
     SelectedArmLevel,
     allows_functions,
-    choose_level,
-    with_functions,
+    select_errors,
 )
 from visioncal.calibration.stages.loads import check_elastic, check_poses
 from visioncal.calibration.stages.reported_poses import move_to_arm
@@ -34,6 +33,7 @@ from visioncal.estimation.arm import (
     rows_of,
     stops_of,
 )
+from visioncal.estimation.arm_sizes import most_orders
 from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Problem
@@ -160,17 +160,10 @@ class RobotArm:
         return self.matched is None or self.matched.robot.can_tilt
 
     @property
-    def has_functions(self) -> bool:
-        """Whether joint error functions were found."""
-        return self.kinematics is not None and self.kinematics.functions is not None
-
-    @property
     def function_gain(self) -> float:
         """Twice the gain in log-likelihood by joint error functions; zero without any."""
-        if self.kinematics is None or self.kinematics.functions is None:
-            return 0.0
-        *others, functions = (fit.gain for fit in self.kinematics.fits.values())
-        return functions - max(others)
+        functions = None if self.kinematics is None else self.kinematics.functions
+        return 0.0 if functions is None else functions.gain
 
     def at(self, stops: IntArray) -> Self:
         """The arm at a subset (k,) of its stops."""
@@ -419,8 +412,10 @@ class RobotArm:
         asked: str,
         views: Sequence[int],
         noise: Noise | None = None,
+        *,
+        functions: bool = False,
     ) -> Self:
-        """Chooses the level of the arm's model by the data.
+        """Selects the errors of the arm's model by the data.
 
         Args:
             problem: The observations, with this arm as reported.
@@ -428,24 +423,39 @@ class RobotArm:
             asked: A key of `stages.kinematics.ASKED`.
             views: (n,) view of each observation.
             noise: Noise levels to start from; None to start from large ones.
+            functions: Whether functions of the joints are among them, where stops suffice.
         """
-        stops = stops_of(problem, self.robot)
-        if self.matched is None or self.joints_rad is None or not len(stops):
-            return self
-        used = self.at(stops)
+        used = self.at(stops_of(problem, self.robot))
         q, loads = used.joints_rad, used.loads
-        if q is None:
+        if self.matched is None or self.joints_rad is None or q is None or not len(q):
             return self
         model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, loads)
         blocks = blocks_of(model.nominal, self.loads)
         bases = {name: self._block_jacobian(model, name) for name in blocks}
-        kinematics = choose_level(
-            problem, start, self.robot, bases, asked, self.with_nominal_zero(problem), noise=noise
+        harmonics = None
+        if functions and allows_functions(asked, len(q)):
+            jacobian = model.robot.harmonic_jacobian(self.joints_rad, most_orders())
+            columns = self._by_stop(jacobian.reshape(len(jacobian), 6, -1))
+            harmonics = columns.reshape(len(columns), 6, model.nominal.joint_count, -1, 2)
+        kinematics = select_errors(
+            problem,
+            start,
+            self.robot,
+            bases,
+            model.torque_nm,
+            asked,
+            harmonics,
+            self.with_nominal_zero(problem),
+            noise,
         )
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         arm_views = tuple(views[index] for index in mine)
         arm = replace(self, kinematics=replace(kinematics, views=arm_views))
         if kinematics.errors:
+            if (found := kinematics.functions) is not None:
+                model = replace(
+                    model, harmonic_directions=found.directions, harmonic_sizes=found.sizes
+                )
             return arm._with_model(model.with_errors(kinematics.errors))
         if self.model is None:
             return arm
@@ -453,25 +463,6 @@ class RobotArm:
         fit = kinematics.nominal.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
-
-    def with_functions(self, problem: Problem, start: State, asked: str, noise: Noise) -> Self:
-        """Looks for joint error functions beyond the chosen level; see `with_level`."""
-        used = self.at(stops_of(problem, self.robot))
-        q, reported = used.joints_rad, used.reported
-        if self.matched is None or self.joints_rad is None or q is None or self.kinematics is None:
-            return self
-        if not allows_functions(asked, len(q)):
-            return self
-        model = ArmModel.of(self.matched.arm, q, reported).loaded(q, used.loads)
-        selection = np.eye(len(self.has_pose))[:, self.has_pose]
-        stops = (selection, self.joints_rad, self.loads)
-        fit = with_functions(self.kinematics, problem, start, self.robot, model, stops, noise)
-        if fit.functions is None:
-            return self
-        model = replace(
-            model, harmonic_directions=fit.functions.directions, harmonic_sizes=fit.functions.sizes
-        ).with_errors(fit.errors)
-        return replace(self, kinematics=fit)._with_model(model)
 
     def _block_jacobian(self, model: ArmModel, name: str) -> FloatArray:
         """Jacobian (s, 6, p) of the flange by the errors of a block."""

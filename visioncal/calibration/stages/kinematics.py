@@ -1,89 +1,166 @@
-"""Selection of the arm's error model: none, offsets, links, eccentric gears, joint functions."""
+"""Selection of the arm's error model: the blocks of errors that the stops show, and their fit."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, listed
+from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
-from visioncal.estimation.joint_functions import JointFunctions, find_joint_functions, most_orders
-from visioncal.estimation.kinematics import (
-    LEVELS,
-    ArmTrials,
-    LevelFit,
-    fit_level,
-    resized,
-    without_springs,
-)
+from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of
+from visioncal.estimation.arm_sizes import ArmSizes, JointFunctions, estimate_arm_sizes
+from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, RIGID, WEIGHT
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import (
+    Solution,
+    fit_problem,
+    left_out_residuals,
     robot_levels,
     starting_noise,
 )
 from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
-from visioncal.robot import Loads
 
 # Prior sigma of a zero that was found from the target's poses, and of the other joints' zeros
 # [rad].
 _ZERO_SIGMA_RAD = 5e-4
-# Levels by what the user asks for: the quick one after a lost encoder, or all that the data
-# determine.
+# The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
+# the data determine.
+_ALL = (*RIGID, COMPLIANCE, WEIGHT, BACKLASH, HARMONICS)
 ASKED: Mapping[str, tuple[str, ...]] = {
-    "offsets": ("offsets",),
-    "kinematics": ("geometry", "eccentricity"),
-    "elastic": ("elastic",),
-    "thermal": tuple(LEVELS),
-    "auto": tuple(LEVELS),
+    "offsets": ("offsets", BACKLASH),
+    "kinematics": (*RIGID, BACKLASH, HARMONICS),
+    "elastic": _ALL,
+    "thermal": _ALL,
+    "auto": _ALL,
 }
-# The level with joint errors that are functions of their angles, and the fewest stops for it.
-FUNCTIONS, _FEWEST_STOPS = "functions", 20
 # Requests that leave the level of the geometry to the data.
 _AUTOMATIC = ("auto", "thermal")
+# The name of a level by the block of errors that it has and the ones before it lack, and the fewest
+# stops for functions of the joints.
+FUNCTIONS, _FEWEST_FOR_FUNCTIONS = "functions", 20
+_LEVEL_OF = {
+    BACKLASH: "backlash",
+    "offsets": "offsets",
+    "links": "geometry",
+    "eccentricity": "eccentricity",
+    "ratios": "eccentricity",
+    COMPLIANCE: "elastic",
+    WEIGHT: "elastic",
+    HARMONICS: FUNCTIONS,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LevelFit:
+    """Fit with some blocks of errors of a robot's arm free."""
+
+    errors: Mapping[str, ArmErrors]  # The errors by block; empty for the nominal arm.
+    fit: Solution
+    gain: float  # Twice the gain in log-likelihood over the nominal arm.
+    # (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
+    inside: FloatArray
+    left_out: FloatArray  # (m, 6) leave-one-out residuals of each stop, to first order.
+    has_rotation: Mask  # (m,) which observations include a rotation.
+    functions: JointFunctions | None = None  # Functions of the joints; None without any.
+
+    @classmethod
+    def of(
+        cls, problem: Problem, state: State, robot: str, noise: Noise | None, sizes: ArmSizes | None
+    ) -> "LevelFit":
+        """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
+        errors = {} if sizes is None else sizes.errors
+        effects = [error.effect(robot, name) for name, error in errors.items()]
+        problem = problem.with_effects([*problem.effects, *effects])
+        values = np.append(state.values, problem.start_values[len(state.values) :])
+        if sizes is not None:
+            noise = replace(noise or starting_noise(problem), robots=sizes.levels)
+        fit = fit_problem(problem, State(state.edges, values), noise)
+        rows, points = rows_of(problem, robot), problem.points
+        pairs = zip(problem.observations.has_rotation, problem.observations.observed, strict=True)
+        rotation = np.array([has and name not in points for has, name in pairs], dtype=bool)
+        return cls(
+            errors,
+            fit,
+            0.0 if sizes is None else sizes.gain,
+            problem.linear(fit.state).residuals[rows],
+            left_out_residuals(problem, fit.state, fit.noise, rows)[rows],
+            rotation[rows],
+            None if sizes is None else sizes.functions,
+        )
+
+    @property
+    def level(self) -> str:
+        """The name of the level."""
+        names = [level for block, level in _LEVEL_OF.items() if block in self.errors]
+        return names[-1] if names else NOMINAL
+
+    @property
+    def held_out_mm(self) -> float:
+        """RMS of the residuals of left-out stops [mm]."""
+        return _rms(self.left_out, self.has_rotation).mm
+
+    @cached_property
+    def result(self) -> ArmLevel:
+        """The fit as figures."""
+        inside, left_out = (
+            _rms(array, self.has_rotation) for array in (self.inside, self.left_out)
+        )
+        return ArmLevel(
+            level=self.level,
+            unknowns=sum(error.basis.shape[2] for error in self.errors.values()),
+            rms_mm=inside.mm,
+            rms_deg=inside.deg,
+            held_out_mm=left_out.mm,
+            held_out_deg=left_out.deg,
+            likelihood_ratio=self.gain,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class SelectedArmLevel:
-    """The level of the arm's model that the views support."""
+    """The errors of the arm's model that the views show."""
 
-    level: str  # Its name; `nominal` where none explains more than chance.
-    fits: Mapping[str, LevelFit]  # All fits, the nominal arm's first.
+    nominal: LevelFit  # The fit of the nominal arm.
+    fit: LevelFit  # That with the errors; the nominal one where none explain more than chance.
     was_asked: bool  # Whether the user named the level.
     views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
-    # Functions of the joints; None where these are not significant.
-    functions: JointFunctions | None = None
-    diverged: tuple[str, ...] = ()  # Levels whose fits diverged, so that they were not compared.
+    # The fit with all blocks of errors, where the user named a level without some that are likely.
+    beyond: LevelFit | None = None
 
     @property
-    def nominal(self) -> LevelFit:
-        """The fit of the nominal arm."""
-        return self.fits[NOMINAL]
+    def level(self) -> str:
+        """Its name; `nominal` where no errors explain more than chance."""
+        return self.fit.level
 
     @property
     def errors(self) -> Mapping[str, ArmErrors]:
-        """The arm's errors by block, at this level."""
-        return self.fits[self.level].errors
+        """The arm's errors by block."""
+        return self.fit.errors
+
+    @property
+    def functions(self) -> JointFunctions | None:
+        """Functions of the joints; None where these are not significant."""
+        return self.fit.functions
 
     def left_out(self) -> tuple[UnseenView, ...]:
         """Residuals of held-out stops with both arms, by view."""
         before, after = (
             np.linalg.norm(level_fit.left_out.reshape(-1, 2, 3), axis=2)
-            for level_fit in (self.nominal, self.fits[self.level])
+            for level_fit in (self.nominal, self.fit)
         )
         return unseen_views(self.views, before, after, self.nominal.has_rotation)
 
     @cached_property
     def result(self) -> ArmResult:
-        """The compared levels, as a section of a calibration."""
-        return ArmResult(level=self.level, levels=tuple(map(_level, self.fits, self.fits.values())))
+        """Both levels, as a section of a calibration."""
+        fits = (self.nominal,) if self.fit is self.nominal else (self.nominal, self.fit)
+        return ArmResult(level=self.level, levels=tuple(fit.result for fit in fits))
 
 
 def unseen_views(
@@ -106,159 +183,84 @@ def unseen_views(
     )
 
 
-def choose_level(
+def select_errors(
     problem: Problem,
     state: State,
     robot: str,
     bases: Mapping[str, FloatArray],
+    torque_nm: float,
     asked: str,
+    harmonics: FloatArray | None = None,
     stated: Problem | None = None,
     noise: Noise | None = None,
 ) -> SelectedArmLevel:
-    """Selects the level of a robot's arm model.
+    """Selects the errors of a robot's arm that its observations show.
 
-    A level is chosen if its likelihood, with a penalty for its unknowns, exceeds the others' by
-    more than chance, and it predicts held-out stops better than the nominal arm.
+    Their sizes are estimated together; see `arm_sizes`. They must also predict left-out stops
+    better than the nominal arm.
 
     Args:
         problem: The observations, without errors of this arm.
         state: The solution with the nominal arm.
         robot: The robot.
         bases: (s, 6, p) Jacobian of the flange pose by stop, for the errors of each block.
+        torque_nm: The torque of a unit compliance [N m].
         asked: A key of `ASKED`.
+        harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
         stated: The observations with zeros as in the model, where `problem` has a shifted zero
             corrected; None without one. Then offsets are the least level.
         noise: The noise's levels to start from; those from above where None.
     """
-    diverged: list[str] = []
 
-    def converged(name: str, fit: Callable[[], LevelFit | None]) -> LevelFit | None:
-        """The fit of a level; None, and noted, where it diverges."""
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                return fit()
-        except np.linalg.LinAlgError:
-            diverged.append(name)
-            return None
+    def fitted(blocks: Sequence[str]) -> LevelFit:
+        """The fit with those blocks that are likely; the nominal one where none are better."""
+        own = {name: bases[name] for name in bases if name in blocks}
+        waves = harmonics if HARMONICS in blocks else None
+        # Numbers may be so large that their squares are none.
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                sizes = estimate_arm_sizes(
+                    problem, state, start.fit.noise, robot, own, torque_nm, waves
+                )
+                fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else start
+            except np.linalg.LinAlgError:
+                return start
+        return fit if fit.held_out_mm < start.held_out_mm else start
 
     with one_blas_thread():
-        arm = ArmTrials(problem, state, robot, bases, noise)
-        fits = {NOMINAL: fit_level(arm)}
-        for name, blocks in LEVELS.items():
-            fits[name] = converged(name, partial(fit_level, arm, blocks))
+        nominal = start = LevelFit.of(problem, state, robot, noise, None)
+        fit = beyond = start
+        stops = np.unique(problem.observations.stops[rows_of(problem, robot)])
+        if len(stops) >= FEWEST_STOPS:
+            fit = fitted(ASKED[asked])
+            beyond = fit if ASKED[asked] == _ALL else fitted(_ALL)
         if stated is not None:
-            nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
-            fits = _with_shifted_zero(fits, problem, stated, nominal, bases)
-    possible = {name: fit for name, fit in fits.items() if fit is not None}
-    always = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
-    allowed = (*always, *ASKED[asked])
-    final = None
-    while final is None:
-        best = _best({name: fit for name, fit in possible.items() if name in allowed})
-        # The nominal arm has nothing to resize, and ends this at the latest.
-        with one_blas_thread():
-            final = converged(best, partial(resized, arm, possible.pop(best)))
-    fits = {name: final if name == best else possible.get(name) for name in fits}
-    compared = {name: fit for name, fit in fits.items() if fit is not None}
-    return SelectedArmLevel(best, compared, asked not in _AUTOMATIC, diverged=tuple(diverged))
-
-
-def with_functions(
-    found: SelectedArmLevel,
-    problem: Problem,
-    state: State,
-    robot: str,
-    model: ArmModel,
-    stops: tuple[FloatArray, FloatArray, Loads],
-    noise: Noise,
-) -> SelectedArmLevel:
-    """Adds functions of the joints to a level of the geometry, where they are significant.
-
-    Args:
-        found: The result of `choose_level`.
-        problem: The observations, without errors of this arm.
-        state: The start.
-        robot: The robot.
-        model: The nominal arm.
-        stops: (s, m) incidence of the problem's stops and the robot's m places; (m, n) joints and
-            loads at the latter.
-        noise: The noise's levels to start from.
-    """
-    placed, q, loads = stops
-    count = model.nominal.joint_count
-    names = [*dict.fromkeys(["links", "eccentricity", *found.errors])]
-    names += [COMPLIANCE if model.functions is None else WEIGHT]
-    bases = {
-        name: np.tensordot(placed, model.columns(name, q, loads), axes=1)
-        for name in dict.fromkeys(names)
-        if name != "offsets"
-    }
-    harmonics = model.robot.harmonic_jacobian(q, most_orders()).reshape(len(q), -1)
-    harmonics = (placed @ harmonics).reshape(len(placed), 6, count, -1, 2)
-    with one_blas_thread():
-        functions = find_joint_functions(
-            problem, state, noise, robot, bases, harmonics, model.torque_nm
-        )
-        if functions is None:
-            return found
-        noise = replace(noise, robots=functions.levels)
-        arm = ArmTrials(problem, state, robot, bases, noise)
-        fit = arm.level(without_springs(arm, functions.errors), functions.gain)
-    fits = {**found.fits, FUNCTIONS: fit}
-    return replace(found, level=FUNCTIONS, fits=fits, functions=functions)
+            nominal = LevelFit.of(stated, state, robot, noise, None)
+            fit, beyond = (
+                _with_shifted_zero(level_fit, problem, start, stated, nominal, bases["offsets"])
+                for level_fit in (fit, beyond)
+            )
+    is_beyond = beyond.gain - fit.gain > SIGNIFICANT
+    asked_for = asked not in _AUTOMATIC
+    return SelectedArmLevel(nominal, fit, asked_for, beyond=beyond if is_beyond else None)
 
 
 def _with_shifted_zero(
-    fits: Mapping[str, LevelFit | None],
+    fit: LevelFit,
     problem: Problem,
+    zeroed: LevelFit,
     stated: Problem,
-    nominal: LevelFit | None,
-    bases: Mapping[str, FloatArray],
-) -> dict[str, LevelFit | None]:
-    """The levels beside the nominal arm, each with the gain of the shifted zero."""
-    zeroed = fits[NOMINAL]
-    if nominal is None or zeroed is None:
-        return dict(fits)
-    gain = 2.0 * (_neg_log_likelihood(stated, nominal) - _neg_log_likelihood(problem, zeroed))
-    with_gain = {name: fit and replace(fit, gain=fit.gain + gain) for name, fit in fits.items()}
-    if with_gain["offsets"] is None:
-        errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
-        with_gain["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
-    return with_gain | {NOMINAL: nominal}
-
-
-def _neg_log_likelihood(problem: Problem, fit: LevelFit) -> float:
-    return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
-
-
-def _best(fits: Mapping[str, LevelFit]) -> str:
-    """The most likely level that predicts held-out stops better than the first one."""
-    # A level's likelihood has the penalty for its columns, except for their prior sizes. Of two
-    # levels with as many sizes, such as offsets or links, neither is simpler: preferring offsets
-    # would leave links with errors as small out of the covariance.
-    best, *others = fits
-    held_out_mm = {name: _rms(fit.left_out, fit.has_rotation).mm for name, fit in fits.items()}
-    nominal_mm = held_out_mm[best]
-    for name in others:
-        more_sizes = len(fits[name].errors) > len(fits[best].errors)
-        margin = SIGNIFICANT if more_sizes else 0.0
-        if held_out_mm[name] < nominal_mm and fits[name].gain - fits[best].gain > margin:
-            best = name
-    return best
-
-
-def _level(name: str, fit: LevelFit) -> ArmLevel:
-    """Writes a fit as figures."""
-    inside, left_out = (_rms(array, fit.has_rotation) for array in (fit.inside, fit.left_out))
-    return ArmLevel(
-        level=name,
-        unknowns=fit.size,
-        rms_mm=inside.mm,
-        rms_deg=inside.deg,
-        held_out_mm=left_out.mm,
-        held_out_deg=left_out.deg,
-        likelihood_ratio=fit.gain,
+    nominal: LevelFit,
+    offsets: FloatArray,
+) -> LevelFit:
+    """A fit beside the nominal arm, with the gain of the shifted zero; offsets are its least."""
+    values = (
+        robot_levels(part, level.fit.state, starting_noise(part), from_above=True)[1]
+        for part, level in ((stated, nominal), (problem, zeroed))
     )
+    gain = 2.0 * (next(values) - next(values))
+    errors = fit.errors or {"offsets": ArmErrors(offsets, _ZERO_SIGMA_RAD, gain, of_links=True)}
+    return replace(fit, errors=errors, gain=fit.gain + gain)
 
 
 def _rms(residuals: FloatArray, turned: Mask) -> Rms:
@@ -271,7 +273,7 @@ def _rms(residuals: FloatArray, turned: Mask) -> Rms:
 
 def allows_functions(asked: str, stops: int) -> bool:
     """Whether a level allows functions of the joints, and there are enough stops for them."""
-    return asked not in ("offsets", "hand-eye") and stops >= _FEWEST_STOPS
+    return HARMONICS in ASKED.get(asked, ()) and stops >= _FEWEST_FOR_FUNCTIONS
 
 
 def check_level(asked: str) -> None:
@@ -304,10 +306,9 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
 
 
 def doubts(kinematics: SelectedArmLevel) -> Iterator[Finding]:
-    """Reports where another level explains the views far better than the requested one."""
-    chosen, name = kinematics.result.chosen, _best(kinematics.fits)
-    best = replace(kinematics.result, level=name).chosen
-    if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
+    """Reports where other errors explain the views far better than those of the requested level."""
+    chosen, best = kinematics.fit, kinematics.beyond
+    if best is not None and best.held_out_mm < chosen.held_out_mm:
         yield Finding(
             "level",
             f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
@@ -323,11 +324,6 @@ def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
-        )
-    if kinematics.diverged:
-        yield (
-            f"The arm's level {listed(kinematics.diverged)} was not compared: a fit with these "
-            "errors diverges."
         )
     result = kinematics.result
     if result.is_calibrated:
