@@ -101,8 +101,8 @@ def test_frames_that_take_up_a_calibrated_arms_zeros_are_no_doubt():
         recorded(simulate(replace(CELL, robots=(CELL.robots[0], slipped), stops=24, seed=0)))
     )
     # No stop tells the zeros of the first joint and of the last one from a base and a plate that
-    # are turned, and more stops would not: both are as uncertain as zeros of 5 mrad, 0.29 deg, whose
-    # size is estimated from four others to a third.
+    # are turned, and more stops would not: both are as uncertain as zeros of 5 mrad (0.29 deg),
+    # whose size is estimated from four others to a third.
     assert found.cell.robots["b"].arm.level == "offsets"
     assert found.edges["cell_from_base_b"].sigma_deg > 0.2
     assert found.edges["flange_b_from_target_plate_b"].sigma_deg > 0.2

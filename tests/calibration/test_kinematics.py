@@ -198,6 +198,6 @@ def test_columns_whose_squares_are_no_numbers_leave_the_arm_as_stated():
     }
     problem = arm.without_errors(known.cell_fit.inlier_problem)
     state = State(fit.state.edges, problem.start_values)
-    assert select_errors(problem, state, ROBOT, bases, 1.0, "auto").level == "geometry"
+    assert select_errors(problem, state, ROBOT, bases, 1.0, "auto", fit.noise).level == "geometry"
     bases["offsets"] = 1e200 * bases["offsets"]
-    assert select_errors(problem, state, ROBOT, bases, 1.0, "auto").level == "nominal"
+    assert select_errors(problem, state, ROBOT, bases, 1.0, "auto", fit.noise).level == "nominal"

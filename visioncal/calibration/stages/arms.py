@@ -411,7 +411,7 @@ class RobotArm:
         start: State,
         asked: str,
         views: Sequence[int],
-        noise: Noise | None = None,
+        noise: Noise,
         *,
         functions: bool = False,
     ) -> Self:
@@ -422,8 +422,9 @@ class RobotArm:
             start: Starting values.
             asked: A key of `stages.kinematics.ASKED`.
             views: (n,) view of each observation.
-            noise: Noise levels to start from; None to start from large ones.
-            functions: Whether functions of the joints are among them, where stops suffice.
+            noise: Noise levels to start from.
+            functions: Whether functions of the joints are among them, where stops suffice; where
+                none are significant, the arm stays as it is.
         """
         used = self.at(stops_of(problem, self.robot))
         q, loads = used.joints_rad, used.loads
@@ -433,7 +434,9 @@ class RobotArm:
         blocks = blocks_of(model.nominal, self.loads)
         bases = {name: self._block_jacobian(model, name) for name in blocks}
         harmonics = None
-        if functions and allows_functions(asked, len(q)):
+        if functions:
+            if not allows_functions(asked, len(q)):
+                return self
             jacobian = model.robot.harmonic_jacobian(self.joints_rad, most_orders())
             columns = self._by_stop(jacobian.reshape(len(jacobian), 6, -1))
             harmonics = columns.reshape(len(columns), 6, model.nominal.joint_count, -1, 2)
@@ -444,10 +447,12 @@ class RobotArm:
             bases,
             model.torque_nm,
             asked,
+            noise,
             harmonics,
             self.with_nominal_zero(problem),
-            noise,
         )
+        if kinematics is None:
+            return self
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         arm_views = tuple(views[index] for index in mine)
         arm = replace(self, kinematics=replace(kinematics, views=arm_views))

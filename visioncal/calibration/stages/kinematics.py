@@ -1,6 +1,7 @@
 """Selection of the arm's error model: the blocks of errors that the stops show, and their fit."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of
+from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import ArmSizes, JointFunctions, estimate_arm_sizes
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, RIGID, WEIGHT
 from visioncal.estimation.problem import Problem
@@ -71,7 +72,7 @@ class LevelFit:
 
     @classmethod
     def of(
-        cls, problem: Problem, state: State, robot: str, noise: Noise | None, sizes: ArmSizes | None
+        cls, problem: Problem, state: State, robot: str, noise: Noise, sizes: ArmSizes | None
     ) -> "LevelFit":
         """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
         errors = {} if sizes is None else sizes.errors
@@ -79,7 +80,7 @@ class LevelFit:
         problem = problem.with_effects([*problem.effects, *effects])
         values = np.append(state.values, problem.start_values[len(state.values) :])
         if sizes is not None:
-            noise = replace(noise or starting_noise(problem), robots=sizes.levels)
+            noise = replace(noise, robots=sizes.levels)
         fit = fit_problem(problem, State(state.edges, values), noise)
         rows, points = rows_of(problem, robot), problem.points
         pairs = zip(problem.observations.has_rotation, problem.observations.observed, strict=True)
@@ -190,10 +191,10 @@ def select_errors(
     bases: Mapping[str, FloatArray],
     torque_nm: float,
     asked: str,
+    noise: Noise,
     harmonics: FloatArray | None = None,
     stated: Problem | None = None,
-    noise: Noise | None = None,
-) -> SelectedArmLevel:
+) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
     Their sizes are estimated together; see `arm_sizes`. They must also predict left-out stops
@@ -206,34 +207,40 @@ def select_errors(
         bases: (s, 6, p) Jacobian of the flange pose by stop, for the errors of each block.
         torque_nm: The torque of a unit compliance [N m].
         asked: A key of `ASKED`.
+        noise: The noise's levels to start from.
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
         stated: The observations with zeros as in the model, where `problem` has a shifted zero
             corrected; None without one. Then offsets are the least level.
-        noise: The noise's levels to start from; those from above where None.
-    """
 
-    def fitted(blocks: Sequence[str]) -> LevelFit:
-        """The fit with those blocks that are likely; the nominal one where none are better."""
+    Returns:
+        The errors; with `harmonics` None where no functions of the joints are significant.
+    """
+    is_enough = len(stops_of(problem, robot)) >= FEWEST_STOPS
+
+    def likely(blocks: Sequence[str]) -> ArmSizes | None:
         own = {name: bases[name] for name in bases if name in blocks}
         waves = harmonics if HARMONICS in blocks else None
-        # Numbers may be so large that their squares are none.
-        with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                sizes = estimate_arm_sizes(
-                    problem, state, start.fit.noise, robot, own, torque_nm, waves
-                )
-                fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else start
-            except np.linalg.LinAlgError:
-                return start
-        return fit if fit.held_out_mm < start.held_out_mm else start
+        with suppress(np.linalg.LinAlgError):
+            if is_enough:
+                return estimate_arm_sizes(problem, state, noise, robot, own, torque_nm, waves)
+        return None
 
-    with one_blas_thread():
+    def fitted(sizes: ArmSizes | None) -> LevelFit:
+        """The fit with errors of some sizes; the nominal one where it is no better."""
+        with suppress(np.linalg.LinAlgError):
+            fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else start
+            return fit if fit.held_out_mm < start.held_out_mm else start
+        return start
+
+    # Numbers may be so large that their squares are none.
+    with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
+        sizes = likely(ASKED[asked])
+        if harmonics is not None and sizes is None:
+            return None
         nominal = start = LevelFit.of(problem, state, robot, noise, None)
-        fit = beyond = start
-        stops = np.unique(problem.observations.stops[rows_of(problem, robot)])
-        if len(stops) >= FEWEST_STOPS:
-            fit = fitted(ASKED[asked])
-            beyond = fit if ASKED[asked] == _ALL else fitted(_ALL)
+        fit = beyond = fitted(sizes)
+        if ASKED[asked] != _ALL:
+            beyond = fitted(likely(_ALL))
         if stated is not None:
             nominal = LevelFit.of(stated, state, robot, noise, None)
             fit, beyond = (
