@@ -49,6 +49,9 @@ def test_a_bad_result_is_used_by_force_alone(bad, command):
     assert refused.out == ""
     assert "is bad" in refused.err
     assert "--force" in refused.err
+    first, *others = Calibration.load(bad[1]).verdict.reasons
+    assert first in refused.err
+    assert not any(reason in refused.err for reason in others)
     machine = visioncal(*words, "--json") if words[0] != "export" else None
     if machine is not None:
         assert machine.status == 3

@@ -516,6 +516,7 @@ CSV_REFUSALS = [
     ("view,", "number,", "header: the column view, .*, is missing"),
     ("view,", "View,", "header: the column view, .*, is missing; View may be meant: names are"),
     (",x_m,y_m,z_m,qx,qy,qz,qw,", ",x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,w,", "in rx_deg,ry_deg,rz"),
+    ("0.6,0,0.3", "0.6,0,0,3", "line 3: it has 14 fields, .*; decimal commas may be the cause"),
     ("0.6,0,0.3,0.6,0,0,0.8", "0,6,0,0,3,0,6,0,0,0,8", "line 3: it has 17 .* decimal commas"),
     (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
     (",note", ",", "column 13 has no name"),

@@ -119,7 +119,9 @@ def check_usable(verdict: "Verdict", what: str, *, force: bool) -> tuple[str, ..
     """
     if verdict.status != "bad":
         return ()
-    words = f"The verdict of {what} is bad: {' '.join(verdict.reasons)}"
+    words = f"The verdict of {what} is bad: {' '.join(verdict.reasons[:1])}"
+    if len(verdict.reasons) > 1:
+        words += f" All {len(verdict.reasons)} reasons are in its report."
     if force:
         return (words,)
     raise VerdictError(

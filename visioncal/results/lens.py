@@ -20,15 +20,12 @@ from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
 from visioncal.vision.camera import (
     intrinsics,
     normalise,
-    project,
     project_with_jacobian,
     with_intrinsics,
 )
 
-# Grid of pixels along the image's width and height for fitting coefficients, and iterations.
-_GRID, _STEPS = (40, 32), 5
-# Smallest rms of a field that is fitted [px].
-_NOTICED_PX = 0.01
+# Numbers of pixels of a grid along the image's width and height.
+_GRID = (40, 32)
 # Share of the prior variance by which the field must be determined to count as observed.
 _SEEN = 0.5
 # Relative singular value below which a combination of coefficients is undetermined.
@@ -161,6 +158,28 @@ class CameraResult:
             return px
         return np.asarray(px - self.displacements(px, distance_m) @ self.field.coefficients)
 
+    def beyond_model_px(self) -> tuple[float, float]:
+        """Displacements by the field where it was observed, per axis: rms and largest [px].
+
+        At the views' mean distance. Matrix and coefficients cannot take over any of it: the field
+        is orthogonal to them over the image.
+        """
+        if self.field is None or not len(self.field.coefficients):
+            return 0.0, 0.0
+        px = image_grid(self.camera)
+        columns = self.displacements(px)
+        displacements = columns @ self.field.coefficients
+        before = np.sum(columns**2, axis=(1, 2))
+        after = np.sum((columns @ self.field.root) ** 2, axis=(1, 2))
+        # The share of the prior variance that the views removed.
+        weights = np.clip(1.0 - after / np.where(before > 0.0, before, np.inf), 0.0, 1.0)
+        if not weights.any():
+            return 0.0, 0.0
+        mean_squares = np.average(displacements**2, axis=0, weights=weights)
+        # Where the field is poorly determined everywhere, its best determined part counts.
+        observed = weights > min(_SEEN, 0.5 * weights.max())
+        return float(np.sqrt(mean_squares.mean())), float(np.abs(displacements[observed]).max())
+
     def rays_by_lens(
         self, px: FloatArray, rays: FloatArray, distance_m: float | None = None
     ) -> tuple[FloatArray, FloatArray]:
@@ -191,50 +210,6 @@ class CameraResult:
             field = replace(field, edge_covariance=beside @ jacobian.T)
         edges = None if edges is None else edges @ jacobian.T
         return replace(self, edge_covariance=edges, field=field)
-
-
-@dataclass(frozen=True, eq=False)
-class RefittedLens:
-    """Matrix and coefficients that approximate a lens with its field."""
-
-    camera: Camera  # The approximating intrinsics.
-    rms_px: float = 0.0  # Remaining displacement where the field was observed (rms), per axis [px].
-    most_px: float = 0.0  # Largest remaining displacement there, per axis [px].
-
-
-def fit_coefficients(lens: CameraResult) -> RefittedLens:
-    """Fits matrix and coefficients to a lens and its field, at the views' mean distance.
-
-    Only pixels where the field was observed are fitted. The camera's frame is kept, so that its
-    transform remains valid.
-    """
-    camera = lens.camera
-    if lens.field is None or not len(lens.field.coefficients):
-        return RefittedLens(camera)
-    px = image_grid(camera)
-    in_model = lens.in_model(px)
-    rays, weights = normalise(camera, in_model), _determined_share(lens, px)
-    seen = np.isfinite(rays).all(axis=1) & (weights > 0.0)
-    px, in_model, rays, weights = px[seen], in_model[seen], rays[seen], weights[seen]
-    size = len(intrinsics(camera))
-    if len(px) < size or _rms(px - in_model, weights) < _NOTICED_PX:
-        return RefittedLens(camera)
-    fitted, points = camera, np.column_stack([rays, np.ones(len(rays))])
-    roots, free = np.sqrt(weights)[:, None], np.arange(_fitted_count(camera))
-    for _ in range(_STEPS):
-        projected = project_with_jacobian(fitted, points)
-        columns = (roots[:, :, None] * projected.jacobian_intrinsics[:, :, free]).reshape(
-            -1, len(free)
-        )
-        scale = np.linalg.norm(columns, axis=0)
-        residuals = (roots * (px - projected.px)).ravel()
-        step = np.linalg.lstsq(columns / scale, residuals, rcond=_DETERMINED)[0] / scale
-        fitted = with_intrinsics(fitted, intrinsics(fitted) + np.pad(step, (0, size - len(step))))
-    remaining = px - project(fitted, points)
-    # Where the field is poorly determined everywhere, its best determined part counts.
-    observed = weights > min(_SEEN, 0.5 * weights.max())
-    most_px = float(np.abs(remaining[observed]).max())
-    return RefittedLens(fitted, _rms(remaining, weights), most_px)
 
 
 def image_grid(camera: Camera, share: float = 1.0) -> FloatArray:
@@ -302,27 +277,6 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
         return SensorTilt(rad, 0.0)
     along = tilt @ fitted[:2] / rad
     return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)))
-
-
-def _fitted_count(camera: Camera) -> int:
-    """Number of fitted intrinsics: without trailing zero coefficients, unless all are zero."""
-    used = np.flatnonzero(camera.distortion)
-    return len(intrinsics(camera)) if not len(used) else 4 + int(used[-1]) + 1
-
-
-def _determined_share(lens: CameraResult, px: FloatArray) -> FloatArray:
-    """(n,) share of the field's prior variance that the views removed at (n, 2) pixels."""
-    if lens.field is None:
-        return np.zeros(len(px))
-    columns = lens.displacements(px)
-    before = np.sum(columns**2, axis=(1, 2))
-    after = np.sum((columns @ lens.field.root) ** 2, axis=(1, 2))
-    return np.asarray(np.clip(1.0 - after / np.where(before > 0.0, before, np.inf), 0.0, 1.0))
-
-
-def _rms(px: FloatArray, weights: FloatArray) -> float:
-    """Weighted rms of (n, 2) displacements, per axis [px]."""
-    return float(np.sqrt(np.sum(weights * np.mean(px**2, axis=1)) / np.sum(weights)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -5,6 +5,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -22,7 +23,6 @@ _FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
 _SHOWN_PROBLEMS = 10
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
-_DECIMAL = re.compile(r"[+-]?[0-9]*\.[0-9]+([eE][+-]?[0-9]+)?")
 # Quoted values and numbers, which differ between problems of one kind.
 _VALUES = re.compile(r"'[^']*'|[0-9.]+")
 _LINE = re.compile(r", line ([0-9]+)")
@@ -155,7 +155,9 @@ class TableReader(NumberChecks):
             if len(row) != width:
                 words = f"it has {len(row)} fields, but the header has {width} columns"
                 step = ""
-                if len(row) > width and not any(_DECIMAL.fullmatch(cell.strip()) for cell in row):
+                # A decimal comma makes two whole numbers of one, `0,3`.
+                whole = [_INTEGER.fullmatch(cell.strip()) is not None for cell in row]
+                if len(row) > width and any(map(all, pairwise(whole))):
                     words += "; decimal commas may be the cause"
                     step = (
                         "Write decimal points; or separate the cells of all lines by semicolons, "

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -20,7 +19,7 @@ from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
-from visioncal.results.lens import RefittedLens, fit_coefficients, image_grid, to_ray
+from visioncal.results.lens import image_grid, to_ray
 from visioncal.vision.camera import normalise
 
 # Coefficients of OpenCV's largest model, whose last two tilt the sensor.
@@ -28,6 +27,8 @@ _MOST_COEFFICIENTS = 14
 # Share of the image about its centre in which both lenses are compared: at the rim neither is known
 # well where no view looked.
 _INNER = 0.5
+# Smallest rms of a lens's field that is told [px].
+_NOTICED_PX = 0.01
 # Largest error of an inverted distortion [px]: far less than any lens is known to.
 _SAME_PX = 1e-3
 # Iterations of OpenCV's fixed point, and where it ends [plane at unit depth].
@@ -385,21 +386,16 @@ class Content:
         """(4, 4) `parent_from_child` [m]."""
         return self.edge.matrix
 
-    @cached_property
-    def refitted_lens(self) -> RefittedLens | None:
-        """The lens refitted without its field; None where there is no camera."""
-        return None if self.lens is None else fit_coefficients(self.lens)
-
     @property
     def field_error_words(self) -> str:
-        """Remaining error of the refitted lens, in words; empty where the lens has no field."""
-        lens = self.refitted_lens
-        if lens is None or lens.rms_px == 0.0:
+        """What matrix and coefficients leave of a lens's field, in words; empty without one."""
+        rms_px, most_px = (0.0, 0.0) if self.lens is None else self.lens.beyond_model_px()
+        if rms_px < _NOTICED_PX:
             return ""
         return (
             "the lens departs from its model, and matrix and coefficients are those that come "
-            f"nearest to it: they leave {figure(lens.rms_px)} px rms where it was seen, "
-            f"{figure(lens.most_px)} px at the most (visioncal locate corrects that)"
+            f"nearest to it: they leave {figure(rms_px)} px rms where it was seen, "
+            f"{figure(most_px)} px at the most (visioncal locate corrects that)"
         )
 
     @property

@@ -34,14 +34,14 @@ _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
 
 def _camera_of(content: Content) -> Camera:
-    """The camera with its field refitted into its coefficients, by one of `_ROS_MODELS`."""
-    if content.refitted_lens is None:
+    """The camera, by one of `_ROS_MODELS`."""
+    if content.lens is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
             "and no images.",
             next_step="Export its transform, as with --to ros.",
         )
-    camera = content.refitted_lens.camera
+    camera = content.lens.camera
     if len(camera.distortion) not in _ROS_MODELS:
         raise DataError(
             f"The lens has {len(camera.distortion)} coefficients; 4 (fisheye), 5 or 8 (brown) are "
@@ -134,8 +134,8 @@ def _write_opencv(content: Content) -> str:
     storage.write("transform", content.matrix)
     storage.write("R", content.matrix[:3, :3].copy())
     storage.write("t", content.matrix[:3, 3:].copy())
-    if content.refitted_lens is not None:
-        camera = content.refitted_lens.camera
+    if content.lens is not None:
+        camera = content.lens.camera
         storage.write("image_width", camera.resolution[0])
         storage.write("image_height", camera.resolution[1])
         storage.write("distortion_model", camera.model)
