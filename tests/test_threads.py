@@ -12,7 +12,7 @@ from support.kept import assert_same_evidence
 from support.marks import slow
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from visioncal.calibration.pipeline import calibrate, run
+from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages import detect
 from visioncal.core.errors import DataError
 from visioncal.core.threads import SharedSetting

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from visioncal.core.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.calibration.pipeline import calibrate
     from visioncal.calibration.pipeline.checkup import Checkup, doctor
+    from visioncal.calibration.run import calibrate
     from visioncal.calibration.verification import verify
     from visioncal.core.errors import (
         ConvergenceError,
@@ -71,7 +71,7 @@ _HOMES = {
     "Verdict": "visioncal.results",
     "VisioncalError": "visioncal.core.errors",
     "batch": "visioncal.interchange.batch",
-    "calibrate": "visioncal.calibration.pipeline",
+    "calibrate": "visioncal.calibration.run",
     "compare": "visioncal.results.compare",
     "convert": "visioncal.interchange.formats",
     "correct": "visioncal.results.compensation",

@@ -25,9 +25,9 @@ from results import few, first, wished, write_section
 from support.cells import calibrated
 
 import visioncal
-from visioncal.calibration.pipeline import Run
+from visioncal.calibration.pipeline.evidence import view_evidence
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.running import view_evidence
+from visioncal.calibration.run import Run
 from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.vision.targets import charuco_board

@@ -7,7 +7,7 @@ import pytest
 from support.marks import slow
 from support.whole_cells import OPTIONS
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target

@@ -11,7 +11,7 @@ from support.edges import solved
 from support.wrong_arms import WRONG_LINKS
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arm_identifiability import identify_arm
 from visioncal.core.choices import CONVENTIONS
 from visioncal.core.transforms import exp, invert, log

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, showing
 from support.marks import slow
 
-from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.run import run
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError

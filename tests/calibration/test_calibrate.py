@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import exact
 
 import visioncal
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.results import Calibration, to_document

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.swept_cells import AHEAD_S, cell_of, swept_session
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.simulation.layout import NetworkOptions

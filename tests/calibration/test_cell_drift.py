@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration

@@ -7,8 +7,8 @@ import pytest
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.checkup import doctor
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.rereading import exchange_views
 from visioncal.session import MemoryImages, Session

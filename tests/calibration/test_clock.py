@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from support.cells import calibrated_sweep
 from support.marks import slow
 
-from visioncal.calibration.pipeline import STAGES, calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES, calibrate
 from visioncal.calibration.stages.clock_offset import LARGEST_SIGMA_S, ClockOffset
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed

@@ -7,7 +7,7 @@ import pytest
 from support.smeared import smeared
 
 import visioncal as package
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.transforms import invert, log
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.running import initial_state
+from visioncal.calibration.pipeline.run_state import initial_state
 from visioncal.calibration.pipeline.solving import initial_inliers
 from visioncal.calibration.pipeline.starting import find_start
-from visioncal.calibration.pipeline.steps import STAGES, read_cell
+from visioncal.calibration.run import STAGES, read_cell
 from visioncal.simulation import (
     BOARDS,
     BoardAt,

@@ -12,7 +12,7 @@ from support.marks import slow
 from support.tracked import errors_of, information, known_of, mounting_bound, reads, solved_of
 
 import visioncal
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.positions import Mounting, PositionReadings, fit_mounting

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.marks import slow
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 from support.cells import calibrated, error_of, known_of
 from support.marks import slow
 
-from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES, calibrate
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log

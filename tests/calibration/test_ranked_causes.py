@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from support.cells import calibrated, showing
 from support.sound_findings import SOUND, changed, directions, left_out
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.cause_ranking import (
     MEASURE_BOARD,
     NO_JOINTS,

@@ -8,8 +8,8 @@ from support.cells import calibrated_sweep
 from support.marks import slow
 from support.swept_cells import HOW, cell_of, swept_session
 
-from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.corners import CornerStack

@@ -8,7 +8,7 @@ import pytest
 from support.boards import any_page, printed
 from support.marks import slow
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log

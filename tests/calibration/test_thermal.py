@@ -13,7 +13,7 @@ from support.pages import Page
 from support.warmed import CELL, drift_of, warmed
 
 from visioncal import Session
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.verification import verify
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError

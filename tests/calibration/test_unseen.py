@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.cells import known_of
 
+from visioncal.calibration.pipeline.evidence import view_evidence
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import view_evidence
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate
 
 HELD = (3, 8, 21, 30)

@@ -16,7 +16,7 @@ from support.commands import every_command, started, visioncal
 from typer.main import get_command
 
 import visioncal as visioncal_package
-from visioncal.calibration.pipeline import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import progress
 from visioncal.cli.app import app

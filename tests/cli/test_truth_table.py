@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.cli.summary import truth_table
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.records import cell_session

@@ -13,7 +13,7 @@ from support.commands import visioncal
 from support.killed_calls import ALL, LESS, NAMES, expect_no_leftovers, visible, written
 from support.samples import made_up, with_frames
 
-from visioncal.calibration.pipeline import Run
+from visioncal.calibration.run import Run
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation

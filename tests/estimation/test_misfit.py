@@ -8,8 +8,8 @@ from support.cells import calibrated, error_of, reporting, showing
 from support.marks import slow
 from support.problems import observed, world
 
-from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages import refine
 from visioncal.calibration.stages.turned_images import find_image_turn
 from visioncal.core.transforms import exp, invert, log

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.commands import visioncal, write_poses, write_table
 from support.touched import TIP, Job, error_of, relabelled, slipped, touched
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.transforms import invert
 from visioncal.estimation.readings import readings_that_close
 from visioncal.interchange.outputs import write_outputs

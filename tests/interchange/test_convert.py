@@ -9,7 +9,7 @@ from support.commands import visioncal
 from support.samples import made_up
 from typer.testing import CliRunner
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.cli.app import app
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import convert

@@ -9,7 +9,7 @@ import pytest
 from support.kept import assert_same, assert_same_evidence
 from support.samples import Sample, made_up, tool_frame, with_frames
 
-from visioncal.calibration.pipeline import Run, run
+from visioncal.calibration.run import Run, run
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.options import NeedOptions, WorkOptions
 from visioncal.cli.result_options import CalibrateOptions

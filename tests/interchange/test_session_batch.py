@@ -13,7 +13,7 @@ import pytest
 from pyarrow import parquet
 from support.commands import visioncal
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.interchange.batch import Options, batch, jobs_of
 from visioncal.interchange.batch import run as batch_run

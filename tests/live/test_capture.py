@@ -11,7 +11,7 @@ from support.killed import kill_and_resume
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of, recorded
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose

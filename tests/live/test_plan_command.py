@@ -13,7 +13,7 @@ from support.commands import Done, visioncal
 from support.drawn import column
 from support.marks import slow
 
-from visioncal.calibration.pipeline.running import with_proposal
+from visioncal.calibration.pipeline.explaining import with_proposal
 from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths

@@ -7,7 +7,7 @@ import pytest
 from rerun.chunk import RrdReader
 from support.aligned_cells import cell_result
 
-from visioncal.calibration.pipeline import Run
+from visioncal.calibration.run import Run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.interchange.exports import Selection, export

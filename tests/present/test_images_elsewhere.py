@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.interchange.outputs import RECORDING, write_outputs
 from visioncal.interchange.result_files import rewrite_result

@@ -14,7 +14,7 @@ from support.findings import CONTRADICTS, sick, with_contradiction, with_finding
 from support.pages import Page, section
 from support.samples import REJECTED, Sample, made_up
 
-from visioncal.calibration.pipeline import Run, run
+from visioncal.calibration.run import Run, run
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.core.types import Target

@@ -7,7 +7,7 @@ import pytest
 from support.commands import visioncal
 from support.wrong_arms import target_in_camera
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.estimation.workspace import postures

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arms import IdentifiedArm
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import MatchedJoints

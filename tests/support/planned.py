@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from support.cells import known_of
 
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.session import Session

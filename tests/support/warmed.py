@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline import calibrate
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.thermal import inputs_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures

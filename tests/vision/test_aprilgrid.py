@@ -9,7 +9,7 @@ from support.boards import any_page, aprilgrid, printed
 from support.marks import slow
 from support.rendered import Shot, photograph
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.intrinsics import read_target_description

@@ -8,7 +8,7 @@ from support.boards import circles
 from support.marks import slow
 from support.rendered import Shot, photograph
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.session import Session

@@ -2,8 +2,8 @@
 
 import typer
 
-from visioncal.calibration.pipeline import run
-from visioncal.calibration.pipeline.running import CalibrationOptions
+from visioncal.calibration.pipeline.run_state import CalibrationOptions
+from visioncal.calibration.run import run
 from visioncal.cli.console import exit_status, report_written, say, with_run_paths
 from visioncal.cli.parsing import views_in
 from visioncal.cli.progress import shown_progress

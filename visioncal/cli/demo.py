@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from visioncal.calibration.pipeline import run
+from visioncal.calibration.run import run
 from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_error, report_written, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import (

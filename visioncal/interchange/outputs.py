@@ -14,7 +14,7 @@ from visioncal.core.output_generations import write_generation
 
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
-    from visioncal.calibration.pipeline import Run as Calibrated
+    from visioncal.calibration.run import Run as Calibrated
     from visioncal.calibration.verification import Check, Outcome
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict

@@ -215,7 +215,7 @@ def rewrite_result(folder: Path, calibration: Calibration) -> Written:
             next_step="Name the output folder that the result was loaded from.",
         )
     # Imports the whole calibration, which loading a result need not wait for.
-    from visioncal.calibration.pipeline import Run
+    from visioncal.calibration.run import Run
 
     return write_outputs(folder, stored.session, Run(calibration, stored.evidence), stored.note)
 

@@ -8,7 +8,7 @@ from support.cells import known_of
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount

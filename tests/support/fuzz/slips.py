@@ -10,7 +10,7 @@ from support.cells import session_of
 
 from visioncal.calibration.pipeline.misread_poses import misread_pose_finding
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import compose

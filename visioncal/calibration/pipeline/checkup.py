@@ -12,10 +12,9 @@ from visioncal.calibration.pipeline.misread_poses import (
     misreadings,
     turned_boards,
 )
-from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import initial_state
+from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
-from visioncal.calibration.pipeline.steps import stages_before
+from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cause_ranking import LEAST_RUN
 from visioncal.calibration.stages.cell import Cell, read_cell
 from visioncal.calibration.stages.image_checks import unnamed_images, unseen_cause

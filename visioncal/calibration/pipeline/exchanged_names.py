@@ -5,7 +5,7 @@ from itertools import combinations
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.starting import agreeing_views
-from visioncal.calibration.pipeline.steps import stages_before
+from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.core.errors import VisioncalError

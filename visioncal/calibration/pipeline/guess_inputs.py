@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.init_frames import init_frames

@@ -19,7 +19,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
     robot_numbers,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import stages_before
+from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
 from visioncal.calibration.stages.corner_numbers import (
     MOST_FROM_BEHIND,

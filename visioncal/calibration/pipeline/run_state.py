@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from pathlib import Path
+from typing import TypedDict, TypeVar, Unpack
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import WorkAccuracy, work_accuracy
@@ -11,16 +12,34 @@ from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.findings import Findings
+from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.readings import Readings
 from visioncal.core.choices import Convention, SolverName
-from visioncal.core.types import Corners, Mount
+from visioncal.core.errors import DataError
+from visioncal.core.types import Corners, Mount, Progress
 from visioncal.results import Verdict
 from visioncal.robot import Loads
+from visioncal.session import Session
 from visioncal.session.selecting import is_whole_cell
 from visioncal.session.table import loads_of
 
 _T = TypeVar("_T")
+
+
+class CalibrationOptions(TypedDict, total=False):
+    """Options of `calibrate`, by name; the defaults are its own.
+
+    With `pictures`, faint copies of the images are kept in `Run.searches`.
+    """
+
+    solver: SolverName
+    level: str
+    convention: Convention | None
+    progress: Progress | None
+    threads: int | None
+    dense: bool
+    pictures: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +124,30 @@ def _there(value: _T | None, name: str) -> _T:
     if value is None:
         raise RuntimeError(f"a stage that needs {name} comes before it")
     return value
+
+
+def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
+    """Loads the session and checks the options: the state before the first stage."""
+    threads, solver = asked.get("threads"), asked.get("solver", "joint")
+    level, convention = asked.get("level", "auto"), asked.get("convention")
+    if threads is not None and threads < 1:
+        raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
+    check_level(level)
+    loaded = session if isinstance(session, Session) else Session.load(session)
+    state = RunState(
+        loaded,
+        asked.get("progress"),
+        threads or 0,
+        dense={} if asked.get("dense") else None,
+        pictures=asked.get("pictures", False),
+        solver=solver,
+        level=level,
+        convention=convention,
+    )
+    if state.mount is None and solver != "joint":
+        raise DataError(
+            f"solver {solver} cannot be asked of a whole cell: it has the joint solver.",
+            culprits=["--solver"],
+            next_step="Leave it out, or calibrate one camera and robot of it (Session.of).",
+        )
+    return state

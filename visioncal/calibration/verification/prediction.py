@@ -6,9 +6,9 @@ from reprlib import repr as shorten
 
 import numpy as np
 
-from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior

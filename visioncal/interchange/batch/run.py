@@ -193,7 +193,7 @@ def _made_by(job: Job, session: Session) -> dict[str, object]:
 def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     """Calibrates on one thread, and writes the outputs of `visioncal calibrate`."""
     # Imported late, since a finished batch needs none of it.
-    from visioncal.calibration.pipeline import run
+    from visioncal.calibration.run import run
     from visioncal.calibration.stages.detect import ONE_OPENCV_THREAD
 
     with ONE_OPENCV_THREAD.held():
@@ -443,7 +443,7 @@ def _pool(count: int) -> Iterator[Executor]:
         # inherits the caller's threads and locks.
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(
-            [work.__module__, "visioncal.calibration.pipeline", "visioncal.present.report.page"]
+            [work.__module__, "visioncal.calibration.run", "visioncal.present.report.page"]
         )
     else:
         context = multiprocessing.get_context("spawn")

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pose_ambiguity import choose_nearest

@@ -1,20 +1,12 @@
-"""The stages of a calibration in order, for one camera and one robot or a whole cell.
+"""Reads what a session has of robots, instruments and clocks: the stages before the fit."""
 
-A stage is one file in `calibration.stages`, or a few lines here that pass it its input.
-"""
+from collections.abc import Iterator
+from dataclasses import replace
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-
-from visioncal.calibration.pipeline.assessment import assess_fit
-from visioncal.calibration.pipeline.judging import check_answer, findings_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.solving import solve
-from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
-from visioncal.calibration.stages.cell import pair_edges, read_cell
+from visioncal.calibration.stages.cell import pair_edges
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
 from visioncal.calibration.stages.image_checks import pairing, searched_images
-from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.motion import stream_of
@@ -28,25 +20,20 @@ from visioncal.calibration.stages.readings import (
 from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import STREAMS, Session
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage, by the name that progress shows."""
-
-    name: str
-    run: Callable[[RunState], RunState]
-
 
 # Beginning of warnings about the robot's model; phrases in warnings about unknown names.
 _OF_MODEL, _UNKNOWN_NAMES = "session.toml: robot.model:", ("is ignored", "was not read")
 _MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
-def _read_robot(run: RunState) -> RunState:
+def read_cell_inputs(run: RunState) -> RunState:
+    """Reads the robots' reported poses, and notes what of the session is not used.
+
+    Raises:
+        DataError: The session has no views, none that the fit may use, or no pose of the robot.
+    """
     session = run.session
     if not session.views:
         what = "streams and no views" if session.streams else "no views"
@@ -139,7 +126,7 @@ def _reported(run: RunState) -> RunState:
     return run
 
 
-def _readings(run: RunState) -> RunState:
+def read_readings(run: RunState) -> RunState:
     """Reads the instruments' readings."""
     if run.mount == "instrument":
         readings = read_instrument(run.session).without(run.repeats)
@@ -158,50 +145,12 @@ def _readings(run: RunState) -> RunState:
     return replace(run, poses={**run.poses, **poses})
 
 
-def _clock(run: RunState) -> RunState:
+def put_on_one_clock(run: RunState) -> RunState:
     """Interpolates the robot's poses in its stream for views with only a time."""
     return _reported(set_clocks(run)) if waits_for_clock(run.session) else run
 
 
-def _joints(run: RunState) -> RunState:
+def check_joint_angles(run: RunState) -> RunState:
     """Refuses joint angles that fit the camera's poses only if they are read differently."""
     drops = run.level != "hand-eye"
     return check_joints(run, drops=drops, takes=drops and run.solver == "joint")
-
-
-def _solve(run: RunState) -> RunState:
-    cell = read_cell(run)
-    return replace(run, cell_or_none=cell, cell_fit_or_none=solve(cell, run, run.level, run.solver))
-
-
-def _examine(run: RunState) -> RunState:
-    check_answer(run)
-    answer = assess_fit(run.cell, run, run.cell_fit, run.convention)
-    rejected = (view for view in answer.views if not view.used and view.view not in run.held_back)
-    run = replace(run, cell_fit_or_none=answer.cell_fit, assessment_or_none=answer)
-    return run.noting(Rejection(view.view, view.reason) for view in rejected)
-
-
-def _judge(run: RunState) -> RunState:
-    findings = findings_of(run)
-    run = replace(run, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
-    return replace(run, findings=findings, verdict=judge(findings))
-
-
-STAGES: tuple[Stage, ...] = (
-    Stage("robot", _read_robot),
-    Stage("detect", lambda run: detect_targets(run, run.given_corners)),
-    Stage("readings", _readings),
-    Stage("intrinsics", estimate_lenses),
-    Stage("pnp", locate_targets),
-    Stage("clock", _clock),
-    Stage("joints", _joints),
-    Stage("solve", _solve),
-    Stage("examine", _examine),
-    Stage("judge", _judge),
-)
-
-
-def stages_before(name: str) -> tuple[Stage, ...]:
-    """The stages before the named one."""
-    return STAGES[: [stage.name for stage in STAGES].index(name)]

@@ -1,0 +1,199 @@
+"""Calibrates a session, of one camera and robot or of a whole cell: the whole path, as a page."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Unpack
+
+from visioncal.calibration.pipeline.assessment import assess_fit
+from visioncal.calibration.pipeline.evidence import view_evidence
+from visioncal.calibration.pipeline.judging import check_answer, findings_of
+from visioncal.calibration.pipeline.reading import (
+    check_joint_angles,
+    put_on_one_clock,
+    read_cell_inputs,
+    read_readings,
+)
+from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.run_state import (
+    CalibrationOptions,
+    RunState,
+    initial_state,
+)
+from visioncal.calibration.pipeline.solving import solve
+from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
+from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.judge import judge
+from visioncal.core.arguments import typed
+from visioncal.core.choices import Convention, SolverName
+from visioncal.core.errors import VisioncalError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Corners, Progress, Rejection, Searched
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A calibration with its evidence."""
+
+    calibration: Calibration  # The result.
+    evidence: tuple[ViewEvidence, ...]  # One entry for each view of the session.
+    # Residual of each view, by a fit without its stop [m], [px].
+    left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    # What was found in each image, by view, from which alone the run can be repeated; empty where
+    # more of the images was used.
+    searches: Mapping[int, Searched] = field(default_factory=dict)
+
+    def with_paths(self, session: Path | str, out: Path | str) -> "Run":
+        """Fills the paths of session and output into the verdict's commands."""
+        verdict = self.calibration.verdict.with_paths(session, out)
+        return replace(self, calibration=replace(self.calibration, verdict=verdict))
+
+
+@typed
+def calibrate(
+    session: Session | Path | str,
+    *,
+    solver: SolverName = "joint",
+    level: str = "auto",
+    convention: Convention | None = None,
+    need_mm: float | None = None,
+    need_deg: float | None = None,
+    corrected: bool = False,
+    progress: Progress | None = None,
+    dense: bool = False,
+    threads: int | None = None,
+    corners: Mapping[int, Corners] | None = None,
+) -> Calibration:
+    """Calibrates a session.
+
+    Several threads may calibrate at once. Meanwhile BLAS is limited to one thread per caller, and
+    OpenCV, too, while targets are detected; afterwards both limits are restored.
+
+    Args:
+        session: A session, or the path of its folder or recording. Several cameras or robots are
+            calibrated as a whole cell; `Calibration.of` selects one camera, robot and target.
+        solver: `joint` for the fit of both edges, or the name of a closed form.
+        level: How far to go: `auto` for all that the data allows, `hand-eye` without a calibrated
+            arm, `offsets` of its joints, its `kinematics`, `elastic` with joint compliance, or
+            `thermal` with drift over temperature.
+        convention: Joint table convention of a calibrated arm's parameters: `standard`,
+            `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
+        need_mm: Required accuracy of picks [mm]; replaces that of `[need]`.
+        need_deg: The same in rotation [deg].
+        corrected: Whether targets are corrected for a calibrated arm before they are sent; else the
+            verdict is about picks by the controller's own poses.
+        progress: Called with the progress of long work.
+        dense: Whether to fit a board to all pixels of images that the template refuses.
+        threads: How many images are searched in parallel; one a core where None. The result is the
+            same to the bit.
+        corners: Corners detected before, by view; None to detect them.
+
+    Returns:
+        The result with its verdict.
+
+    Raises:
+        DataError: The input is wrong or shows no target.
+        DegenerateError: The motion leaves a direction of the result undetermined.
+        ConvergenceError: The intrinsics do not converge.
+    """
+    asked = CalibrationOptions(
+        solver=solver,
+        level=level,
+        convention=convention,
+        progress=progress,
+        threads=threads,
+        dense=dense,
+    )
+    state = initial_state(session, **asked)
+    with_need = state.session.needing(need_mm, need_deg, corrected=corrected)
+    state = replace(state, session=with_need, given_corners=corners)
+    return result_of(run_stages(state))
+
+
+def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
+    """Calibrates a session and keeps the evidence; see `calibrate`."""
+    state = run_stages(initial_state(session, **asked))
+    held_out = state.assessment.held_out
+    residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
+    left_out = dict(zip(state.used, residuals, strict=True))
+    searches = state.searches if state.dense is None else {}
+    return Run(result_of(state), view_evidence(state), left_out, searches)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage, by the name that progress shows."""
+
+    name: str
+    run: Callable[[RunState], RunState]
+
+
+def _fit(state: RunState) -> RunState:
+    """Starts by closed forms, rejects outliers, and fits frames, lenses, boards, arms and sizes."""
+    cell = read_cell(state)
+    fit = solve(cell, state, state.level, state.solver)
+    return replace(state, cell_or_none=cell, cell_fit_or_none=fit)
+
+
+def _examine(state: RunState) -> RunState:
+    """Refuses what is undetermined; covariance, left-out stops, tests of the residuals, picks."""
+    check_answer(state)
+    answer = assess_fit(state.cell, state, state.cell_fit, state.convention)
+    rejected = (view for view in answer.views if not view.used and view.view not in state.held_back)
+    state = replace(state, cell_fit_or_none=answer.cell_fit, assessment_or_none=answer)
+    return state.noting(Rejection(view.view, view.reason) for view in rejected)
+
+
+def _judge(state: RunState) -> RunState:
+    """Ranks the causes of what is unexplained, and compares picks with the need."""
+    findings = findings_of(state)
+    state = replace(state, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
+    return replace(state, findings=findings, verdict=judge(findings))
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage("robot", read_cell_inputs),
+    Stage("detect", lambda state: detect_targets(state, state.given_corners)),
+    Stage("readings", read_readings),
+    Stage("intrinsics", estimate_lenses),
+    Stage("pnp", locate_targets),
+    Stage("clock", put_on_one_clock),
+    Stage("joints", check_joint_angles),
+    Stage("solve", _fit),
+    Stage("examine", _examine),
+    Stage("judge", _judge),
+)
+
+
+def stages_before(name: str) -> tuple[Stage, ...]:
+    """The stages before the named one."""
+    return STAGES[: [stage.name for stage in STAGES].index(name)]
+
+
+def run_stages(state: RunState) -> RunState:
+    """Runs all stages; an error is raised with its likeliest cause where that is known."""
+    # Why a run fails is sought with the stages of other runs.
+    from visioncal.calibration.pipeline.explaining import (
+        explained,
+        sought_misreading,
+        with_likely_causes,
+    )
+
+    sought = None
+    with one_blas_thread():
+        for index, stage in enumerate(STAGES):
+            if state.progress is not None:
+                state.progress(stage.name, index, len(STAGES))
+            try:
+                state = stage.run(state)
+            except VisioncalError as error:
+                likely = explained(error, state, stage.name, sought)
+                if likely is error:
+                    raise
+                raise likely from error
+            if stage.name == "joints":
+                state, sought = sought_misreading(state)
+        return with_likely_causes(state, sought)
