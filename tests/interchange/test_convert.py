@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from support.commands import visioncal
+from support.foreign_samples import streams
 from support.samples import made_up
 from typer.testing import CliRunner
 
@@ -46,6 +47,16 @@ def test_a_recording_without_a_whole_view_leaves_no_folder(folder: Path, tmp_pat
     with pytest.raises(DataError, match="no view and no stream"):
         convert(cut, again)
     assert not again.exists()
+
+
+def test_what_a_session_cannot_hold_leaves_no_folder(tmp_path: Path) -> None:
+    recording = streams(tmp_path / "in")
+    rows = recording.source.read_text().splitlines()
+    rows[35] = ",".join([*rows[35].split(",")[:2], "-4.4e10", *rows[35].split(",")[3:]])
+    recording.source.write_text("\n".join(rows))
+    with pytest.raises(DataError, match="is no place in a robot cell"):
+        convert(recording.source, tmp_path / "out", requested=recording.requested)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder: Path, tmp_path: Path) -> None:

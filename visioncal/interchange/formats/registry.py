@@ -1,5 +1,6 @@
 """All foreign formats, and the conversion of sessions and foreign recordings."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
@@ -153,7 +154,13 @@ def write_session(session: Session, dest: Path) -> None:
         write_recording(dest, session, None, (), blueprint(session))
     else:
         session.save(dest)
-    if Session.load(dest).digest() != session.digest():
+    try:
+        read = Session.load(dest)
+    except DataError:
+        # What a session cannot hold, such as a place outside any cell, is refused, and not left.
+        shutil.rmtree(dest) if dest.is_dir() else dest.unlink()
+        raise
+    if read.digest() != session.digest():
         raise DataError(
             f"{dest} does not hold the session {session.name}: their digests differ.",
             culprits=[str(dest)],

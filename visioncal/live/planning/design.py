@@ -104,17 +104,12 @@ class _Selection:
     """Chosen candidates, and their information in each world."""
 
     problem: tuple[_Reduced, ...]
-    rows: tuple[int, ...]  # The chosen candidates.
-    information: tuple[FloatArray, ...]  # (p, p) by world.
-    # (p, a) by world, the gradient's Jacobian in parameters that a fit does not estimate.
-    gradients: tuple[FloatArray, ...]
+    rows: tuple[int, ...] = ()  # The chosen candidates, beside the recorded stops.
 
     @classmethod
     def of(cls, worlds: Sequence[World]) -> "_Selection":
         """Starts with no candidate, only the recorded stops."""
-        problem = tuple(map(_Reduced, worlds))
-        starts, gradients = ((item.start for item in problem), (item.gradient for item in problem))
-        return cls(problem, (), tuple(starts), tuple(gradients))
+        return cls(tuple(map(_Reduced, worlds)))
 
     @property
     def left(self) -> list[int]:
@@ -124,7 +119,7 @@ class _Selection:
 
     def with_rows(self, added: list[int]) -> "_Selection":
         """Adds candidates."""
-        return self._changed((*self.rows, *added), added, 1.0)
+        return _Selection(self.problem, (*self.rows, *added))
 
     def with_best(self) -> "_Selection":
         """Adds the candidate that reduces the value most."""
@@ -133,28 +128,24 @@ class _Selection:
     def without_least(self) -> "_Selection":
         """Removes the chosen candidate without which the value rises least."""
         row = self._best(list(self.rows), -1.0)
-        return self._changed(tuple(other for other in self.rows if other != row), [row], -1.0)
-
-    def _changed(self, rows: tuple[int, ...], by: list[int], sign: float) -> "_Selection":
-        information, gradients = [], []
-        for world, *before in zip(self.problem, self.information, self.gradients, strict=True):
-            factors = world.factors[by]
-            information.append(before[0] + sign * gram(factors, factors))
-            gradients.append(before[1] + sign * gram(factors, world.unestimated[by]))
-        return _Selection(self.problem, rows, tuple(information), tuple(gradients))
+        return _Selection(self.problem, tuple(other for other in self.rows if other != row))
 
     @cached_property
     def covariances(self) -> tuple[FloatArray, ...]:
         """Covariance (p, p) of noise alone, by world."""
-        return tuple(np.asarray(np.linalg.inv(array), dtype=float) for array in self.information)
+        # Information that is summed, never subtracted, keeps its smallest eigenvalues.
+        chosen = [world.factors[list(self.rows)] for world in self.problem]
+        pairs = zip(self.problem, chosen, strict=True)
+        roots = [covariance_root(world.start + gram(rows, rows)) for world, rows in pairs]
+        return tuple(root @ root.T for root in roots)
 
     @cached_property
     def variances(self) -> FloatArray:
         """(3,) minimised, position [m^2] and rotation [rad^2]: means over the worlds."""
         sums = np.zeros(3)
-        for world, covariance, gradient in zip(
-            self.problem, self.covariances, self.gradients, strict=True
-        ):
+        for world, covariance in zip(self.problem, self.covariances, strict=True):
+            rows = list(self.rows)
+            gradient = world.gradient + gram(world.factors[rows], world.unestimated[rows])
             bias = covariance @ gradient
             total = covariance + bias @ bias.T
             sums += [np.sum((root @ total) * root) for root in world.roots]
