@@ -14,7 +14,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.cli.app import app
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import convert
-from visioncal.present.recording import RecordingWriter
+from visioncal.present.recording import write_recording
 from visioncal.session import Session
 
 
@@ -42,8 +42,7 @@ def test_there_and_back_again(folder: Path, tmp_path: Path) -> None:
 def test_a_recording_without_a_whole_view_leaves_no_folder(folder: Path, tmp_path: Path) -> None:
     cut, again = tmp_path / "cut.rrd", tmp_path / "again"
     empty = replace(Session.load(folder), views=())
-    with RecordingWriter(cut, empty):
-        pass
+    write_recording(cut, empty, None, (), None)
     with pytest.raises(DataError, match="no view and no stream"):
         convert(cut, again)
     assert not again.exists()

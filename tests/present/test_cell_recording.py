@@ -15,7 +15,6 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_calibration, read_session
 from visioncal.present.recording.reader import chunks
-from visioncal.present.recording.rrd_messages import scan
 from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
@@ -98,7 +97,7 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
 def test_a_changed_result_is_noticed(cell, session, tmp_path):
     write_outputs(tmp_path, session, Run(true_result(cell, session), ()))
     recording = tmp_path / "recording.rrd"
-    ((frame, _, _),) = chunks(scan(recording), (paths.CALIBRATION,), [])
+    ((frame, _, _),) = chunks(recording, (paths.CALIBRATION,))
     data = bytearray(recording.read_bytes())
     for at in range(frame.offset + (frame.end - frame.offset) // 2, frame.end, 200):
         data[at] ^= 0x10

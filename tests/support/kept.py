@@ -1,4 +1,4 @@
-"""What several tests of recordings share: an exact comparison, and the facts of the kept files."""
+"""What several tests of recordings share: an exact comparison, and a session of literals."""
 
 import datetime
 import json
@@ -6,7 +6,7 @@ import json
 import numpy as np
 
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import MemoryImages, Session, Stream, View
+from visioncal.session import MemoryImages, Session, Stream
 
 
 def assert_same(one: Session, other: Session) -> None:
@@ -48,13 +48,8 @@ def assert_same_evidence(one: tuple[ViewEvidence, ...], other: tuple[ViewEvidenc
                 assert np.array_equal(mine, theirs)
 
 
-def cells(session: Session, view: View) -> list[str]:
-    """A row's texts, as `RecordingWriter.add_view` takes them."""
-    return [view.cell(column) for column in session.columns]
-
-
 def kept_session() -> Session:
-    """What the recordings in tests/data hold: facts of every kind, in literals."""
+    """A session with facts of every kind, in literals."""
     document = {
         "schema": 1,
         "name": "kept, grün",
@@ -79,6 +74,6 @@ def kept_session() -> Session:
 
 
 def kept_streams() -> dict[str, Stream]:
-    """What the newest of the kept recordings holds besides."""
+    """Its streams."""
     samples = np.array([[0.0, 0.1, 20.5], [1e-3, -0.0, np.nan], [2e-3, 1e300, -5e-324]])
     return {"robot": Stream(("stamp_s", "q1_rad", "temp1_c"), samples)}

@@ -1,21 +1,18 @@
 """Recording of a dynamic identification: the arm's motion and its torques over time."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
-from visioncal.core.files import replacing_file
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import log_arm_motion, log_frames
 from visioncal.present.recording.notes import markdown, plain, table_lines
-from visioncal.present.recording.recorder import Recorder
-from visioncal.present.recording.writer import RecordingWriter
+from visioncal.present.recording.writer import recording
 from visioncal.present.torques import base_parameter_table, torque_note, torque_table
 
 # Length of the flange's axes [m].
@@ -43,30 +40,18 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
-    session = run.session
-    with (
-        replacing_file(path) as aside,
-        RecordingWriter(
-            aside, session, announced=len(session.views), blueprint=blueprint, label=path
-        ) as writer,
-    ):
-        writer.add_session(session)
-        writer.draw(partial(_log_run, run))
-
-
-def _log_run(run: Run, recorder: Recorder) -> None:
-    recorder.stream.reset_time()
-    _log_static(recorder.stream, run.identified, run.predictions)
-    start_s = 0.0
-    for prediction in run.predictions:
-        times_s = start_s + prediction.times_s - prediction.times_s[0]
-        _log_series(recorder.stream, prediction, times_s)
-        steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
-        drawn = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
-        robot = run.identified.robot
-        log_arm_motion(recorder.stream, robot, prediction.q[drawn], times_s[drawn].tolist())
-        recorder.keep()
-        start_s = float(times_s[-1]) + _PAUSE_S
+    with recording(path, run.session, blueprint) as recorder:
+        stream, robot, start_s = recorder.stream, run.identified.robot, 0.0
+        stream.reset_time()
+        _log_static(stream, run.identified, run.predictions)
+        for prediction in run.predictions:
+            times_s = start_s + prediction.times_s - prediction.times_s[0]
+            _log_series(stream, prediction, times_s)
+            steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
+            drawn = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
+            log_arm_motion(stream, robot, prediction.q[drawn], times_s[drawn].tolist())
+            recorder.keep()
+            start_s = float(times_s[-1]) + _PAUSE_S
 
 
 def _log_static(

@@ -9,22 +9,14 @@ import rerun as rr
 TIMELINE = "view"
 APPLICATION = "visioncal"
 
-# The session's data, to be read back.
+# The session's data and its result, to be read back.
 SESSION = "/session"
-ROWS = "/session/rows"
-STREAMS = "/session/streams"
-CORNERS = "/session/corners"
-SEARCHES = "/session/searches"
-END = "/session/end"
 IMAGE = "/camera/image"
+CALIBRATION = "/results/calibration"
 
 # The frames of the cell.
 BASE_FRAME, FLANGE_FRAME, CAM_FRAME, TARGET_FRAME = "base", "flange", "cam", "target"
 IMAGE_FRAME = "image"
-
-# Exact results; the calibration's text is written last and validates the others.
-CALIBRATION = "/results/calibration"
-EVIDENCE = "/results/evidence"
 
 # The cell.
 BASE = "/base"

@@ -10,6 +10,7 @@ from typing import Self
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
+from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
 from visioncal.present.recording.rrd_messages import scan
 
@@ -48,14 +49,10 @@ class Recorder:
     def lay_out(self, blueprint: BlueprintLike | None) -> None:
         """Adds the viewer layout of the recording, if there is one.
 
-        It has a hundred kilobytes and follows the session's data, so that a cut within it loses
-        none of that. It is made active because a browser has started to draw by the time it
-        arrives.
+        It is made active because a browser has started to draw by the time it arrives.
         """
         if blueprint is not None:
             self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
-            # Flushed, so that it does not end up between later parts.
-            self.keep()
 
     def at(self, row: int) -> None:
         """Sets the row (the view's index in the session) of what is logged next.
@@ -67,7 +64,7 @@ class Recorder:
         self.stream.set_time(paths.TIMELINE, sequence=row)
 
     def keep(self) -> None:
-        """Flushes to the operating system: what was logged survives the death of the process.
+        """Flushes to the operating system.
 
         Raises:
             OSError: The data could not be written.
@@ -96,8 +93,10 @@ class Recorder:
         if kind is not None:
             return
         # Rerun does not raise when it could not write.
-        if not scan(self._path).finished:
-            raise OSError("its end is missing; the disk may be full")
+        try:
+            scan(self._path)
+        except DataError as error:
+            raise OSError("its end is missing; the disk may be full") from error
         with self._path.open("r+b") as file:
             os.fsync(file.fileno())
 

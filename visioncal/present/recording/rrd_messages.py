@@ -2,8 +2,8 @@
 
 An `.rrd` is a header of 12 bytes followed by messages: kind and length, 8 bytes each in
 little-endian order, and a payload. A finished file ends with a message of kind LAST, which tells
-rerun where its chunks are, and 32 bytes that give the position of that message. A writer that was
-killed leaves none of these; a truncated file ends within a message.
+rerun where its chunks are, and 32 bytes that give the position of that message. A truncated file
+has none of these.
 
 Chunks are not read with rerun's reader, which takes whole files and ends the process on some
 damaged ones. The payload of a chunk is the message `ArrowMsg` of rerun's Protocol Buffers.
@@ -45,24 +45,11 @@ class MessageFrame:
         return self.offset + self.size
 
 
-@dataclass(frozen=True)
-class Scan:
-    """The complete messages of a file."""
-
-    path: Path  # The file.
-    # Messages in file order up to the first truncated one, without the one of kind LAST.
-    frames: tuple[MessageFrame, ...]
-    end: int  # Offset behind the last of them.
-    finished: bool  # Whether the file has rerun's closing bytes.
-    cut: bool  # Whether data follows `end` although the file is not finished.
-
-
-def scan(path: Path) -> Scan:
-    """Locates the messages of a file.
+def scan(path: Path) -> tuple[MessageFrame, ...]:
+    """Locates the messages of a file, without the one of kind LAST.
 
     Raises:
-        DataError: The file is missing or no `.rrd`, or it is finished but a message's length is
-            wrong.
+        DataError: The file is missing, no `.rrd`, cut off, or a message's length is wrong.
     """
     missing = absence(path)
     if missing:
@@ -80,21 +67,17 @@ def scan(path: Path) -> Scan:
                 )
             frames = list(_walk(file, size))
             file.seek(max(0, size - _CLOSING_BYTES))
-            closed = file.read().startswith(_CLOSING_MAGIC)
+            is_closed = file.read().startswith(_CLOSING_MAGIC)
     except OSError as error:
         raise _unreadable(path, error) from error
-    reached_last = bool(frames) and frames[-1].kind == LAST
-    if reached_last:
-        frames.pop()
-    end = frames[-1].end if frames else _START_BYTES
-    if closed and not reached_last:
+    if not (is_closed and frames and frames[-1].kind == LAST):
+        end = frames[-1].end if frames else _START_BYTES
         raise DataError(
-            f"{path} is damaged: the length of the message at byte {end} was changed after it was "
-            "written.",
+            f"{path} was cut off or damaged: the message at byte {end} is not whole.",
             culprits=[str(path)],
             next_step="Take the recording again from its origin.",
         )
-    return Scan(path, tuple(frames), end, closed, end < size and not closed)
+    return tuple(frames[:-1])
 
 
 def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
@@ -104,9 +87,7 @@ def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
         file.seek(offset)
         kind, length = _HEAD.unpack(file.read(_HEAD.size))
         frame = MessageFrame(kind, offset + _HEAD.size, length)
-        # Zeros, as after a power loss, would read as an empty message of kind LAST.
-        empty_last = frame.kind == LAST and not frame.size
-        if frame.kind > ACTIVATION or frame.end > size or empty_last:
+        if frame.kind > ACTIVATION or frame.end > size:
             return
         yield frame
         if frame.kind == LAST:

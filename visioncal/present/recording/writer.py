@@ -1,207 +1,35 @@
-"""Writes recordings of sessions: view by view during capture, or as a whole."""
+"""Writes recordings of sessions and their results."""
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Self
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
 
+import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.choices import ImagesKept
-from visioncal.core.documents.tables import TextTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import named_errors, replacing_file, sha256
+from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
-from visioncal.present.recording import codec
-from visioncal.present.recording.reader import ExternalImages
+from visioncal.present import result_parts
+from visioncal.present.recording import codec, notes, overlays, paths
+from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
-from visioncal.present.recording.results import log_results
+from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session
-from visioncal.session.kinds import check_images_can_be_used
-from visioncal.session.table import View, read_views
+from visioncal.session import Session, View
 from visioncal.vision.finders.imaging import decode_image, faint_jpeg
 
-
-class RecordingWriter:
-    """Writes a recording while its session is captured.
-
-    A view survives the death of the process once `add_view` returns. A recording that an exception
-    interrupts opens as one that was cut off.
-
-        with RecordingWriter(path, session, announced=20) as writer:
-            writer.add_view(["1", "images/001.png", "0.4", ...], png)
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        session: Session,
-        *,
-        announced: int | None = None,
-        blueprint: BlueprintLike | None = None,
-        label: Path | None = None,
-        images: ImagesKept = "full",
-        searches: Mapping[tuple[str, str], Searched] | None = None,
-    ) -> None:
-        """Starts the file.
-
-        Args:
-            path: The `.rrd`. It must not exist, unless `label` is given.
-            session: Data that holds for all views; its own views are not written.
-            announced: Number of views to come, by which readers can state how many were lost.
-            blueprint: Viewer layout of the recording.
-            label: Final path that messages name, where `path` is a temporary one.
-            images: What is stored of the images beside their digests.
-            searches: What was found in each image, by its name and that of its board in the
-                session's `boards`: the session can be calibrated again without its images.
-
-        Raises:
-            DataError: The file exists or cannot be written.
-        """
-        self._label = label or path
-        self._session = session
-        self._numbers: set[int] = set()
-        self._images: dict[str, str] = {}
-        self._kept = images
-        self._searches = searches or {}
-        with named_errors(self._label):
-            if label is None:
-                path.open("xb").close()
-            self._recorder = Recorder(path)
-            self._recorder.stream.send_recording_name(session.name)
-            rows = codec.UNKNOWN if announced is None else announced
-            header = codec.Header.of(session, rows, "" if self._kept == "full" else self._kept)
-            codec.log_header(self._recorder.stream, header)
-            for index, (name, samples) in enumerate(session.streams.items()):
-                self._recorder.at(index)
-                codec.log_samples(self._recorder.stream, name, samples)
-            if session.corner_table is not None:
-                codec.log_corners(self._recorder.stream, session.corner_table)
-            if self._searches:
-                codec.log_searches(self._recorder.stream, self._searches)
-            self._recorder.keep()
-            self._recorder.lay_out(blueprint)
-
-    def add_view(self, cells: Sequence[str], image: bytes | None) -> None:
-        """Adds one view.
-
-        Args:
-            cells: One text per column of the session, as in views.csv.
-            image: Bytes of the file that the column `image` names; None without a name or a file.
-
-        Raises:
-            DataError: A cell is wrong, the view's number is already there, its image differs from
-                an earlier view's of the same name, or the file cannot be written. Earlier views
-                remain.
-        """
-        view = self._checked(cells)
-        self._log(view, "" if image is None else self._checked_digest(view, sha256(image)), image)
-
-    def _log(self, view: View, image_sha256: str, shown: bytes | None) -> None:
-        row, recorder = len(self._numbers), self._recorder
-        name = view.image if self._kept == "full" else f"{view.image}.jpg"
-        with named_errors(self._label):
-            recorder.at(row)
-            codec.log_row(
-                recorder.stream, codec.StoredRow.of(self._session.columns, view, image_sha256)
-            )
-            codec.log_image(recorder.stream, name, shown)
-            recorder.keep()
-        self._numbers.add(view.number)
-
-    def add_results(
-        self, session: Session, calibration: Calibration | None, evidence: Sequence[ViewEvidence]
-    ) -> None:
-        """Adds results.
-
-        Args:
-            session: The session with all of its views.
-            calibration: Result of the session; None draws the cell as recorded.
-            evidence: Evidence of the views, in any order.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
-        with named_errors(self._label):
-            log_results(self._recorder, session, calibration, evidence)
-
-    def add_session(self, session: Session) -> None:
-        """Adds all views of a session.
-
-        Raises:
-            DataError: An image cannot be read, or the file cannot be written.
-        """
-        images = session.images
-        for view in session.views:
-            cells = [view.cell(column) for column in session.columns]
-            has_image = bool(view.image) and images.exists(view.image)
-            if self._kept == "full":
-                self.add_view(cells, images.read(view.image) if has_image else None)
-                continue
-            row, shown = self._checked(cells), None
-            if view.image and self._kept == "thumbnail":
-                found = self._searches.get((view.image, session.board_of(view)))
-                shown = (found and found.faint_jpeg) or images.shown(view.image)
-                if shown is None and has_image:
-                    pixels = decode_image(images.read(view.image), colour=True)
-                    shown = None if isinstance(pixels, str) else faint_jpeg(pixels)
-            digest = images.sha256(view.image) if view.image else ""
-            self._log(row, digest and self._checked_digest(row, digest), shown)
-
-    def draw(self, log: Callable[[Recorder], None]) -> None:
-        """Adds a drawing that belongs to no view.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
-        with named_errors(self._label):
-            log(self._recorder)
-            self._recorder.keep()
-
-    @property
-    def _where(self) -> str:
-        """Name of the row that is added, for messages."""
-        return f"row {len(self._numbers) + 1}"
-
-    def _checked(self, cells: Sequence[str]) -> View:
-        """Checks a row: it must be readable again."""
-        where, corners = self._where, self._session.corner_table is not None
-        table = TextTable("", self._session.columns, (tuple(cells),), (len(self._numbers) + 1,))
-        (view,) = read_views(table, with_corners=corners)
-        check_images_can_be_used(self._session.declaration, [view])
-        if view.number in self._numbers:
-            raise DataError(
-                f"{where}: view {view.number} is already there; each view has a number of its own.",
-                culprits=[f"view {view.number}"],
-            )
-        return view
-
-    def _checked_digest(self, view: View, digest: str) -> str:
-        """The SHA-256 of a view's image, which must have a name of its own."""
-        where = self._where
-        if not view.image:
-            raise DataError(f"{where}: it has an image but does not name it.", culprits=[where])
-        if self._images.setdefault(view.image, digest) != digest:
-            raise DataError(
-                f"{where}: another image is already there by the name {view.image}.",
-                culprits=[view.image],
-            )
-        return digest
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Closes the recording, with the end mark unless an error occurred.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
-        with named_errors(self._label):
-            if kind is None:
-                codec.log_end(self._recorder.stream, len(self._numbers))
-            self._recorder.__exit__(kind)
+_MEDIA_TYPES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".tif": "image/tiff",
+    ".tiff": "image/tiff",
+    ".bmp": "image/bmp",
+    ".webp": "image/webp",
+}
 
 
 def write_recording(
@@ -218,7 +46,7 @@ def write_recording(
     Args:
         path: The `.rrd` to write; it appears whole or not at all.
         session: The session; `read_session` returns it.
-        calibration: Result of the session, if there is one.
+        calibration: Result of the session; None draws the cell as recorded.
         evidence: Evidence of the views, in any order.
         blueprint: Viewer layout, as by `viewer.blueprint`; None for the viewer's own.
         images: What is stored of the images beside their digests. They are stored whole where the
@@ -227,36 +55,120 @@ def write_recording(
         searches: What was found in each image, by view.
 
     Raises:
+        DataError: The file cannot be written, an image of the session cannot be read, the evidence
+            names a view that the session does not have, or a section of the result cannot be read.
+    """
+    seen_of = {view.view: view for view in evidence}
+    unknown = seen_of.keys() - {view.number for view in session.views}
+    if unknown:
+        culprits = [f"view {number}" for number in sorted(unknown)]
+        raise DataError(
+            f"The evidence names {', '.join(culprits)}, which the session {session.name!r} does "
+            "not have.",
+            culprits=culprits,
+        )
+    with recording(path, session, blueprint, images, searches or {}) as recorder:
+        _draw(recorder.stream, session, calibration, seen_of)
+        text = "" if calibration is None else calibration.text
+        codec.result_record(text, evidence).log(recorder.stream, paths.CALIBRATION)
+
+
+@contextmanager
+def recording(
+    path: Path,
+    session: Session,
+    blueprint: BlueprintLike | None,
+    images: ImagesKept = "full",
+    searches: Mapping[int, Searched] | None = None,
+) -> Iterator[Recorder]:
+    """Starts a recording with a session; see `write_recording`.
+
+    Yields:
+        The recorder, for what is drawn besides.
+
+    Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
     store, by_view = session.images, searches or {}
     searched = [view for view in session.views if view.image and not view.has_corners]
-    found = {
-        (view.image, session.board_of(view)): search
-        for view in searched
-        if (
-            search := by_view.get(view.number)
-            or store.search_of(view.image, session.board_of(view))
-        )
-        is not None
-    }
+    found: dict[tuple[str, str], Searched] = {}
+    for view in searched:
+        key = view.image, session.board_of(view)
+        search = by_view.get(view.number) or store.search_of(*key)
+        if search is not None:
+            found[key] = search
     if all(store.exists(view.image) for view in searched) and any(
         (view.image, session.board_of(view)) not in found for view in searched
     ):
         images = "full"
-    elif isinstance(store, ExternalImages):
+    elif isinstance(store, RecordedImages) and store.kept != "full":
         images = store.kept
-    with (
-        replacing_file(path) as aside,
-        RecordingWriter(
-            aside,
-            session,
-            announced=len(session.views),
-            blueprint=blueprint,
-            label=path,
-            images=images,
-            searches={} if images == "full" else found,
-        ) as writer,
-    ):
-        writer.add_session(session)
-        writer.add_results(session, calibration, evidence)
+    with replacing_file(path) as aside, Recorder(aside) as recorder:
+        recorder.stream.send_recording_name(session.name)
+        digests = []
+        for row, view in enumerate(session.views):
+            recorder.at(row)
+            digests.append(_log_image(recorder.stream, session, view, images, found))
+        stored = {} if images == "full" else found
+        codec.session_record(session, images, digests, stored).log(recorder.stream, paths.SESSION)
+        recorder.lay_out(blueprint)
+        recorder.keep()
+        yield recorder
+
+
+def _log_image(
+    stream: rr.RecordingStream,
+    session: Session,
+    view: View,
+    images: ImagesKept,
+    found: Mapping[tuple[str, str], Searched],
+) -> str:
+    """Logs what is kept of a view's image at the stream's current time; returns its SHA-256."""
+    store, shown, name = session.images, None, view.image
+    digest = store.sha256(name) if name else ""
+    has_image = bool(name) and store.exists(name)
+    if images == "full" and has_image:
+        shown = store.read(name)
+        digest = sha256(shown)
+    elif images == "thumbnail" and name:
+        search, name = found.get((name, session.board_of(view))), f"{name}.jpg"
+        shown = (search and search.faint_jpeg) or store.shown(view.image)
+        if shown is None and has_image:
+            pixels = decode_image(store.read(view.image), colour=True)
+            shown = None if isinstance(pixels, str) else faint_jpeg(pixels)
+    if shown is None:
+        # Otherwise the viewer would keep showing the previous view's image.
+        stream.log(paths.IMAGE, rr.Clear(recursive=False))
+    else:
+        media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix.lower())
+        stream.log(paths.IMAGE, rr.EncodedImage(contents=shown, media_type=media_type))
+    return digest
+
+
+def _draw(
+    stream: rr.RecordingStream,
+    session: Session,
+    calibration: Calibration | None,
+    evidence: Mapping[int, ViewEvidence],
+) -> None:
+    """Draws a session and its result."""
+    views = dict(enumerate(session.views))
+    scene = SceneDrawing.of(session, calibration, evidence)
+    overlay = overlays.Overlay.of(session, calibration, evidence)
+    scene.log_static(stream)
+    seen = [evidence.get(view.number, ViewEvidence(view.number)) for view in session.views]
+    scene.log_views(stream, seen)
+    overlay.log_views(stream, seen)
+    if calibration is None:
+        return
+    notes.log_static(stream, calibration, result_parts.stated_boards(session))
+    rows = {view.number: row for row, view in views.items()}
+    sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
+    unposed = {row: scene.unposed(view.number) for row, view in views.items()}
+    notes.log_views(stream, sights, views, unposed)
+    for name, arm in calibration.by_name.robots.items():
+        drifts = () if arm.thermal is None else arm.thermal.views
+        shown = {rows[drift.view]: drift for drift in drifts if drift.view in rows}
+        for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
+            values = {row: float(getattr(drift, attribute)) for row, drift in shown.items()}
+            notes.log_scalars(stream, paths.part_of(plot, name), values)
