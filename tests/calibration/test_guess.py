@@ -17,16 +17,13 @@ from support.marks import slow
 
 import visioncal
 from visioncal.calibration.guess import guess_reading
-from visioncal.calibration.pipeline.guess_inputs import (
-    camera_poses_of,
-    chain_poses,
-    guess_session,
-)
+from visioncal.calibration.pipeline.guess_inputs import chain_poses
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.closed_form import SOLVERS
+from visioncal.interchange.formats import DoubtfulSession
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
@@ -376,14 +373,12 @@ def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
     session = Session.load(rendered)
     chain = chain_poses(session)
     assert np.isfinite(chain).all()
-    seen = camera_poses_of(session)
-    assert np.isfinite(seen.poses()).all()
     told = numbers(np.diag([-1.0, -1.0, 1.0, 1.0]) @ chain, unit="mm").read_as(Reading())
-    guess = guess_session(session, told)
+    guess = DoubtfulSession(session, told).guess()
     assert guess.stands_out
     # The simulated robot reports the model's poses: what is given back is the chain.
     np.testing.assert_allclose(guess.best.hypothesis.robot_numbers(told).poses(), chain, atol=1e-6)
-    assert not guess_session(session).stands_out
+    assert not DoubtfulSession(session).guess().stands_out
 
 
 def whole(poses):
@@ -443,6 +438,6 @@ def test_a_real_stream_that_is_inverse_is_named(real_data):
 
 @pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
 def test_real_sessions_of_images_are_not_accused(real_data, name):
-    guess = guess_session(Session.load(real_data / "sessions" / name))
+    guess = DoubtfulSession(Session.load(real_data / "sessions" / name)).guess()
     assert not guess.stands_out, guess.sentence
     assert "fit as declared" in guess.sentence

@@ -14,17 +14,15 @@ from support.whole_cells import misfit
 from typer.testing import CliRunner
 
 import visioncal
-from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.app import app
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import (
+    DoubtfulSession,
     ImportOptions,
     assemble,
-    guess_foreign,
     read_foreign,
     reread,
-    reread_session,
 )
 from visioncal.robot import Robot, read_robot_document
 from visioncal.session import Session
@@ -216,14 +214,14 @@ def late(tmp_path):
 @pytest.mark.parametrize("with_poses", [False, True], ids=["joints alone", "both"])
 def test_a_shift_moves_the_joints(late, with_poses):
     foreign, joints = late(with_poses=with_poses)
-    guess = guess_foreign(foreign)
-    assert guess.stands_out
     session = assemble(foreign)
-    mended = {
-        "recording": assemble(reread(foreign, guess.best)),
-        "session": reread_session(session, guess_session(session).best),
-    }
-    for name, fixed in mended.items():
+    for name, recorded in {
+        "recording": DoubtfulSession.of(foreign),
+        "session": DoubtfulSession(session),
+    }.items():
+        guess = recorded.guess()
+        assert guess.stands_out
+        fixed = reread(recorded, guess.best)
         found = [view.joints_rad for view in fixed.views]
         # The last row's robot was never logged, and the first one's twice.
         np.testing.assert_array_equal(found[:-1], joints[:-1], err_msg=name)
@@ -234,10 +232,11 @@ def test_a_shift_moves_the_joints(late, with_poses):
 
 def test_what_joints_cannot_be_is_refused(late):
     foreign, _ = late(with_poses=False)
-    best = guess_foreign(foreign).best
+    recorded = DoubtfulSession.of(foreign)
+    best = recorded.guess().best
     inverse = replace(best.hypothesis, robot=replace(best.hypothesis.robot, inverse=True))
     with pytest.raises(DataError, match="known by its joint angles alone"):
-        reread(foreign, replace(best, hypothesis=inverse))
+        reread(recorded, replace(best, hypothesis=inverse))
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

@@ -29,7 +29,7 @@ from support.marks import slow
 
 import visioncal
 from visioncal.core.conventions import Reading
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert, read_foreign
 from visioncal.interchange.formats.intrinsics import read_intrinsics
@@ -296,8 +296,9 @@ def test_streams_of_different_motions_are_refused(tmp_path):
         rows = np.hstack([stamps[:, None], quaternions(poses)])
         np.savetxt(tmp_path / f"{name}.txt", rows, "%.17g")
     requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
-    with pytest.raises(DataError, match="of the same motion"):
-        convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
+    session = convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
+    with pytest.raises(DegenerateError, match="of the same motion"):
+        visioncal.calibrate(session)
 
 
 FLANGE_FROM_CAM_BACK = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))

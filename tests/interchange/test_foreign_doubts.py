@@ -22,11 +22,11 @@ from visioncal.cli.app import app
 from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import (
+    DoubtfulSession,
     ImportOptions,
     PoseImportOptions,
     assemble,
     convert,
-    guess_foreign,
     read_foreign,
 )
 
@@ -89,7 +89,7 @@ def test_pairs_by_order_are_told_and_two_columns_of_images_are_one_too_many(tmp_
     )
     # Why they show nothing is said before any reading is tried.
     with pytest.raises(DataError, match=r"No board can be read in 9 views.*almost uniform"):
-        guess_foreign(foreign)
+        DoubtfulSession.of(foreign).guess()
     with pytest.raises(DataError, match="elsewhere does not exist"):
         read_foreign(tmp_path / "log.csv", replace(SEEN, images=tmp_path / "elsewhere"))
     both = [[f"{at:03d}.png", f"{at:03d}.png", *pose] for at, pose in enumerate(poses)]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from visioncal.cli.app import app
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert
+from visioncal.core.transforms import invert
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions, assemble, read_foreign
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
@@ -51,24 +51,14 @@ WRITTEN = {
 @pytest.mark.parametrize(("turned", "scale", "said"), WRITTEN.values(), ids=WRITTEN.keys())
 def test_what_is_said_of_a_stream_holds_once(tmp_path, turned, scale, said):
     recording = streams(tmp_path)
-    wanted = read_foreign(recording.source, recording.requested).robot
+    wanted = read_foreign(recording.source, recording.requested).stream.poses
     table = np.loadtxt(recording.source, delimiter=",")
     poses = PoseNumbers(table[:, 1:4], table[:, 4:], Reading(), tuple(map(str, table[:, 0])))
     written = quaternions(turned(poses.poses())) * ([scale] * 3 + [1] * 4)
     np.savetxt(recording.source, np.hstack([table[:, :1], written]), "%.12f", delimiter=",")
-    found = read_foreign(recording.source, replace(recording.requested, robot=said)).robot
-    # Of moments that are equally slow the last digit decides which are taken.
-    common = sorted(set(found.places) & set(wanted.places))
-    assert len(common) > 10
-    pairs = [
-        [
-            dict(zip(pose_numbers.places, pose_numbers.poses(), strict=True))[place]
-            for place in common
-        ]
-        for pose_numbers in (found, wanted)
-    ]
-    # Nine digits are written of the original, twelve here, and the clocks' offset is found anew.
-    np.testing.assert_allclose(*pairs, atol=1e-6)
+    found = read_foreign(recording.source, replace(recording.requested, robot=said)).stream.poses
+    # Nine digits are written of the original, twelve here.
+    np.testing.assert_allclose(found.poses(), wanted.poses(), atol=1e-8)
 
 
 def test_a_translation_called_t_is_no_time(rows):
@@ -242,26 +232,6 @@ def test_four_coefficients_may_be_a_fisheyes(tmp_path, model, noted):
     lens, notes = read_intrinsics(tmp_path / "lens.json")
     assert lens["model"] == ("brown" if noted else "fisheye")
     assert bool(notes) == noted
-
-
-def test_a_stream_with_wide_gaps_is_told_so(tmp_path):
-    recording = streams(tmp_path)
-    table = np.loadtxt(recording.source, delimiter=",")
-    np.savetxt(recording.source, table[::7], "%.9f", delimiter=",")
-    with pytest.raises(DataError, match=r"0\.35 s apart; where the gap is 0\.25 s or more"):
-        read_foreign(recording.source, recording.requested)
-
-
-def test_an_offset_where_the_search_ends_is_refused(tmp_path):
-    times_s = np.arange(0, 40, 0.1)
-    # One swing of ten seconds: what is tried agrees the better, the nearer it comes.
-    swing = np.outer(np.tanh((times_s - 20) / 5), [0.5, 0.3, 0.2, 0.1, 0.1, 0.1])
-    for name, poses, ahead_s in (("robot", exp(swing), 0), ("camera", invert(exp(swing)), 6)):
-        rows = np.hstack([times_s[:, None] + ahead_s, quaternions(poses)])
-        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9f", delimiter=",")
-    requested = replace(HAND, camera_file=tmp_path / "camera.csv")
-    with pytest.raises(DataError, match=r"\+5\.00 s apart, where the search ends"):
-        read_foreign(tmp_path / "robot.csv", requested)
 
 
 def test_rows_that_hold_poses_are_not_taken_for_names_of_files(tmp_path):

@@ -9,7 +9,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from visioncal.calibration.guess import Candidate
-from visioncal.calibration.pipeline.guess_inputs import guess_session
 from visioncal.cli.console import messages, say
 from visioncal.cli.parsing import names_in, pair_in, size_in
 from visioncal.cli.progress import shown_progress
@@ -17,11 +16,9 @@ from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import (
     DoubtfulSession,
-    ForeignRecording,
     ImportOptions,
     PoseImportOptions,
     convert,
-    guess_foreign,
 )
 
 
@@ -80,13 +77,10 @@ def import_options(poses: RobotPoseOptions) -> ImportOptions:
     )
 
 
-def _chosen(recorded: DoubtfulSession | ForeignRecording, *, yes: bool) -> Candidate:
+def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and returns the clearly best or confirmed one."""
     with shown_progress(quiet=False) as progress:
-        if isinstance(recorded, ForeignRecording):
-            guess = guess_foreign(recorded, progress=progress)
-        else:
-            guess = guess_session(recorded.session, recorded.robot, progress=progress)
+        guess = recorded.guess(progress)
     console = messages()
     table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
     for candidate in guess.candidates:

@@ -15,7 +15,7 @@ from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
-from visioncal.core.types import FloatArray, Progress
+from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -25,29 +25,20 @@ from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 _SEEING = ("detect", "intrinsics", "pnp")
 
 
-def guess_session(
-    session: Session, robot: PoseNumbers | None = None, *, progress: Progress | None = None
+def guess_from_camera_poses(
+    run: RunState,
+    robot: PoseNumbers | None = None,
+    camera: PoseNumbers | None = None,
+    *,
+    knows_mount: bool = True,
 ) -> Guess:
-    """Tries every plausible reading of a session's poses.
+    """Tries every plausible reading of a session's poses, with all alternatives of the camera's.
 
     Args:
-        session: The session, with images or measured poses of the target.
+        run: The run, with the camera's poses.
         robot: The robot's original numbers, one row a view; those of the session where None.
-        progress: Called with the progress of long work.
-
-    Returns:
-        The readings, and whether one stands out.
-
-    Raises:
-        DataError: There is nothing to read, or the target is in no view.
-        DegenerateError: Too few views have both poses, or the lens cannot be estimated.
-        ConvergenceError: The intrinsics do not converge.
-    """
-    return guess_from_camera_poses(with_camera_poses(RunState(session, progress)), robot)
-
-
-def guess_from_camera_poses(run: RunState, robot: PoseNumbers | None = None) -> Guess:
-    """Does what `guess_session` does, once the camera's poses are known, with all alternatives.
+        camera: The original numbers of measured poses; those of the session where None.
+        knows_mount: Whether the session's mount is stated; else both are tried.
 
     Raises:
         DataError: There is nothing to read.
@@ -61,23 +52,13 @@ def guess_from_camera_poses(run: RunState, robot: PoseNumbers | None = None) -> 
     if robot is None:
         poses = numbers_in(run.session, POSE)
         robot = reported_or_joint_poses(robot_numbers(run) if run.clocks else poses, joint_poses)
-    is_measured, mount = bool(run.corners), run.session.mount
-    for camera in camera_pose_choices(run, robot):
-        guess = guess_reading(robot, camera, mount, chain=joint_poses, is_measured=is_measured)
+    is_measured, mount = bool(run.corners), run.session.mount if knows_mount else None
+    choices = camera_pose_choices(run, robot) if camera is None else (camera,)
+    for poses in choices:
+        guess = guess_reading(robot, poses, mount, chain=joint_poses, is_measured=is_measured)
         if not guess.stands_out and guess.declared.closes:
             break
     return guess
-
-
-def camera_poses_of(session: Session, *, progress: Progress | None = None) -> PoseNumbers:
-    """Measures `cam_from_target` of every view, without the robot; NaN where it was not seen.
-
-    Raises:
-        DataError: The target is in no view.
-        DegenerateError: The lens cannot be estimated.
-        ConvergenceError: The intrinsics do not converge.
-    """
-    return camera_numbers(with_camera_poses(RunState(session, progress)))
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:

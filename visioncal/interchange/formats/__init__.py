@@ -1,8 +1,9 @@
 """Readers of foreign recordings: one file a format, with one entry each in the registry.
 
 A foreign recording becomes a session in three steps: `read_foreign` reads its numbers as they are
-written, `assemble` builds the session, and `write_session` stores it. In between, `guess_foreign`
-can test whether the poses are meant in another convention. `convert` does all of this.
+written, `assemble` builds the session, and `write_session` stores it. In between, a
+`DoubtfulSession` tests whether the poses are meant in another convention. `convert` does all of
+this.
 
 A new format is a file with a `ForeignFormat` and its entry in `registry.FOREIGN_FORMATS`. Another
 common name of a field needs no format: it is added to the keys in `poses`, `fields` (times),
@@ -19,10 +20,8 @@ from visioncal.interchange.formats.registry import (
 )
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
-    guess_foreign,
     load_for_rereading,
     reread,
-    reread_session,
 )
 
 __all__ = [
@@ -33,10 +32,8 @@ __all__ = [
     "PoseImportOptions",
     "assemble",
     "convert",
-    "guess_foreign",
     "load_for_rereading",
     "read_foreign",
     "reread",
-    "reread_session",
     "write_session",
 ]

@@ -98,17 +98,6 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
-    sweep = foreign.sweep
-    if sweep is not None:
-        # All samples of the camera, without the robot's poses: those become a stream.
-        foreign = replace(
-            foreign,
-            robot=PoseNumbers.empty(sweep.camera.places),
-            camera=sweep.camera,
-            stamps_s=sweep.camera_s,
-            views=(),
-            columns={},
-        )
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     notes = list(foreign.notes)
@@ -122,26 +111,27 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [[row.get(name, "") for name in columns] for row in rows]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [[row.get(name, "") for name in names] for row in rows]
     numbered = zip(foreign.views or range(len(rows)), foreign.corners, strict=False)
     found = [(view, item.ids, item.px) for view, item in numbered if item is not None]
     session = Session.assemble(
         document,
-        columns,
+        names,
         cells,
         FileImages(files) if files else MemoryImages({}),
         target_document=target,
         robot_document=robot,
         corners=CornerTable.of_lists(found) if foreign.corners else None,
     )
-    if sweep is not None:
-        poses = pose_cells(sweep.robot, session_columns.POSE)
+    stream = foreign.stream
+    if stream is not None:
+        poses = pose_cells(stream.poses, session_columns.POSE)
         numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in poses])
-        values = np.hstack([sweep.robot_s[:, None], numbers])
+        values = np.hstack([stream.stamps_s[:, None], numbers])
         values.setflags(write=False)
-        stream = Stream(("stamp_s", *session_columns.POSE), values)
-        session = session.with_streams({"robot": stream})
+        columns = ("stamp_s", *session_columns.POSE)
+        session = session.with_streams({"robot": Stream(columns, values)})
     elif foreign.joints_rad is None and not foreign.robot.present.all():
         missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.present)]
         notes.append(

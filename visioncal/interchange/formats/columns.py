@@ -6,19 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.stages.clock_offset import LEAST_CORRELATION
-from visioncal.calibration.stages.motion import slow_and_new
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
-from visioncal.estimation.clock_correlation import (
-    WIDEST_OFFSET_S,
-    ImageTimes,
-    Match,
-    turning_matches,
-)
-from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 from visioncal.interchange.formats.file_search import (
     files_in,
     images_beside,
@@ -28,7 +19,7 @@ from visioncal.interchange.formats.file_search import (
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
-    ForeignSweep,
+    ForeignStream,
     ImportOptions,
     PoseImportOptions,
 )
@@ -42,9 +33,6 @@ from visioncal.interchange.formats.reading import (
 )
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
-# Limits of the overlap of two streams [s]: a shorter one determines no offset, a longer one is no
-# calibration motion.
-_SHORTEST_S, _LONGEST_S = 2.0, 3600.0
 # Present epochs are about 1e9 s: (larger than, seconds a unit).
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 # Numbers of values that a pose in one field may have.
@@ -204,10 +192,10 @@ TABLE = ForeignFormat(
 def with_camera_file(
     robot_fields: Fields, camera_fields: Fields, requested: ImportOptions
 ) -> ForeignRecording:
-    """Joins a file of robot poses with one of camera poses, by time if possible, else by row.
+    """Joins robot and camera poses of two files: where both have times as a stream, else by row.
 
     Raises:
-        DataError: Either holds no poses, their numbers differ, or their motions do not agree.
+        DataError: Either holds no poses, or their numbers differ.
     """
     robot, robot_names, first = _poses(robot_fields, requested.robot, "robot")
     camera, camera_names, second = _poses(camera_fields, requested.camera, "camera")
@@ -217,7 +205,18 @@ def with_camera_file(
     if robot_stamp and camera_stamp:
         robot_s, robot = _timed(robot_fields, robot_stamp, robot)
         camera_s, camera = _timed(camera_fields, camera_stamp, camera)
-        return _by_time(name, ForeignSweep(robot_s, robot, camera_s, camera), notes)
+        return ForeignRecording(
+            name=name,
+            robot=PoseNumbers.empty(camera.places),
+            camera=camera,
+            stamps_s=camera_s,
+            stream=ForeignStream(robot_s, robot),
+            notes=(
+                *notes,
+                f"All {len(camera)} samples of the camera are views, and the robot's are a stream "
+                "beside them: calibrate finds how far their clocks differ.",
+            ),
+        )
     if len(robot) != len(camera):
         raise DataError(
             f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
@@ -274,76 +273,3 @@ def _in_seconds(stamps: FloatArray) -> FloatArray:
     sizes = np.abs(stamps[np.isfinite(stamps)])
     largest = float(sizes.max()) if len(sizes) else 0.0
     return stamps * next((unit_s for limit, unit_s in _EPOCHS if largest > limit), 1.0)
-
-
-def _by_time(name: str, sweep: ForeignSweep, notes: tuple[str, ...]) -> ForeignRecording:
-    """Estimates a coarse clock offset, and samples times at which the robot is slow."""
-    robot_s, camera_s = sweep.robot_s, sweep.camera_s
-    common_s = min(robot_s[-1], camera_s[-1]) - max(robot_s[0], camera_s[0])
-    if common_s < _SHORTEST_S:
-        raise DataError(
-            f"The streams have {max(common_s, 0.0):.1f} s in common (robot {robot_s[0]:.2f} to "
-            f"{robot_s[-1]:.2f}, camera {camera_s[0]:.2f} to {camera_s[-1]:.2f}); "
-            f"{_SHORTEST_S:g} s or more are needed.",
-            culprits=["robot", "camera"],
-            next_step="Stamp both with the same clock, to within a few seconds.",
-        )
-    if common_s > _LONGEST_S:
-        raise DataError(
-            f"The streams have {common_s:.0f} s in common; up to {_LONGEST_S:.0f} are read.",
-            culprits=["robot", "camera"],
-            next_step="Cut the recording into parts.",
-        )
-    flange = Trajectory(robot_s, sweep.robot.poses())
-    match = _match(flange, ImageTimes("eye-in-hand", camera_s, sweep.camera.poses()))
-    robot_clock_s = camera_s - match.offset_s
-    rows = np.flatnonzero(flange.covers(robot_clock_s))
-    if len(rows) < 3:
-        raise DataError(
-            f"The robot's poses cover {len(rows)} samples of the camera's; 3 or more are "
-            f"needed. They are {flange.step_s:.2f} s apart; where the gap is {LONGEST_GAP_S} s or "
-            "more, nothing is interpolated.",
-            culprits=["robot", "camera"],
-            next_step="Log the robot's pose ten times a second or more.",
-        )
-    poses = flange.at(robot_clock_s[rows])
-    chosen = slow_and_new(poses, flange.speeds(robot_clock_s[rows]))
-    sampled = sweep.camera.rows(rows[chosen])
-    return ForeignRecording(
-        name=name,
-        robot=PoseNumbers.written(poses[chosen], sweep.robot.reading, sampled.places),
-        camera=sampled,
-        stamps_s=camera_s[rows[chosen]],
-        sweep=sweep,
-        notes=(
-            *notes,
-            f"The camera's clock is about {1e3 * match.offset_s:+.0f} ms ahead of the robot's, as "
-            f"both turn alike there with a correlation of {match.correlation:.2f}; calibrate "
-            "estimates it finer.",
-            f"All {len(sweep.camera)} samples of the camera are kept as views, and the robot's as "
-            "a stream beside them: calibrate takes the robot's poses from there.",
-        ),
-    )
-
-
-def _match(flange: Trajectory, frames: ImageTimes) -> Match:
-    best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
-    if flange.step_s >= LONGEST_GAP_S:
-        # Too sparse to compare; the caller reports the uncovered samples.
-        return best
-    if best.correlation < LEAST_CORRELATION:
-        raise DataError(
-            f"The turning of robot and camera agrees with a correlation of {best.correlation:.2f} "
-            f"at best, {best.offset_s:+.2f} s apart; {LEAST_CORRELATION} is needed.",
-            culprits=["robot", "camera"],
-            next_step="Check that both streams are of the same motion.",
-        )
-    if best.at_end:
-        raise DataError(
-            f"The turning of robot and camera agrees best {best.offset_s:+.2f} s apart, "
-            f"where the search ends: offsets within {WIDEST_OFFSET_S:g} s and a quarter of the "
-            "time in common are tried.",
-            culprits=["robot", "camera"],
-            next_step="Stamp both with clocks that differ by less, or record for longer.",
-        )
-    return best

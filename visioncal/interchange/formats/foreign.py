@@ -84,13 +84,11 @@ class ImportOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class ForeignSweep:
-    """Two streams of one motion, each with its own clock."""
+class ForeignStream:
+    """The robot's poses over time, on a clock of its own."""
 
-    robot_s: FloatArray  # (n,) times [s], ascending.
-    robot: PoseNumbers  # (n,) `base_from_flange`.
-    camera_s: FloatArray  # (k,) times [s], ascending.
-    camera: PoseNumbers  # (k,) `cam_from_target`.
+    stamps_s: FloatArray  # (k,) times [s], ascending.
+    poses: PoseNumbers  # (k,) `base_from_flange`.
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +123,8 @@ class ForeignRecording:
     # The fields of `[robot]` in session.toml, where the user names a robot.
     arm: Mapping[str, Any] | None = None
     views: tuple[int, ...] = ()  # (n,) the rows' numbers in the source; 0, 1, ... where empty.
-    # Two streams with separate clocks, of which the rows are a sample; None where the source has
-    # one clock.
-    sweep: ForeignSweep | None = None
+    # The robot's poses, where they are not those of the rows but a stream beside them.
+    stream: ForeignStream | None = None
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.

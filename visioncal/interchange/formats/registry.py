@@ -21,7 +21,6 @@ from visioncal.interchange.formats.rereading import (
     exchange_views,
     load_for_rereading,
     reread,
-    reread_session,
 )
 from visioncal.interchange.formats.views import VIEWS, VISP, ZIVID
 from visioncal.session import Session
@@ -42,7 +41,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
 _DEFAULTS = ImportOptions()
 
 # Tries other readings of the poses, and selects one.
-Choose: TypeAlias = Callable[[DoubtfulSession | ForeignRecording], Candidate]
+Choose: TypeAlias = Callable[[DoubtfulSession], Candidate]
 
 
 @typed
@@ -91,13 +90,14 @@ def convert(
     is_session = is_result or is_recording or (source / "session.toml").is_file()
     if form is not None or not is_session:
         foreign = read_foreign(source, requested, form)
-        if choose is None:
-            check_radians(foreign.robot, requested.robot, "robot")
+        if choose is not None:
+            doubtful = DoubtfulSession.of(foreign)
+        else:
+            robot = foreign.robot if foreign.stream is None else foreign.stream.poses
+            check_radians(robot, requested.robot, "robot")
             if foreign.camera is not None:
                 check_radians(foreign.camera, requested.camera, "camera")
-        else:
-            foreign = reread(foreign, choose(foreign), mirrors_poses=mirrors_poses)
-        session = assemble(foreign)
+            session = assemble(foreign)
     elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
@@ -110,9 +110,8 @@ def convert(
     else:
         doubtful = load_for_rereading(source)
         check_one_of_each(doubtful.session)
-        session = reread_session(
-            doubtful.session, choose(doubtful), doubtful.robot, mirrors_poses=mirrors_poses
-        )
+    if choose is not None:
+        session = reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
     if exchange is not None:
         session = exchange_views(session, *exchange)
     write_session(session, dest)

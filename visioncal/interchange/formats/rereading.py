@@ -3,20 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from visioncal.calibration.guess import Candidate, Guess, guess_reading
+from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.guess.hypothesis import MIRROR_WORDS, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
-    camera_poses_of,
     chain_poses,
-    guess_session,
+    guess_from_camera_poses,
     numbers_in,
-    reported_or_joint_poses,
+    with_camera_poses,
 )
 from visioncal.calibration.pipeline.misread_poses import session_is_mirrored
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
@@ -52,78 +52,6 @@ _BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
-def guess_foreign(foreign: ForeignRecording, *, progress: Progress | None = None) -> Guess:
-    """Tries every plausible reading of a foreign recording's poses, and both mounts if needed.
-
-    Raises:
-        DataError: There are no poses, no view shows the target, or nothing determines the mount.
-        DegenerateError: Too few views have both poses.
-        ConvergenceError: The intrinsics do not converge.
-    """
-    foreign = with_observations_only(foreign)
-    # The mount does not affect what is read from the session here.
-    session = assemble(foreign, mount=MOUNTS[0])
-    chain = chain_poses(session)
-    camera = foreign.camera
-    if camera is None:
-        camera = camera_poses_of(session, progress=progress)
-    return guess_reading(
-        reported_or_joint_poses(foreign.robot, chain),
-        camera,
-        foreign.mount,
-        chain=chain,
-        is_measured=foreign.camera is None,
-    )
-
-
-def reread(
-    foreign: ForeignRecording, candidate: Candidate, *, mirrors_poses: bool = False
-) -> ForeignRecording:
-    """Applies a candidate reading to a recording: poses, pairing, mount and the size of the board.
-
-    Raises:
-        DataError: It changes the robot's poses where only joint angles are recorded, or mirrors
-            them without permission.
-    """
-    if _mirrors(candidate) and not mirrors_poses:
-        raise _not_mirrored(candidate)
-    foreign, reading = with_observations_only(foreign), candidate.hypothesis
-    notes = _change_notes(candidate)
-    if foreign.mount is None:
-        notes = (*notes, f"The mount is taken for {reading.mount}.")
-    robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
-    _check_applies(candidate, robot)
-    if joints is not None:
-        chain = chain_poses(assemble(foreign, mount=reading.mount))
-        if _is_one_log(chain, robot):
-            order = reading.rows(len(joints))
-            joints = np.where((order >= 0)[:, None], joints[order], np.nan)
-    target, sweep = foreign.target, foreign.sweep
-    if sweep is not None:
-        corrected = reading.robot.corrected(sweep.robot), reading.camera.corrected(sweep.camera)
-        sweep = replace(sweep, robot=corrected[0], camera=corrected[1])
-    return replace(
-        foreign,
-        sweep=sweep,
-        robot=reading.robot_numbers(robot) if robot.present.any() else robot,
-        camera=None if camera is None else reading.camera_numbers(camera),
-        joints_rad=joints,
-        mount=reading.mount,
-        target=None if target is None else _scaled(target, candidate.board_scale),
-        notes=(*(note for note in foreign.notes if not _is_overruled(note, candidate)), *notes),
-    )
-
-
-def _is_overruled(note: str, candidate: Candidate) -> bool:
-    """Whether a note states an assumption that the candidate changes."""
-    if " taken for " not in note:
-        return False
-    start = note.replace("quaternions", "rotations").lower()
-    return any(
-        start.startswith(" ".join(difference.split()[:3])) for difference in candidate.differences
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class DoubtfulSession:
     """A session whose poses may be in another convention."""
@@ -132,6 +60,33 @@ class DoubtfulSession:
     session: Session
     # The robot's poses as they are written; None for those of the session.
     robot: PoseNumbers | None = None
+    # The measured poses of the target as they are written; None for those of the session.
+    camera: PoseNumbers | None = None
+    knows_mount: bool = True  # Whether the mount is stated; else both are tried.
+
+    @classmethod
+    def of(cls, foreign: ForeignRecording) -> Self:
+        """The session of a foreign recording, and its poses as they are written.
+
+        Raises:
+            DataError: No row has an observation, or a number is wrong.
+        """
+        foreign = with_observations_only(foreign)
+        robot = foreign.robot if foreign.robot.present.any() else None
+        session = assemble(foreign, mount=MOUNTS[0])
+        return cls(session, robot, foreign.camera, foreign.mount is not None)
+
+    def guess(self, progress: Progress | None = None) -> Guess:
+        """Tries every plausible reading of its poses, and both mounts where it is not known.
+
+        Raises:
+            DataError: There are no poses, no view shows the target, or nothing determines the
+                mount.
+            DegenerateError: Too few views have both poses.
+            ConvergenceError: The intrinsics do not converge.
+        """
+        run = with_camera_poses(RunState(self.session, progress))
+        return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
 
 
 def load_for_rereading(path: Path) -> DoubtfulSession:
@@ -168,7 +123,7 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
 def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
     """Score of the chain's closure as declared; infinite where it does not close."""
     try:
-        declared = guess_session(session, robot).declared
+        declared = DoubtfulSession(session, robot).guess().declared
     except VisioncalError:
         # The candidate reading that is then tried reports the error.
         return np.inf
@@ -221,22 +176,19 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
     return replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot
 
 
-def reread_session(
-    session: Session,
-    candidate: Candidate,
-    robot: PoseNumbers | None = None,
-    *,
-    mirrors_poses: bool = False,
+def reread(
+    doubtful: DoubtfulSession, candidate: Candidate, *, mirrors_poses: bool = False
 ) -> Session:
     """Applies a candidate reading to a session's poses; everything else stays the same.
 
-    `robot` has the robot's poses as they are written; None for the session's own. For a mirror,
-    corners.csv is mirrored back where it shows the board from behind. The session notes the changes
-    in `corrected`.
+    For a mirror, corners.csv is mirrored back where it shows the board from behind. The session
+    notes the changes in `corrected`.
 
     Raises:
-        DataError: The resulting session is invalid; or as `reread`.
+        DataError: The resulting session is invalid; or the reading changes the robot's poses where
+            only joint angles are recorded, or mirrors them without permission.
     """
+    session = doubtful.session
     corners = session.corner_table
     changes: tuple[str, ...] = ()
     if _mirrors(candidate) and not mirrors_poses:
@@ -244,29 +196,57 @@ def reread_session(
             raise _not_mirrored(candidate)
         corners, changes, candidate = _mirrored_back(corners, session.resolution[0], candidate)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    camera = numbers_in(session, MEASURED_CAM_POSE)
-    robot = numbers_in(session, POSE) if robot is None else robot
+    camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
+    robot = doubtful.robot or numbers_in(session, POSE)
     reading = candidate.hypothesis
-    _check_applies(candidate, robot)
+    _check_applies(candidate, session, robot)
     if _is_one_log(chain_poses(session), robot):
         names = joint_columns(session.columns)
-        before = [{name: row[name] for name in names} for row in cells]
-        for row, at in zip(cells, reading.rows(len(cells)), strict=True):
-            row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
+        order = reading.rows(len(cells))
+        joints = [{name: cells[at][name] if at >= 0 else "" for name in names} for at in order]
+        _replace_cells(cells, joints, names)
     if robot.present.any():
         _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
     if camera.present.any():
         corrected = pose_cells(reading.camera_numbers(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
-    changes = (*changes, *_change_notes(candidate))
-    document = {**session.document, "mount": reading.mount}
-    if changes:
-        document["corrected"] = [*session.declaration.corrected, *changes]
-    target = session.target_document
+    if candidate.changes:
+        changes += (f"The poses are read otherwise than declared: {candidate.words}.",)
+    document, target = {**session.document, "mount": reading.mount}, session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
         document["target"] = "target.toml"
-    reread = Session.assemble(
+    streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
+    reread = _rewritten(session, document, cells, changes, corners, target).with_streams(streams)
+    if not doubtful.knows_mount:
+        changes += (f"The mount is taken for {reading.mount}.",)
+    kept = (note for note in session.warnings if not _is_overruled(note, candidate))
+    notes = dict.fromkeys((*changes, *kept, *reread.warnings))
+    return replace(reread, warnings=tuple(notes))
+
+
+def _is_overruled(note: str, candidate: Candidate) -> bool:
+    """Whether a note states an assumption that the candidate changes."""
+    if " taken for " not in note:
+        return False
+    start = note.replace("quaternions", "rotations").lower()
+    return any(
+        start.startswith(" ".join(difference.split()[:3])) for difference in candidate.differences
+    )
+
+
+def _rewritten(
+    session: Session,
+    document: Mapping[str, Any],
+    cells: Sequence[Mapping[str, str]],
+    changes: Sequence[str],
+    corners: CornerTable | None,
+    target: Mapping[str, Any] | None,
+) -> Session:
+    """A session with other cells, corners and target; it notes the changes in `corrected`."""
+    if changes:
+        document = {**document, "corrected": [*session.declaration.corrected, *changes]}
+    return Session.assemble(
         document,
         session.columns,
         [[row[name] for name in session.columns] for row in cells],
@@ -274,11 +254,7 @@ def reread_session(
         target_document=target,
         robot_document=session.robot_document,
         corners=corners,
-    ).with_streams(
-        {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     )
-    notes = dict.fromkeys((*changes, *session.warnings, *reread.warnings))
-    return replace(reread, warnings=tuple(notes))
 
 
 def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
@@ -334,15 +310,11 @@ def _mirrored_back(
     )
 
 
-def _change_notes(candidate: Candidate) -> tuple[str, ...]:
-    if not candidate.changes:
-        return ()
-    return (f"The poses are read otherwise than declared: {candidate.words}.",)
-
-
-def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
+def _check_applies(candidate: Candidate, session: Session, robot: PoseNumbers) -> None:
     """Refuses another reading of poses where only joint angles are recorded."""
-    if not robot.present.any() and candidate.hypothesis.robot != candidate.declared.robot:
+    streamed = any(name in stream for stream in session.streams.values() for name in POSE)
+    recorded = streamed or robot.present.any()
+    if not recorded and candidate.hypothesis.robot != candidate.declared.robot:
         raise DataError(
             f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
             "alone, of which that cannot be said.",
@@ -423,13 +395,7 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
         views = np.where(is_first, second, np.where(is_second, first, corners.views))
         corners = replace(corners, views=views)
     note = f"the images of views {first} and {second} were exchanged"
-    rows: Sequence[dict[str, str]] = [*cells.values()]
-    return Session.assemble(
-        {**session.document, "corrected": [*session.declaration.corrected, note]},
-        session.columns,
-        [[row[name] for name in session.columns] for row in rows],
-        session.images,
-        target_document=session.target_document,
-        robot_document=session.robot_document,
-        corners=corners,
-    ).with_streams(session.streams)
+    rewritten = _rewritten(
+        session, session.document, [*cells.values()], [note], corners, session.target_document
+    )
+    return rewritten.with_streams(session.streams)
