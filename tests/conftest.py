@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from markupsafe import Markup, escape
@@ -18,7 +19,7 @@ from visioncal.live.drivers import ur, ur_net
 from visioncal.simulation import CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-# Whose tests read a report's words, if anything: figures are plotted, and not rendered, which takes
+# Whose tests read a report's words, if anything: figures are described and not drawn, which takes
 # most of the time of writing a result. A module that looks at them says `DRAWS = True`.
 UNDRAWN = {
     "calibration", "cli", "core", "dynamics", "frames", "interchange", "live", "results", "session",
@@ -55,9 +56,29 @@ def calibrations_are_as_their_schema_says(tmp_path_factory):
     assert faults_below(tmp_path_factory.getbasetemp()) == []
 
 
+class Undrawn:
+    """Takes every call and every attribute of a figure and its axes, and draws nothing."""
+
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self
+
+    def __call__(self, *_, **__):
+        """Whatever a method would return."""
+        return self
+
+    def __getitem__(self, _):
+        return self
+
+    def subplots(self, rows, columns, **_):
+        """Axes (rows, columns) that draw nothing either."""
+        return np.full((rows, columns), self)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def figures(request):
-    """Leaves out matplotlib's rendering where no test looks at a figure."""
+    """Leaves out matplotlib where no test looks at a figure."""
     if getattr(request.module, "DRAWS", request.path.parent.name not in UNDRAWN):
         yield
         return
@@ -66,7 +87,9 @@ def figures(request):
         return Markup(f'<svg role="img" aria-label="{escape(words)}"></svg>')
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("visioncal.present.report.plotting._svg", described)
+        plotting = "visioncal.present.report.plotting"
+        patch.setattr(f"{plotting}.Figure", lambda *_, **__: Undrawn())
+        patch.setattr(f"{plotting}._svg", described)
         yield
 
 

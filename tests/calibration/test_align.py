@@ -280,7 +280,7 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
 
 
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
-    cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS))
+    cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=8))
     found = aligned(cell)
     (remedy,) = {value.remedy for value in found.cell.untied if value.frame == "instrument_t1"}
     assert "read points on a robot's flange" in remedy
@@ -328,8 +328,8 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     assert after < 0.45 * before
 
 
-def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
-    cell, _ = clean
+def test_a_robot_without_joints_stays_as_it_reports_itself():
+    cell = simulate(NetworkOptions(stops=8))
     session = cell_session(cell, "cell", seen="names")
     columns = [column for column in session.columns if not column.startswith("q")]
     columns += ["qx", "qy", "qz", "qw"]
@@ -443,7 +443,7 @@ def two_cameras(cell):
     [
         ("eye-in-hand", one_camera, "one_axis"),
         ("eye-to-hand", one_camera, "translation"),
-        ("eye-to-hand", two_cameras, "one_axis"),
+        slow("eye-to-hand", two_cameras, "one_axis"),
         slow("eye-to-hand", two_cameras, "translation"),
     ],
 )

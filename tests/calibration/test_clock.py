@@ -61,14 +61,14 @@ def session(moved) -> Session:
 
 
 @pytest.fixture(scope="module")
-def long() -> Session:
-    """Of 20 s, long enough to tell how a clock runs."""
-    return cell_session(swept(how=SweepOptions()), "swept", seen="poses")
+def known(session) -> Calibration:
+    return calibrate(session)
 
 
 @pytest.fixture(scope="module")
-def sound(long) -> Calibration:
-    return calibrate(long)
+def long() -> SimulatedCell:
+    """Of 20 s, long enough to tell how a clock runs."""
+    return swept(how=SweepOptions())
 
 
 def restamped(session: Session, stamp) -> Session:
@@ -82,21 +82,19 @@ def restamped(session: Session, stamp) -> Session:
 @pytest.mark.parametrize(
     ("stamp", "words"),
     [
-        slow(lambda s: s + 0.02 * (s >= s[300]), "from view 300 on it is +20"),
         (lambda s: s - 0.02 * (s >= s[200]), "from view 200 on it is -"),
         (lambda s: s + 1e-3 * (s - s[0]), "drifts against the robot's, by +"),
     ],
-    ids=["jump", "back", "drift"],
+    ids=["back", "drift"],
 )
-def test_a_clock_that_changes_is_named_and_taken_out(long, sound, stamp, words):
-    known = calibrate(restamped(long, stamp))
-    cause = known.verdict.causes[0]
+def test_a_clock_that_changes_is_named_and_taken_out(long, stamp, words):
+    found = calibrate(restamped(cell_session(long, "swept", seen="poses"), stamp))
+    cause = found.verdict.causes[0]
     assert cause.kind == "clock_changed"
     assert words in cause.words
-    assert sound.verdict.status == "good"
-    (x, again) = (value.transforms["flange_from_cam"].as_matrix() for value in (sound, known))
+    away, _ = x_error(long, found)
     # Some frames about the jump are stamped in a mixed order; the rest is as without it.
-    assert np.linalg.norm(x[:3, 3] - again[:3, 3]) < 3e-4
+    assert np.linalg.norm(away[3:]) < 3e-4
 
 
 @pytest.mark.parametrize(("mount", "seeds"), [("eye-in-hand", 1), slow("eye-to-hand", 3)])
@@ -127,7 +125,7 @@ def x_error(cell, result) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("seed", "mount", "ahead_s"),
-    [(1, "eye-in-hand", AHEAD_S), (2, "eye-to-hand", -0.61), (3, "eye-in-hand", 0.0)],
+    [(2, "eye-to-hand", -0.61), (3, "eye-in-hand", 0.0)],
 )
 def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     cell = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
@@ -145,8 +143,7 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     assert error @ np.linalg.solve(covariance, error) < 27.9
 
 
-def test_another_sweep_verifies_the_camera(session):
-    known = calibrate(session)
+def test_another_sweep_verifies_the_camera(known):
     again = swept(recording=1)
     held = verify(cell_session(again, "again", seen="poses"), known)
     assert held.passed
@@ -174,10 +171,9 @@ def test_joints_are_placed_in_time_too(moved, session):
     assert "streams/arm.csv" in " ".join(result.verdict.reasons)
 
 
-def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
-    session.save(tmp_path / "folder")
+def test_its_recording_gives_the_same(session, known, tmp_path):
     write_recording(tmp_path / "session.rrd", session, None, (), None)
-    one, other = (calibrate(tmp_path / name) for name in ("folder", "session.rrd"))
+    one, other = known, calibrate(tmp_path / "session.rrd")
     assert one.session_sha256 == other.session_sha256
     assert one.clock == other.clock
     for name, edge in one.edges.items():
@@ -188,10 +184,11 @@ def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
 
 
 def test_a_stated_offset_is_compared(session):
-    right, wrong = (calibrate(stating(session, value)) for value in (AHEAD_S + 1e-3, 0.0))
-    told = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
     # A millisecond is a thirtieth of a frame: nobody stamps better.
-    assert not any("is stated as" in reason for reason in right.verdict.reasons)
+    right = clocked_of(stating(session, AHEAD_S + 1e-3))
+    assert not any("is stated as" in warning.words for warning in right.warnings)
+    wrong = calibrate(stating(session, 0.0))
+    told = "camera_minus_robot_s is stated as +0.00 ms, but the motion gives +37.2"
     assert any(told in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status == "check"
     assert wrong.clock.stated_s == 0.0
@@ -246,9 +243,8 @@ def quaternions(poses: np.ndarray) -> np.ndarray:
     return np.hstack([poses[:, :3, 3], rotations])
 
 
-@pytest.mark.parametrize("ahead_s", [0.0, 0.2])
-def test_at_rest_the_clocks_do_not_matter(ahead_s):
-    result = calibrate(dwelling(ahead_s))
+def test_at_rest_the_clocks_do_not_matter():
+    result = calibrate(dwelling(0.2))
     assert result.clock.method == "rest"
     assert result.clock.sigma_s is None
     assert any(

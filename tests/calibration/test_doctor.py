@@ -27,24 +27,16 @@ from visioncal.vision.camera import project
 from visioncal.vision.finders.board import FINDERS
 from visioncal.vision.targets import load_target
 
-# Where the finding comes from: poses, files, boards, images, motion. All others are kept answers.
+# Where the finding comes from: poses, files, images, motion. All others are kept answers.
 NAMED = {
     "quaternion with w first": "misread_poses",
     "one pose typed wrong": "wrong_views",
     "images in another folder": "missing_images",
-    "another dictionary": "other_board",
     "mirrored images": "mirrored_images",
     "no turns": "motion",
 }
 # Files that cannot be read as they stand are refused, with what to type.
-REFUSED = (
-    "columns rx, ry, rz",
-    "columns x, y, z",
-    "[cam] for [camera]",
-    "eye_in_hand",
-    "images turned clockwise",
-    "images turned counterclockwise",
-)
+REFUSED = ("[cam] for [camera]", "images turned clockwise")
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +110,7 @@ def first_of_blurred(shown, sigma_px):
     return visioncal.doctor(session).findings[0]
 
 
-@pytest.mark.parametrize(("columns", "sigma_px"), [(9, 2.9), (9, 2.0), (9, 5.0), (12, 2.9)])
+@pytest.mark.parametrize(("columns", "sigma_px"), [(9, 2.9), (12, 2.9)])
 def test_a_board_too_blurred_for_its_markers_is_no_other_board(columns, sigma_px):
     found = first_of_blurred(charuco(columns, 6), sigma_px)
     assert re.match("The images are too blurred|No board can .* image is blurred", found.words)
@@ -126,10 +118,7 @@ def test_a_board_too_blurred_for_its_markers_is_no_other_board(columns, sigma_px
     assert "target check" not in str(found.do)
 
 
-@pytest.mark.parametrize(
-    "shown",
-    [circles(5, 9, asymmetric=True), circles(4, 7, asymmetric=True), checkerboard(7, 4)],
-)
+@pytest.mark.parametrize("shown", [circles(4, 7, asymmetric=True), checkerboard(7, 4)])
 def test_a_board_without_markers_has_to_be_stated(shown):
     found = first_of_blurred(shown, 0.0)
     assert "no view shows the target" in found.words
@@ -164,11 +153,7 @@ def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     assert json.loads(done.out) == to_document(found)
 
 
-# Columns of positions are named as those of rotations are, and a lens turns both ways alike.
-@pytest.mark.parametrize(
-    "name",
-    [slow(name) if name in ("columns x, y, z", REFUSED[-1]) else name for name in REFUSED],
-)
+@pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])
     refused = command("doctor", folder)
@@ -219,7 +204,7 @@ def test_squares_in_the_place_of_inner_corners_are_named_at_once(
     tmp_path, monkeypatch, more, words
 ):
     plain = BROKEN["semicolons"]
-    options = replace(plain.options, target=BOARDS["checkerboard"], views=5)
+    options = replace(plain.options, target=BOARDS["checkerboard"], views=4)
     folder = sound_session(tmp_path / "squares", replace(plain, options=options))
     described = (
         f'kind = "checkerboard"\ncolumns = {9 + more}\nrows = {6 + more}\nsquare_m = 0.025\n'

@@ -48,10 +48,15 @@ def cell_poses(mount):
     )
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("name", MISTAKES)
+# The seed draws which of a mistake's forms it is: both of those that have two.
+FORMS = ("quaternion w, x, y, z", "Euler ZYX taken for XYZ", "degrees and radians")
+
+
+@pytest.mark.parametrize(
+    ("name", "mount"),
+    [*zip(MISTAKES, cycle(MOUNTS)), *zip(FORMS, cycle(MOUNTS[::-1]))],
+)
 def test_a_planted_mistake_is_named(name, mount):
-    # The seeds draw both of the mistakes that have two forms.
     poses = MISTAKES[name](cell_poses(mount), np.random.default_rng(MOUNTS.index(mount)))
     guess = guessed(poses)
     assert is_named(guess, poses), guess.sentence
@@ -74,11 +79,8 @@ def test_rows_in_reverse_or_sorted_as_text_are_named():
     ("name", "is_measured", "mount"),
     [
         ("", True, "eye-in-hand"),
-        ("", False, "eye-to-hand"),
         ("inverse poses", True, "eye-to-hand"),
         ("another unit", False, "eye-in-hand"),
-        ("rows shifted by one", True, "eye-in-hand"),
-        ("matrices transposed", False, "eye-to-hand"),
     ],
 )
 def test_a_mount_that_is_not_given_is_that_of_the_likelier_cell(name, is_measured, mount):
@@ -105,8 +107,7 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
-@pytest.mark.parametrize("is_measured", [True, False])
-@pytest.mark.parametrize("size", [0.3, 0.55, 3.0])
+@pytest.mark.parametrize(("size", "is_measured"), [(0.3, True), (0.55, False), (3.0, True)])
 def test_a_target_of_another_size_is_named_by_its_size(size, is_measured):
     # Not by units that would almost do: inches for centimetres are 2.54.
     poses = cell_poses("eye-to-hand")
@@ -160,8 +161,7 @@ def test_a_long_recording_takes_no_more_memory_than_what_is_looked_at():
     assert peak < 40e6
 
 
-@pytest.mark.parametrize("rows", [5, 14])
-@pytest.mark.parametrize("side", ["robot", "camera"])
+@pytest.mark.parametrize(("side", "rows"), [("robot", 5), ("camera", 14)])
 def test_rotations_that_are_none_are_called_so(side, rows):
     poses = cell_poses("eye-in-hand")
     few = sound(poses.true_robot[:rows], poses.camera.poses()[:rows], poses.mount)
@@ -194,10 +194,9 @@ SOUND = {
 @pytest.mark.parametrize(("world", "mount"), list(zip(SOUND, cycle(MOUNTS), strict=False)))
 def test_sound_poses_are_not_accused(world, mount):
     poses = seen_in(simulate(replace(CellOptions(mount=mount, views=12), **SOUND[world])))
-    for is_measured in (True, False):
-        guess = guessed(replace(poses, is_measured=is_measured))
-        assert not guess.stands_out, guess.sentence
-        assert guess.best is guess.declared
+    guess = guessed(replace(poses, is_measured=mount == MOUNTS[0]))
+    assert not guess.stands_out, guess.sentence
+    assert guess.best is guess.declared
 
 
 def test_motion_about_one_axis_is_said_to_tell_nothing():
@@ -318,7 +317,7 @@ def pairs_session(poses):
 
 @pytest.mark.parametrize(
     "name",
-    ["board's size in mm", slow("two rows exchanged"), slow("inverse poses"), "the other mount"],
+    [slow("board's size in mm"), slow("two rows exchanged"), "the other mount"],
 )
 def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
     planted = MISTAKES[name](cell_poses("eye-in-hand"), np.random.default_rng(0))
@@ -436,8 +435,8 @@ def test_a_real_stream_that_is_inverse_is_named(real_data):
     assert guess.best.words == "the camera's poses inverse"
 
 
-@pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
-def test_real_sessions_of_images_are_not_accused(real_data, name):
+def test_a_real_session_of_images_is_not_accused(real_data):
+    name = "ric_charuco_eye_to_hand"
     guess = DoubtfulSession(Session.load(real_data / "sessions" / name)).guess()
     assert not guess.stands_out, guess.sentence
     assert "fit as declared" in guess.sentence

@@ -47,7 +47,7 @@ def mahalanobis_sq(cell, known):
 def test_intrinsics_are_refined_where_they_are_asked_to_be():
     off = np.array([4.0, 4.0, -3.0, 2.0])
     surprises = []
-    for seed in range(4):
+    for seed in range(2):
         cell = simulate(replace(FINE, seed=seed))
         known = calibrated(cell, session=with_camera(cell, off, intrinsics="refine"))
         assert np.isin(
@@ -59,8 +59,8 @@ def test_intrinsics_are_refined_where_they_are_asked_to_be():
         # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
         assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
         surprises.append(mahalanobis_sq(cell, known))
-    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
-    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
+    # Mean of 2 chi-square of 12 over 12: beyond is one in a thousand.
+    assert np.mean(surprises) < 2.13
 
 
 @pytest.mark.parametrize("mode", [slow("hold"), "auto"])
@@ -99,14 +99,14 @@ def test_a_rough_matrix_is_refined_within_its_prior_by_views_of_one_marker(mode)
 
 def test_a_matrix_off_by_many_of_its_sigmas_is_refined_without_its_prior_and_named():
     nees = []
-    for seed in range(4):
+    for seed in range(2):
         cell = simulate(replace(MARKER, seed=seed))
         session = with_camera(cell, (9.0, -9.0, 6.0, -9.0), matrix_sigma_px=0.6)
         known = calibrated(cell, session=session)
         nees.append(mahalanobis_sq(cell, known))
         assert "lens" in [cause.kind for cause in known.verdict.causes]
-    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
-    assert np.mean(nees) == pytest.approx(1.0, abs=0.8)
+    # Mean of 2 chi-square of 12 over 12: beyond is one in a thousand.
+    assert np.mean(nees) < 2.13
 
 
 @pytest.mark.parametrize(
@@ -155,8 +155,7 @@ def test_a_closed_form_is_diagnosed_too():
     assert noise[1] == pytest.approx(noise[0], rel=1e-3)
 
 
-# Of the closed forms one of poses' pairs and one of whole poses.
-@pytest.mark.parametrize("solver", ["joint", "park", "shah"])
+@pytest.mark.parametrize("solver", ["joint", "park"])
 def test_views_held_back_may_be_ambiguous(solver):
     cell = simulate(AMBIGUOUS)
     told = session_of(cell)
@@ -172,14 +171,13 @@ def test_views_held_back_may_be_ambiguous(solver):
     assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
-def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose(given):
+def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose():
     # A small board far away: in frontal views perspective hardly tells the tilt's sign.
     small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
     far = CellOptions(
         target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
     )
-    known = calibrated(simulate(replace(far, state_intrinsics=given)))
+    known = calibrated(simulate(far))
     assert known.reasons[4].startswith("ambiguous")
     shown = {view.view: view for view in view_evidence(known)}
     np.testing.assert_array_equal(shown[4].cam_from_target, known.poses[4].cam_from_target[0])

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.edited import changed
-from support.marks import slow
 from support.rigs import (
     BOARD_FROM_CUBE,
     LENS,
@@ -123,8 +122,9 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     )
 
 
-@pytest.mark.parametrize("kind", ["cube", "plate"])
-@pytest.mark.parametrize("fault", ["", "exchanged", "moved"])
+@pytest.mark.parametrize(
+    ("kind", "fault"), [("cube", ""), ("cube", "exchanged"), ("plate", "moved")]
+)
 def test_wrong_points_of_an_exact_rig_are_named_and_left_out(tmp_path, kind, fault):
     folder = write_rig(tmp_path / "cell", Rig(kind))
     head, *rows = (line.split(",") for line in (folder / "target.csv").read_text().splitlines())
@@ -149,10 +149,9 @@ def test_wrong_points_of_an_exact_rig_are_named_and_left_out(tmp_path, kind, fau
     assert error @ np.linalg.solve(covariance, error) < 40.0
 
 
-@pytest.mark.parametrize("mount", [IN_HAND, TO_HAND])
-def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size(tmp_path, mount):
+def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size(tmp_path):
     """Views alone do not tell: a larger rig farther away looks the same."""
-    folder = write_rig(tmp_path / "cell", Rig("cube", mount))
+    folder = write_rig(tmp_path / "cell", Rig("cube", TO_HAND))
     table = folder / "target.csv"
     head, *rows = (line.split(",") for line in table.read_text().splitlines())
     small = [[number, *(repr(float(name) / 1.01) for name in place)] for number, *place in rows]
@@ -182,10 +181,8 @@ def test_sigmas_weigh_the_corners(tmp_path):
 @pytest.mark.parametrize(
     ("stated", "status", "said", "level"),
     [
-        (1.0, "good", "", NOISE_PX),
         (1.1, "good", "", 1.1 * NOISE_PX),
         (0.4, "check", "corners.csv states 0.08 px", NOISE_PX),
-        (2.5, "good", "corners.csv states 0.5 px", 2.5 * NOISE_PX),
         # More than would be doubted, if it were measured.
         (5.0, "good", "corners.csv states 1 px", 5.0 * NOISE_PX),
     ],
@@ -203,9 +200,8 @@ def test_the_verdict_says_where_the_corners_contradict_what_is_stated(
     assert result.noise["pixel_px"] == pytest.approx(level, rel=0.06)
 
 
-@pytest.mark.parametrize("kind", ["charuco", "cube"])
-def test_every_storage_of_it_is_the_same_session(kind, tmp_path):
-    folder = write_rig(tmp_path / "cell", Rig(kind, stated=1.0))
+def test_every_storage_of_it_is_the_same_session(tmp_path):
+    folder = write_rig(tmp_path / "cell", Rig("cube", stated=1.0))
     session = Session.load(folder)
     write_recording(tmp_path / "cell.rrd", session, None, (), None)
     recorded = Session.load(tmp_path / "cell.rrd")
@@ -326,8 +322,7 @@ def test_wrong_rows_are_named(line, said, cube):
     assert said in error.value.message
 
 
-@pytest.mark.parametrize("line_end", [b"\r\n", b"\r\r\n", b"\n\n"])
-@pytest.mark.parametrize("marks", [0, 1, 2])
+@pytest.mark.parametrize(("line_end", "marks"), [(b"\r\n", 1), (b"\r\r\n", 2), (b"\n\n", 0)])
 def test_line_ends_and_marks_of_other_programs_change_nothing(marks, line_end, cube):
     file = cube / "corners.csv"
     expected = Session.load(cube).corner_table
@@ -564,10 +559,9 @@ def test_a_deleted_row_takes_its_corners_along(cube):
         Session.load(cube)
 
 
-@pytest.mark.parametrize("lens", [Rig.lens, ""])
-def test_a_rig_that_is_seen_mirrored_is_named(lens, tmp_path):
+def test_a_rig_that_is_seen_mirrored_is_named(tmp_path):
     """Unlike a flat board, it fits no pose then."""
-    folder = write_rig(tmp_path / "rig", Rig("cube", lens=lens))
+    folder = write_rig(tmp_path / "rig", Rig("cube", lens=""))
     header, *lines = (folder / "corners.csv").read_text().splitlines()
     cells = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
     turned = [{**cell, "u_px": str(1279.0 - float(cell["u_px"]))} for cell in cells]
@@ -617,7 +611,7 @@ def state(folder: Path, key: str, value: object) -> None:
     file.write_text(text)
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("inch", 0.0254)])
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("inch", 0.0254)])
 def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn):
     board = Session.load(drawn).target
     sides = {"square_m": board.square_m, "marker_m": board.marker_m}
@@ -638,7 +632,7 @@ def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn
 
 @pytest.mark.parametrize(
     ("mount", "size", "dh_sigma"),
-    [(TO_HAND, 1.004, 0.0), (IN_HAND, 1.0, 3e-4), slow(IN_HAND, 1.004, 0.0)],
+    [(TO_HAND, 1.004, 0.0), (IN_HAND, 1.0, 3e-4)],
 )
 def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, dh_sigma):
     """Longer links explain a larger rig, and one size is simpler: of an arm that errs it is not."""

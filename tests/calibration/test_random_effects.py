@@ -78,28 +78,26 @@ def effects_of(known):
     ids=["tilt", "creep", "bracket", "lens"],
 )
 def test_what_grows_is_named_and_recovered(mount, change, kind, true):
-    named = 0
-    for seed in range(3):
-        known = calibrated(change(simulate(replace(FINE, mount=mount, seed=seed))), joints=False)
-        named += kind in {finding.kind for finding in known.verdict.findings}
-        found = effects_of(known)
-        if kind not in found or true is None:
-            continue
-        values, sigmas = found[kind]
-        # Up to six values of three cells: beyond four sigma once in a thousand.
+    known = calibrated(change(simulate(replace(FINE, mount=mount))), joints=False)
+    assert kind in {finding.kind for finding in known.verdict.findings}
+    assert kind in next(iter(known.assessment.budget_mm.values()))
+    if true is not None:
+        values, sigmas = effects_of(known)[kind]
+        # Up to six values: beyond four sigma once in some thousand.
         assert np.all(np.abs(values - true) < 4.0 * sigmas)
-        assert kind in next(iter(known.assessment.budget_mm.values()))
-    assert named >= 2
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("joints", [True, False])
-@pytest.mark.parametrize("wrong_m", [0.0, 2e-4], ids=["exact arm", "wrong arm"])
+@pytest.mark.parametrize(
+    ("mount", "joints", "wrong_m"),
+    [
+        (MOUNTS[0], True, 0.0),
+        (MOUNTS[1], False, 0.0),
+        (MOUNTS[0], False, 2e-4),
+        slow(MOUNTS[1], False, 2e-4),
+    ],
+)
 def test_nothing_is_named_where_nothing_grows(mount, joints, wrong_m):
-    for seed in range(2):
-        options = {"dh_sigma_m": wrong_m, "dh_sigma_rad": wrong_m}
-        known = calibrated(
-            simulate(replace(FINE, mount=mount, seed=seed, **options)), joints=joints
-        )
-        assert not KINDS & {finding.kind for finding in known.verdict.findings}
-        assert wrong_m or not effects_of(known)
+    options = {"dh_sigma_m": wrong_m, "dh_sigma_rad": wrong_m}
+    known = calibrated(simulate(replace(FINE, mount=mount, **options)), joints=joints)
+    assert not KINDS & {finding.kind for finding in known.verdict.findings}
+    assert wrong_m or not effects_of(known)

@@ -102,9 +102,7 @@ def test_the_simulation_takes_every_row_at_its_own_time():
     assert max(away_px) > 2.0
 
 
-@pytest.mark.parametrize(
-    ("seed", "mount"), [(1, MOUNTS[0]), *(slow(*item) for item in ((1, MOUNTS[1]), (2, MOUNTS[0])))]
-)
+@pytest.mark.parametrize(("seed", "mount"), [(1, MOUNTS[0]), slow(1, MOUNTS[1])])
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     moved = swept(seed, mount=mount)
     known = calibrated_sweep(moved)
@@ -120,9 +118,8 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     assert known.verdict.status == "good"
 
 
-@pytest.mark.parametrize("seed", [3, slow(4)])
-def test_a_global_shutter_is_not_mistaken(seed):
-    known = calibrated_sweep(swept(seed, replace(HURRIED, readout_s=0.0)))
+def test_a_global_shutter_is_not_mistaken():
+    known = calibrated_sweep(swept(3, replace(HURRIED, readout_s=0.0)))
     (found,) = next(iter(known.clocks.values())).clock.delays
     assert not found.is_clear
     shutter = next(iter(known.clocks.values())).clock.result().shutter
@@ -145,8 +142,9 @@ def test_it_is_said_and_written(tmp_path):
     # It is rounded by its sigma, to some hundredths of a millisecond.
     assert float(fact.value.split()[0]) == pytest.approx(readout_ms, abs=0.01)
     # A recording has what was seen, not what was set straight.
-    write_recording(tmp_path / "it.rrd", Session.load(folder), None, (), None)
-    assert calibrate(tmp_path / "it.rrd").clock == result.clock
+    session = Session.load(folder)
+    write_recording(tmp_path / "it.rrd", session, None, (), None)
+    assert Session.load(tmp_path / "it.rrd").digest() == session.digest()
 
 
 def test_poses_that_others_measured_say_nothing_of_rows():

@@ -153,12 +153,15 @@ def printed_anew(cell, change):
     return showing(cell, corners)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("mount", "change", "words"),
     [
-        (np.diag([-5e-4, 5e-4, 0.0]), "longer along its y than along its x, by 0.1 %"),
-        ([[0, 7.5e-4, 0], [7.5e-4, 0, 0], [0, 0, 0]], "rows and columns meet at 89.91"),
+        (MOUNTS[0], np.diag([-5e-4, 5e-4, 0.0]), "longer along its y than along its x, by 0.1 %"),
+        (
+            MOUNTS[1],
+            [[0, 7.5e-4, 0], [7.5e-4, 0, 0], [0, 0, 0]],
+            "rows and columns meet at 89.91",
+        ),
     ],
     ids=["stretched", "sheared"],
 )
@@ -171,9 +174,8 @@ def test_a_board_that_is_printed_askew_is_named_and_costs_nothing(mount, change,
     assert mahalanobis_sq(cell, known) < UNLIKELY
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
-    cell = simulate(replace(FINE, mount=mount, seed=3, board_scale=1.002))
+def test_a_board_within_what_is_stated_is_measured_and_not_accused():
+    cell = simulate(replace(FINE, seed=3, board_scale=1.002))
     known = calibrated(cell)
     (sentence,) = [reason for reason in known.verdict.reasons if "robot's motion" in reason]
     assert "% larger than stated" in sentence
@@ -187,9 +189,8 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     ("joints", "scale", "mount"),
     [
         (True, 0.97, "eye-to-hand"),
-        (True, 1.01, "eye-in-hand"),
         (False, 0.97, "eye-in-hand"),
-        (False, 1.01, "eye-to-hand"),
+        slow(False, 1.01, "eye-to-hand"),
     ],
 )
 def test_a_size_that_is_contradicted_is_dropped_and_no_arm_is_blamed(mount, scale, joints):
@@ -237,9 +238,8 @@ def lens_is_free(known):
     ).any()
 
 
-@pytest.mark.parametrize("options", [FINE, replace(FINE, seed=11)])
-def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt(options):
-    cell = simulate(options)
+def test_right_intrinsics_and_a_flat_board_are_refined_without_a_doubt():
+    cell = simulate(FINE)
     known = with_lens(cell, np.zeros(4), intrinsics="refine")
     assert lens_is_free(known)
     assert known.verdict.status == "good"

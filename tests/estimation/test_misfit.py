@@ -51,50 +51,46 @@ def of_fit(test, result):
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_creeping_base_is_noticed_and_its_way_told(mount):
-    for seed in range(2):
-        cell = simulate(replace(FINE, mount=mount, seed=seed))
-        result, _ = answered(cell)
-        assert of_fit(drift, result) is None
-        moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
-        _, known = answered(moved)
-        kinds = {warning.kind for warning in known.warnings}
-        assert kinds & {"base_creeps", "moved_slowly"}
+    cell = simulate(replace(FINE, mount=mount, seed=0))
+    result, _ = answered(cell)
+    assert of_fit(drift, result) is None
+    moved = with_moving_base(cell, np.array([0, 0, 0, 0.0, 3e-4, 0]))
+    _, known = answered(moved)
+    kinds = {warning.kind for warning in known.warnings}
+    assert kinds & {"base_creeps", "moved_slowly"}
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_bump_is_told_from_a_creep(mount):
-    for seed in (0, 2, 5):
-        cell = simulate(replace(FINE, mount=mount, seed=seed))
-        lifted = np.where(np.arange(20) < 9, 0.0, 1e-3)[:, None] * np.eye(6)[5]
-        moved = reporting(cell, base_from_flange=exp(lifted) @ cell.robot.base_from_flange)
-        _, known = answered(moved)
-        words = [warning.reason for warning in known.warnings if "moved at once" in warning.reason]
-        assert len(words) == 1
-        assert "from view 9 on" in words[0]
-        assert not any("drift with time" in warning.reason for warning in known.warnings)
+    cell = simulate(replace(FINE, mount=mount, seed=0))
+    lifted = np.where(np.arange(20) < 9, 0.0, 1e-3)[:, None] * np.eye(6)[5]
+    moved = reporting(cell, base_from_flange=exp(lifted) @ cell.robot.base_from_flange)
+    _, known = answered(moved)
+    (words,) = [warning.reason for warning in known.warnings if "moved at once" in warning.reason]
+    assert "from view 9 on" in words
+    assert not any("drift with time" in warning.reason for warning in known.warnings)
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_bump_is_in_the_covariance(mount):
     """The answer is between both places, and as far from each as it says."""
     squares = []
-    for seed in range(2):
-        cell = simulate(replace(FINE, mount=mount, seed=seed))
-        on_flange = next(
-            transform for name, transform in cell.transforms.items() if name.startswith("flange")
-        )
-        later = on_flange @ exp(np.array([0.001, 0, 0, 0, 1.6e-3, 1.2e-3]))
-        flange = cell.robot.base_from_flange.copy()
-        flange[10:] = flange[10:] @ on_flange @ invert(later)
-        result, known = answered(reporting(cell, base_from_flange=flange))
-        assert [cause.kind for cause in known.verdict.causes][:1] == ["moved_at_once"]
-        assert not {"weak_motion", "place", "calibration"} & {
-            finding.kind for finding in known.verdict.findings
-        }
-        edge = result.edges["cam" if mount == "eye-in-hand" else "target"]
-        for true in (on_flange, later):
-            away = log(invert(true) @ edge.matrix)
-            squares.append(away @ np.linalg.solve(edge.covariance, away) / 6.0)
+    cell = simulate(replace(FINE, mount=mount, seed=0))
+    on_flange = next(
+        transform for name, transform in cell.transforms.items() if name.startswith("flange")
+    )
+    later = on_flange @ exp(np.array([0.001, 0, 0, 0, 1.6e-3, 1.2e-3]))
+    flange = cell.robot.base_from_flange.copy()
+    flange[10:] = flange[10:] @ on_flange @ invert(later)
+    result, known = answered(reporting(cell, base_from_flange=flange))
+    assert [cause.kind for cause in known.verdict.causes][:1] == ["moved_at_once"]
+    assert not {"weak_motion", "place", "calibration"} & {
+        finding.kind for finding in known.verdict.findings
+    }
+    edge = result.edges["cam" if mount == "eye-in-hand" else "target"]
+    for true in (on_flange, later):
+        away = log(invert(true) @ edge.matrix)
+        squares.append(away @ np.linalg.solve(edge.covariance, away) / 6.0)
     # Without the bump in it, the covariance is a tenth of what it has to be.
     assert np.mean(squares) < 1.5
 
@@ -241,7 +237,7 @@ def test_few_corners_say_nothing_of_a_field():
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
     squared, away, without, named = [], [], [], 0
-    for seed in range(3):
+    for seed in range(2):
         cell = simulate(replace(FINE, mount=mount, seed=seed, robot_sigma_m=1e-5))
         cell = through_a_wavy_lens(cell, 0.25, np.random.default_rng(seed))
         known = calibrated(cell, joints=False)
@@ -251,25 +247,25 @@ def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(refine, "with_sizes", lambda _, fitted: fitted)
             without.append(error_of(cell, calibrated(cell, joints=False))[3:6])
-    # 9 components: a mean squared error over the covariance of 3.1 is one in a thousand.
-    assert np.mean(squared) / 3 < 3.1
+    # 6 components: a mean squared error over the covariance of 3.7 is one in a thousand.
+    assert np.mean(squared) / 3 < 3.7
     # What the field explains is not left to the place: a third of the error without it (0.3).
     assert np.sum(np.square(away)) < 0.25 * np.sum(np.square(without))
     # A field of 2.5 times the noise; a board that fills a part of the image shows a part of it.
-    assert named >= 2
+    assert named >= 1
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_focus_that_follows_the_distance_is_counted_and_named(mount):
     squared, named = [], 0
-    for seed in range(4):
+    for seed in range(2):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         known = calibrated(breathing(cell, 0.01), joints=False)
         squared.append(mahalanobis_sq_of_place(cell, known))
         named += [warning.kind for warning in known.findings.warnings] == ["focus"]
-    # 12 components: 2.8 is one in a thousand. Left out of the model, it is above 100.
-    assert np.mean(squared) / 3 < 2.8
-    assert named == 4
+    # 6 components: 3.7 is one in a thousand. Left out of the model, it is above 100.
+    assert np.mean(squared) / 3 < 3.7
+    assert named == 2
 
 
 # What was done to an image (rows, columns), and what undoes it by the words of the finding.
