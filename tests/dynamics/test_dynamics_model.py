@@ -16,9 +16,6 @@ from visioncal.dynamics import (
     Friction,
     FrictionTerms,
     JointMotion,
-    Measured,
-    MomentumObserver,
-    external_torques,
 )
 from visioncal.robot import (
     Inertias,
@@ -27,7 +24,6 @@ from visioncal.robot import (
     body_regressor,
     joint_torques,
     load_robot,
-    momenta,
     parameters_of,
     pseudo_inertias,
     read_robot_document,
@@ -83,7 +79,9 @@ def test_encoders_may_be_eccentric():
     def energy(t):
         q, dq, _ = course(t)
         speeds = robot.chain.jacobian(q) * dq
-        momentum, _ = momenta(robot, robot.inertias, q, dq)
+        still = np.zeros_like(q)
+        momentum = joint_torques(robot, robot.inertias, q, still, dq)
+        momentum -= joint_torques(robot, robot.inertias, q, still, still)
         frames = robot.link_frames(q[0])[:-1]
         masses = robot.masses
         centres = np.einsum("nij,nj->ni", frames[:, :3, :3], masses.centres_m) + frames[:, :3, 3]
@@ -189,59 +187,6 @@ def test_friction_acts_on_its_own_joint():
     more = stuck.torques(np.full((1, 6), 0.03), np.zeros((1, 6)))
     less = friction.torques(np.full((1, 6), 0.03), np.zeros((1, 6)))
     assert more - less == pytest.approx(0.5 * coulomb[None] * np.exp(-1.0))
-
-
-def test_momentum_changes_by_torques():
-    robot = load_robot("panda")
-    q, dq, ddq = states(robot)
-    torques = joint_torques(robot, robot.inertias, q, dq, ddq)
-    _, rate = momenta(robot, robot.inertias, q, dq)
-    step = 1e-5
-    later, _ = momenta(robot, robot.inertias, q + step * dq + 0.5 * step**2 * ddq, dq + step * ddq)
-    sooner, _ = momenta(robot, robot.inertias, q - step * dq + 0.5 * step**2 * ddq, dq - step * ddq)
-    # A central difference over 1e-5 s of momenta whose third derivatives are some hundreds.
-    assert (later - sooner) / (2.0 * step) == pytest.approx(rate + torques, abs=1e-6)
-
-
-def pushed(gain, push):
-    """An arm that follows a known course while a push sets in after half of it."""
-    robot = load_robot("ur5e")
-    friction = Friction(*np.full((4, 6), 0.4), np.zeros(6), np.ones(6))
-    arm = ArmDynamics(robot, robot.inertias, friction)
-    times = np.arange(0.0, 2.0, 0.002)
-    waves = np.sin(np.outer(times, [1.0, 1.3, 1.7, 2.1, 2.5, 3.0]))
-    jacobian = np.gradient(waves, times, axis=0, edge_order=2)
-    q, dq = 0.5 * waves, 0.5 * jacobian
-    ddq = np.gradient(dq, times, axis=0, edge_order=2)
-    external = np.where(times[:, None] >= 1.0, push, 0.0)
-    measured = Measured(JointMotion(times, q, dq, ddq), arm.torques(q, dq, ddq) - external)
-    return arm, measured, external_torques(arm, measured, gain)
-
-
-def test_the_observer_sees_a_push_and_nothing_else():
-    push = np.array([3.0, -8.0, 0.0, 1.0, 0.0, 0.5])
-    arm, measured, found = pushed(50.0, push)
-    # Friction turns over within 5 mrad/s, and differences stand for derivatives: some 0.01 N m.
-    assert np.abs(found[:499]).max() < 0.05
-    assert found[-1] == pytest.approx(push, abs=0.05)
-    # A first-order filter: 63 % after the inverse of its gain, here 20 ms; Euler's step is 2 ms.
-    assert found[510, 1] / push[1] == pytest.approx(1.0 - np.exp(-1.0), abs=0.03)
-    one = MomentumObserver(arm, 50.0)
-    motion = measured.motion
-    rows = zip(motion.times_s, motion.q, motion.dq, measured.torques_nm, strict=True)
-    streamed = np.array([one.update(*row) for row in rows])
-    assert streamed == pytest.approx(found, abs=ROUNDING)
-
-
-def test_the_observer_needs_a_time_that_goes_on():
-    arm, measured, _ = pushed(25.0, np.zeros(6))
-    observer = MomentumObserver(arm)
-    sample = (measured.motion.q[0], measured.motion.dq[0], measured.torques_nm[0])
-    observer.update(0.1, *sample)
-    with pytest.raises(DataError, match="ascending times"):
-        observer.update(0.1, *sample)
-    with pytest.raises(DataError, match="gain_per_s is 0"):
-        MomentumObserver(arm, 0.0)
 
 
 @pytest.mark.parametrize("name", ["ur10e", "panda"])

@@ -1,6 +1,6 @@
 """Arm dynamics: inverse dynamics, and identification of inertias and friction from torques."""
 
-from visioncal.dynamics.arm import ArmDynamics, MomentumObserver, external_torques
+from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
 from visioncal.dynamics.identified import Identified, judge, stribeck_rows
@@ -31,7 +31,6 @@ __all__ = [
     "Identified",
     "JointMotion",
     "Measured",
-    "MomentumObserver",
     "MotionMargins",
     "Payload",
     "Prediction",
@@ -41,7 +40,6 @@ __all__ = [
     "drive_gains",
     "estimate_payload",
     "excite",
-    "external_torques",
     "friction_at",
     "judge",
     "measured_friction",

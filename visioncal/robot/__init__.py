@@ -41,7 +41,7 @@ from visioncal.robot.loads import (
 )
 from visioncal.robot.model import LINK_KEYS, Robot
 from visioncal.robot.tables import DHTable, table_document, table_from_document
-from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
+from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
 
 __all__ = [
     "FUNCTION_NAMES",
@@ -64,7 +64,6 @@ __all__ = [
     "joint_deflections",
     "joint_torques",
     "load_robot",
-    "momenta",
     "other_convention",
     "parallel_axes",
     "parameter_transform",

@@ -110,32 +110,6 @@ def effective_states(
     return chain.effective(q), jacobian * dq, jacobian * ddq + chain.curvatures(q) * dq**2
 
 
-def momenta(
-    robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Generalised momentum (m, n) [N m s] of an arm, and its rate without joint torques [N m].
-
-    `p = M dq` and `C^T dq - g`, at (m, n) joint angles [rad] and speeds [rad/s]: the derivative of
-    p is the latter plus all torques (De Luca and Mattone 2003, Actuator failure detection and
-    isolation using generalized momenta).
-
-    Raises:
-        DataError: The number of joints differs from the robot's, or first moments have no mass.
-    """
-    import pinocchio as pin
-
-    positions, speeds, _ = effective_states(robot, q, dq, np.zeros_like(q))
-    model = model_with_inertias(robot, inertias)
-    data = model.createData()
-    momentum, rate = np.empty_like(speeds), np.empty_like(speeds)
-    for row, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
-        upper = np.triu(pin.crba(model, data, position))
-        momentum[row] = upper @ speed + np.triu(upper, 1).T @ speed
-        gravity = pin.computeGeneralizedGravity(model, data, position)
-        rate[row] = pin.computeCoriolisMatrix(model, data, position, speed).T @ speed - gravity
-    return momentum, rate
-
-
 def model_with_inertias(robot: Robot, inertias: Inertias) -> "pin.Model":
     """Pinocchio's model of an arm with given inertias.
 
