@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
@@ -26,6 +26,11 @@ class PoseImportOptions:
         """Whether the stated form has quaternions with the scalar first."""
         maker = POSE_FORMS.get(self.form or "")
         return (self.form if maker is None else maker.rotation) == "quaternion-wxyz"
+
+    def over(self, source: Self) -> Self:
+        """These options, and those of the source where they leave the choice to it."""
+        stated = {name: value for name, value in vars(self).items() if value not in ((), None)}
+        return replace(source, **stated)
 
     def applied_to(self, poses: PoseNumbers) -> PoseNumbers:
         """The poses with the user's options in place of the declared reading."""
@@ -81,6 +86,10 @@ class ImportOptions:
     resolution: tuple[int, int] | None = None  # (width, height) [px].
     robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
     tip: str | None = None  # The frame that the poses are of.
+
+    def with_poses(self, robot: PoseImportOptions, camera: PoseImportOptions) -> Self:
+        """These options over what a source states of its poses."""
+        return replace(self, robot=self.robot.over(robot), camera=self.camera.over(camera))
 
 
 @dataclass(frozen=True, eq=False)

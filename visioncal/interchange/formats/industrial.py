@@ -1,28 +1,42 @@
-"""Samples of ROS: industrial_calibration, robot_cal_tools, easy_handeye2 and MoveIt."""
+"""Samples of ROS: industrial_calibration, robot_cal_tools, easy_handeye2 and MoveIt.
+
+Each states what a table of any origin leaves open: the names of its fields, their form and unit.
+"""
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
-from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.documents import as_numbers, mapping, number, read_json
+from visioncal.core.documents import mapping, number
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.file_search import (
-    files_in,
-    head,
-    images_named,
-    number_in,
-    path_inside,
+from visioncal.core.types import Mount
+from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.file_search import files_in, head, number_in, path_inside
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ImportOptions,
+    PoseImportOptions,
 )
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.intrinsics import intrinsics_from
-from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
+from visioncal.interchange.formats.reading import (
+    fields_of_document,
+    fields_of_records,
+    flattened,
+    read_document,
+)
+
+_NONE = PoseImportOptions()
+
+
+def _quaternions(*names: str, inverse: bool | None = None) -> PoseImportOptions:
+    """Positions [m] and quaternions x, y, z, w in some fields."""
+    return PoseImportOptions(names, "quaternion-xyzw", "m", inverse)
 
 
 def _is_easy_handeye(path: Path) -> bool:
@@ -39,42 +53,20 @@ def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording
     # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
     # serves both (easy_handeye2, HandeyeSampler); the file itself does not say which it is.
     document = mapping(read_yaml(path), str(path))
-    samples = _rows(document.get("samples"), f"{path}: samples")
-    robot, camera, places = [], [], []
-    for at, sample in enumerate(samples):
-        where = f"{path.name}: sample {at}"
-        entry = mapping(sample, where)
-        robot.append(_transform(entry.get("robot"), f"{where}: robot"))
-        camera.append(_transform(entry.get("tracking", entry.get("optical")), f"{where}: tracking"))
-        places.append(where)
+    fields = fields_of_document(document.get("samples"), path)
+    seen = "tracking" if "tracking.translation" in fields.numbers else "optical"
     inverse = requested.mount == "eye-to-hand"
-    poses = requested.robot.applied_to(_numbers(robot, places, inverse=inverse))
+    requested = requested.with_poses(
+        _quaternions("robot.translation", "robot.rotation", inverse=inverse),
+        _quaternions(f"{seen}.translation", f"{seen}.rotation"),
+    )
     note = (
         "inverted, as easy_handeye2 stores them with the camera on the base"
-        if poses.reading.inverse
+        if requested.robot.inverse
         else "as they stand, as with the camera in the hand"
     )
-    return ForeignRecording(
-        name=path.stem,
-        robot=poses,
-        camera=requested.camera.applied_to(_numbers(camera, places, inverse=False)),
-        notes=(f"The robot's poses are read {note}.",),
-    )
-
-
-def _transform(value: object, where: str) -> list[float]:
-    content = mapping(value, where)
-    position = mapping(content.get("translation"), f"{where}: translation")
-    rotation = mapping(content.get("rotation"), f"{where}: rotation")
-    return [
-        *(number(position.get(name), f"{where}: translation: {name}") for name in "xyz"),
-        *(number(rotation.get(name), f"{where}: rotation: {name}") for name in "xyzw"),
-    ]
-
-
-def _numbers(rows: list[list[float]], places: list[str], *, inverse: bool) -> PoseNumbers:
-    numbers = np.array(rows)
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(inverse=inverse), tuple(places))
+    foreign = foreign_from(fields, requested)
+    return replace(foreign, notes=(*foreign.notes, f"The robot's poses are read {note}."))
 
 
 def _is_moveit(path: Path) -> bool:
@@ -89,29 +81,14 @@ def _is_moveit(path: Path) -> bool:
 def _read_moveit(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices."""
     # A list of mappings, as its panel saves them, or of pairs, as its tests have them.
-    document = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
-    robot, camera, places = [], [], []
-    for at, sample in enumerate(_rows(document, str(path))):
-        where = f"{path.name}: sample {at}"
-        if isinstance(sample, list) and len(sample) == 2:
-            first, second = sample
-        else:
-            entry = mapping(sample, where)
-            first, second = entry.get("effector_wrt_world"), entry.get("object_wrt_sensor")
-        robot.append(as_matrix(first, f"{where}: effector_wrt_world"))
-        camera.append(as_matrix(second, f"{where}: object_wrt_sensor"))
-        places.append(where)
-    return ForeignRecording(
-        name=path.stem,
-        robot=requested.robot.applied_to(matrix_numbers(np.array(robot), places)),
-        camera=requested.camera.applied_to(matrix_numbers(np.array(camera), places)),
-    )
-
-
-def _rows(value: object, where: str) -> list[object]:
-    if not isinstance(value, list) or not value:
-        raise DataError(f"{where} is no list of samples.", culprits=[where])
-    return value
+    document, names = read_document(path), ("effector_wrt_world", "object_wrt_sensor")
+    if isinstance(document, list):
+        document = [
+            dict(zip(names, sample, strict=False)) if isinstance(sample, list) else sample
+            for sample in document
+        ]
+    robot, camera = (PoseImportOptions((name,), unit="m") for name in names)
+    return foreign_from(fields_of_document(document, path), requested.with_poses(robot, camera))
 
 
 EASY_HANDEYE = ForeignFormat(
@@ -148,23 +125,27 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
     rows = document.get("data")
     if not isinstance(rows, list) or not rows:
         raise DataError(f"{file}: data holds no rows of pose and image.", culprits=[str(file)])
-    names, poses, places = [], [], []
+    records, places = [], []
     for at, row in enumerate(rows):
         entry = mapping(row, f"{file}: data, row {at}")
         name = entry.get("pose")
         if not isinstance(name, str):
             raise DataError(f"{file}: data, row {at} names no pose.", culprits=[str(file)])
         stored = path_inside(file.parent, name)
-        poses.append(_pose_numbers(read_yaml(stored), str(stored)))
+        image = str(entry.get("image") or "")
+        records.append({**flattened(mapping(read_yaml(stored), str(stored))), "image": image})
         places.append(name)
-        names.append(str(entry["image"]) if entry.get("image") else None)
-    numbers = np.array(poses)
     static = document.get("static_camera")
     if not isinstance(static, bool | None):
         raise DataError(
             f"{file}: static_camera is {static!r}; true or false is needed.", culprits=[str(file)]
         )
-    notes: list[str] = []
+    views = tuple(index for name in places if (index := number_in(name)) is not None)
+    views = views if len(set(views)) == len(places) else ()
+    fields = fields_of_records(records, places, file.parent.name, file.parent, views)
+    requested = replace(requested, image=requested.image or "image")
+    foreign = foreign_from(fields, requested.with_poses(_quaternions(*_POSE), _NONE))
+    notes = [*foreign.notes]
     # The user's options replace what the source states.
     lens = None
     if "intrinsics" in document and not requested.intrinsics:
@@ -174,26 +155,9 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
             "--intrinsics estimate leaves them out."
         )
     target = None if requested.target else _target(document, notes)
-    numbered = [number_in(place) for place in places]
-    views = tuple(index for index in numbered if index is not None)
-    return ForeignRecording(
-        name=file.parent.name,
-        robot=requested.robot.applied_to(
-            PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places))
-        ),
-        images=images_named(names, file.parent, requested.images),
-        mount=None if static is None else "eye-to-hand" if static else "eye-in-hand",
-        target=target,
-        lens=lens,
-        views=views if len(set(views)) == len(places) else (),
-        notes=tuple(notes),
-    )
-
-
-def _pose_numbers(value: object, where: str) -> list[float]:
-    """Reads x, y, z, qx, qy, qz, qw [m]."""
-    content = mapping(value, where)
-    return [number(content.get(name), f"{where}: {name}") for name in _POSE]
+    mount: Mount = "eye-to-hand" if static else "eye-in-hand"
+    mounted = replace(foreign, mount=None if static is None else mount)
+    return replace(mounted, target=target, lens=lens, notes=tuple(notes))
 
 
 def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | None:
@@ -236,31 +200,21 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads kinematic measurements: cam_from_target with the joints of either chain."""
     file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
     document = mapping(read_yaml(file), str(file))
-    poses = []
-    joints: dict[str, list[FloatArray]] = {"camera_joints": [], "target_joints": []}
-    for name, row in document.items():
-        entry = mapping(row, f"{file}: {name}")
-        poses.append(_pose_numbers(entry.get("pose"), f"{file}: {name}: pose"))
-        for chain, values in joints.items():
-            values.append(as_numbers(entry.get(chain, []), f"{file}: {name}: {chain}").reshape(-1))
-    moving = [name for name, values in joints.items() if any(len(row) for row in values)]
-    counts = {len(row) for name in moving for row in joints[name]}
-    if len(moving) != 1 or len(counts) != 1:
+    fields = fields_of_document(document, file)
+    chains = ("camera_joints", "target_joints")
+    moving = [name for name in chains if name in fields.numbers and fields.numbers[name].size]
+    if len(moving) != 1:
         raise DataError(
-            f"{file}: {' and '.join(moving) or 'no chain'} with {sorted(counts)} joints; one chain "
-            "with the same joints in every row is needed.",
+            f"{file}: {' and '.join(moving) or 'no chain'} with joints; one chain with the same "
+            "joints in every row is needed.",
             culprits=[str(file)],
         )
-    numbers = np.array(poses)
-    places = tuple(f"{file.name}: {name}" for name in document)
-    camera = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
-    return ForeignRecording(
-        name=file.stem,
-        robot=PoseNumbers.empty(places),
-        camera=requested.camera.applied_to(camera),
-        joints_rad=np.array(joints[moving[0]]),
+    requested = replace(requested, joints=requested.joints or tuple(moving))
+    camera = _quaternions(*(f"pose.{name}" for name in _POSE))
+    return replace(
+        foreign_from(fields, requested.with_poses(_NONE, camera)),
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
-        columns={"source_row": tuple(str(name) for name in document)},
+        columns={"source_row": tuple(map(str, document))},
     )
 
 

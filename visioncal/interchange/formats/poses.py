@@ -9,7 +9,6 @@ import numpy as np
 
 from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
-from visioncal.core.documents import as_numbers
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.foreign import PoseImportOptions
@@ -370,27 +369,6 @@ def check_radians(
             "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
             + ("; or let --guess find it." if guesses else ""),
         )
-
-
-def as_matrix(value: object, where: str) -> FloatArray:
-    """Reads the 16 numbers of a (4, 4) matrix.
-
-    Raises:
-        DataError: Their number is another, or they are not finite.
-    """
-    numbers = as_numbers(value, where)
-    if numbers.size != 16 or not np.isfinite(numbers).all():
-        raise DataError(
-            f"{where} has {numbers.size} numbers; the 16 finite ones of a matrix are needed.",
-            culprits=[where],
-        )
-    return numbers.reshape(4, 4)
-
-
-def matrix_numbers(matrices: FloatArray, places: Sequence[str], *, unit: str = "m") -> PoseNumbers:
-    """Poses of (n, 4, 4) matrices."""
-    flat = matrices.reshape(len(matrices), 16)
-    return PoseNumbers(*_matrices(flat), Reading("matrix", unit), tuple(places))
 
 
 def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:

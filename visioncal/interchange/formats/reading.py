@@ -384,7 +384,7 @@ def read_fields(path: Path) -> Fields:
     if suffix == ".npy":
         return fields_of_arrays({"value": read_npy(path)}, path)
     if suffix in DOCUMENTS:
-        return _fields_of_document(read_document(path), path)
+        return fields_of_document(read_document(path), path)
     if suffix in _PROGRAMS:
         return _program(path)
     lines = _pendant(path) or _echoed(path) or _printed(path)
@@ -411,8 +411,12 @@ def read_document(path: Path) -> object:
     return read_opencv(path) if path.suffix.lower() == ".xml" else read_yaml(path)
 
 
-def _fields_of_document(document: object, path: Path) -> Fields:
-    """Rows from a list of records, the longest such lists in a mapping, or a mapping of lists."""
+def fields_of_document(document: object, path: Path) -> Fields:
+    """Rows from a list of records, the longest such lists in a mapping, or a mapping of lists.
+
+    Raises:
+        DataError: It holds no rows.
+    """
     # Names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
     if isinstance(document, Mapping):
         numbered = _numbered(document)

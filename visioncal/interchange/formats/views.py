@@ -6,14 +6,14 @@ a camera XML; and Zivid's YAML with 4 x 4 matrices [mm].
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, is_number, mapping, read_table
 from visioncal.core.documents.jsons import read_npy, read_npz
 from visioncal.core.documents.structured import read_yaml
@@ -25,14 +25,17 @@ from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.file_search import (
     files_in,
     head,
-    images_beside,
     is_image_name,
     number_in,
     series_name,
 )
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ImportOptions,
+    PoseImportOptions,
+)
 from visioncal.interchange.formats.intrinsics import read_intrinsics
-from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 from visioncal.interchange.formats.reading import (
     DOCUMENTS,
     ENDINGS,
@@ -60,24 +63,19 @@ def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
     files = _zivid_files(path)
     if not files:
         raise DataError(f"{path} has no files like pos01.yaml.", culprits=[str(path)])
-    matrices = []
+    records = []
     for file in files:
         content = mapping(read_yaml(file), str(file))
-        value = content.get("PoseState")
-        if value is None:
-            value = mapping(content.get("FloatMatrix"), f"{file}: FloatMatrix").get("Data")
-        matrices.append(as_matrix(value, f"{file}: Data"))
-    numbers = [number_in(file.name) for file in files]
-    views = tuple(number for number in numbers if number is not None)
-    places = tuple(file.name for file in files)
-    images, notes = images_beside(path, requested.images, views, places, numbered=True)
-    return ForeignRecording(
-        name=path.resolve().name,
-        robot=requested.robot.applied_to(matrix_numbers(np.array(matrices), places, unit="mm")),
-        images=images,
-        views=views,
-        notes=notes,
+        stated = content.get("PoseState", content.get("FloatMatrix"))
+        records.append(
+            flattened({"matrix": stated.get("Data") if isinstance(stated, dict) else stated})
+        )
+    views = tuple(number_in(file.name) or 0 for file in files)
+    fields = fields_of_records(
+        records, [file.name for file in files], path.resolve().name, path, views
     )
+    stated = PoseImportOptions(("matrix",), unit="mm")
+    return foreign_from(fields, requested.with_poses(stated, PoseImportOptions()), images=path)
 
 
 ZIVID = ForeignFormat(
@@ -96,52 +94,43 @@ def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, .
 
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
-    # Poses of the object in the camera are used only where there are no images.
     files = _pose_files(path)
     if not files:
         raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
     views = tuple(number_in(file.name) or 0 for file in files)
-    places = tuple(file.name for file in files)
-    notes: list[str] = []
-    images, image_notes = images_beside(path, requested.images, views, places, numbered=True)
-    camera_files = (
-        {}
-        if any(images)
-        else {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
+    cameras = {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
+    records = [
+        {
+            name: as_numbers(mapping(read_yaml(at), str(at)).get("data"), f"{at}: data").reshape(-1)
+            for name, at in (("robot", file), ("camera", cameras.get(view)))
+            if at is not None
+        }
+        for view, file in zip(views, files, strict=True)
+    ]
+    fields = fields_of_records(
+        records, [file.name for file in files], path.resolve().name, path, views
     )
-    camera = requested.camera.applied_to(_poses([camera_files.get(view) for view in views], places))
-    cameras = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
-    lens, lens_notes = read_intrinsics(cameras[0]) if cameras else (None, ())
-    stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
-    if stated is not None:
-        notes.append(f"The mount is taken from the folder's name: {stated}.")
-    return ForeignRecording(
-        name=path.resolve().name,
-        robot=requested.robot.applied_to(_poses(files, places)),
-        camera=camera if camera_files else None,
-        images=images,
-        mount=stated,
-        target=None if requested.target else _target(path, notes),
+    robot, camera = (
+        PoseImportOptions((name,), "rotation-vector", "m") for name in ("robot", "camera")
+    )
+    stated = requested.with_poses(robot, camera if cameras else PoseImportOptions())
+    foreign = foreign_from(fields, stated, images=path)
+    notes = [*foreign.notes]
+    lenses = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
+    lens, lens_notes = read_intrinsics(lenses[0]) if lenses else (None, ())
+    mount = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
+    if mount is not None:
+        notes.append(f"The mount is taken from the folder's name: {mount}.")
+    target = None if requested.target else _target(path, notes)
+    return replace(
+        foreign,
+        # Poses of the object in the camera are used only where there are no images.
+        camera=None if any(foreign.images) else foreign.camera,
+        mount=mount,
+        target=target,
         lens=lens,
-        views=views,
-        notes=(*notes, *lens_notes, *image_notes),
+        notes=(*notes, *lens_notes),
     )
-
-
-def _poses(files: Sequence[Path | None], places: tuple[str, ...]) -> PoseNumbers:
-    numbers = np.full((len(files), 6), np.nan)
-    for at, file in enumerate(files):
-        if file is None:
-            continue
-        content = mapping(read_yaml(file), str(file))
-        flat = as_numbers(content.get("data"), f"{file}: data").reshape(-1)
-        if len(flat) != 6 or not np.isfinite(flat).all():
-            raise DataError(
-                f"{file}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
-                culprits=[str(file)],
-            )
-        numbers[at] = flat
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading("rotation-vector"), places)
 
 
 def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
