@@ -6,8 +6,8 @@ import numpy as np
 import pypdfium2
 
 from visioncal.core.types import Image, Target
-from visioncal.vision.printing import Sheet, arrange, pages_named
 from visioncal.vision.printing.drawing import to_pdf
+from visioncal.vision.printing.page import Sheet, arrange, pages_named
 
 MM_PER_INCH = 25.4
 

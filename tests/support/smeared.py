@@ -25,8 +25,8 @@ def smeared(cell: SimulatedCell, *, disc_px: float = 0.0, motion_px: float = 0.0
             its own.
     """
     scene, session, files = prepare_scene(cell), session_of(cell), {}
-    for at, (pose, joints) in enumerate(zip(cell.cam_from_target, cell.robot.joints, strict=True)):
-        light = light_on(scene, pose, joints, samples=SAMPLES)
+    for at, pose in enumerate(cell.cam_from_target):
+        light = light_on(scene, pose, samples=SAMPLES)
         rng = np.random.default_rng([cell.options.seed, at])
         along = rng.uniform(0, np.pi)
         half = 0.5 * motion_px * np.array([np.cos(along), np.sin(along)])

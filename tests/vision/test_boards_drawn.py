@@ -10,7 +10,7 @@ from visioncal.present.recording.board import picture
 from visioncal.simulation.textures import draw_sheet
 from visioncal.vision.finders import NotFound
 from visioncal.vision.finders.charuco import find_charuco
-from visioncal.vision.printing import draw_pattern
+from visioncal.vision.printing.pattern import draw_pattern
 from visioncal.vision.targets import corner_positions, marker_cells, target_from_document
 
 DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))

@@ -18,14 +18,9 @@ from visioncal.core.files import check_free, write_atomically
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.finders.identify_text import describe, to_document, to_toml
 from visioncal.vision.finders.imaging import read_image
-from visioncal.vision.printing import (
-    BoardRequest,
-    arrange,
-    pages_named,
-    requested_target,
-    side_metres,
-    write_board,
-)
+from visioncal.vision.printing.files import write_board
+from visioncal.vision.printing.page import arrange, pages_named
+from visioncal.vision.printing.request import BoardRequest, requested_target, side_metres
 from visioncal.vision.targets import (
     load_target,
     target_document,

@@ -1,7 +1,7 @@
 """A synthetic robot cell with an independent forward model, which provides ground truth.
 
-Nothing here uses the application's camera, robot, targets, solvers or estimator, so that an error
-in a projection or in a kinematic chain cannot cancel out.
+Boards are drawn as they are printed. Nothing here uses the application's camera, robot, solvers or
+estimator, so that an error in a projection or in a kinematic chain cannot cancel out.
 """
 
 from visioncal.simulation.arms import ArmOptions, DhArm, Heat, Payload, arm_named, forward, ur_arm

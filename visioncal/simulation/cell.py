@@ -5,13 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream, frame_name
 from visioncal.simulation.arms import DhArm, Payload
 from visioncal.simulation.layout import (
-    CELL,
     BoardAt,
     CameraAt,
     CellOptions,
@@ -174,18 +172,6 @@ class SimulatedCell:
     def board(self, name: str = "") -> BoardAt:
         """The board of that name, or the single one."""
         return next(board for board in self.layout.boards if board.name == name)
-
-    def between(self, first: str, second: str) -> FloatArray:
-        """(4, 4) `first_from_second` of two frames that no robot moves."""
-        return invert(self._in_cell(first)) @ self._in_cell(second)
-
-    def _in_cell(self, frame: str) -> FloatArray:
-        root = "base" if "base" in self.parents.values() else CELL
-        if frame == root:
-            return np.eye(4)
-        if self.parents.get(frame) != root:
-            raise DataError(f"simulation: {frame} does not stand in the cell.")
-        return self.mountings[frame]
 
     def robot_of(self, frame: str) -> str | None:
         """Robot that carries a camera, board or point; None for none."""

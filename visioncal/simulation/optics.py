@@ -1,17 +1,21 @@
-"""Simulated optics: projection and its inverse, independent of the application.
+"""Simulated optics: projection and its inverse by OpenCV, independent of the application.
 
 Models: Brown (1971) with OpenCV's rational radial term, and the equidistant fisheye polynomial of
-Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres are at integers.
+Kannala and Brandt (2006). Pixel centres are at integers.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray
+
+# Of the iterations that invert a distortion.
+_EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
 def wide_camera() -> Camera:
@@ -81,27 +85,29 @@ def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
     Raises:
         DataError: The number of coefficients does not fit the camera's model.
     """
-    x, y, z = np.moveaxis(np.asarray(points_cam, dtype=float), -1, 0)
-    if camera.model == "fisheye":
-        radius = np.hypot(x, y)
-        distorted = _fisheye_radius(_coefficients(camera), np.arctan2(radius, z))
-        scale = distorted / np.where(radius > 0.0, radius, 1.0)
-        return _to_pixels(camera, x * scale, y * scale)
-    return _to_pixels(camera, *_brown(_coefficients(camera), x / z, y / z))
+    points = np.ascontiguousarray(points_cam, dtype=float)
+    if not points.size:
+        return np.zeros((*points.shape[:-1], 2))
+    module = cv2.fisheye if camera.model == "fisheye" else cv2
+    zero = np.zeros(3)
+    px, _ = module.projectPoints(points.reshape(-1, 1, 3), zero, zero, *_parameters(camera))
+    return np.asarray(px.reshape(*points.shape[:-1], 2))
 
 
 def rays(camera: Camera, px: FloatArray) -> FloatArray:
     """(..., 3) unit vectors in the camera frame, from (..., 2) pixels.
 
-    Newton's method on the distortion. Outside the region where the distortion is monotonic, which
-    contains the image of any real lens, the directions are meaningless.
+    Outside the region where the distortion is monotonic, which contains the image of any real lens,
+    the directions are meaningless.
     """
-    fx, fy, cx, cy = camera.matrix
-    x_bent, y_bent = (px[..., 0] - cx) / fx, (px[..., 1] - cy) / fy
+    flat = np.ascontiguousarray(px, dtype=float).reshape(-1, 1, 2)
     if camera.model == "fisheye":
-        return _fisheye_rays(_coefficients(camera), x_bent, y_bent)
-    x, y = _undo_brown(_coefficients(camera), x_bent, y_bent)
-    directions = np.stack([x, y, np.ones_like(x)], axis=-1)
+        plane = cv2.fisheye.undistortPoints(flat, *_parameters(camera), criteria=_EXACT)
+    else:
+        one = np.eye(3)
+        plane = cv2.undistortPointsIter(flat, *_parameters(camera), one, one, _EXACT)
+    directions = np.pad(plane.reshape(*px.shape), (*[(0, 0)] * (px.ndim - 1), (0, 1)))
+    directions[..., 2] = 1.0
     return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
 
@@ -126,72 +132,14 @@ def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArra
     return seen
 
 
-def _to_pixels(camera: Camera, x: FloatArray, y: FloatArray) -> FloatArray:
-    fx, fy, cx, cy = camera.matrix
-    return np.stack([fx * x + cx, fy * y + cy], axis=-1)
-
-
-def _coefficients(camera: Camera) -> FloatArray:
-    """The 8 Brown coefficients (missing ones zero), or the 4 fisheye coefficients."""
-    given = np.asarray(camera.distortion, dtype=float).ravel()
-    allowed = (4,) if camera.model == "fisheye" else (5, 8)
-    if given.size not in allowed:
+def _parameters(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Camera matrix (3, 3) and distortion coefficients, as OpenCV takes them."""
+    count, allowed = camera.distortion.size, (4,) if camera.model == "fisheye" else (5, 8)
+    if count not in allowed:
         raise DataError(
-            f"simulation: a {camera.model} camera has {given.size} distortion coefficients, "
+            f"simulation: a {camera.model} camera has {count} distortion coefficients, "
             f"{' or '.join(map(str, allowed))} are needed."
         )
-    return given if camera.model == "fisheye" else np.pad(given, (0, 8 - given.size))
-
-
-def _brown(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
-    r2 = x * x + y * y
-    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    x_bent = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    y_bent = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return x_bent, y_bent
-
-
-def _undo_brown(
-    coefficients: FloatArray, x_bent: FloatArray, y_bent: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    x, y = x_bent.copy(), y_bent.copy()
-    h = 1e-6
-    for _ in range(20):
-        distorted_x, distorted_y = _brown(coefficients, x, y)
-        error_x, error_y = x_bent - distorted_x, y_bent - distorted_y
-        right_x, right_y = _brown(coefficients, x + h, y)
-        down_x, down_y = _brown(coefficients, x, y + h)
-        a, b = (right_x - distorted_x) / h, (down_x - distorted_x) / h
-        c, d = (right_y - distorted_y) / h, (down_y - distorted_y) / h
-        determinant = a * d - b * c
-        # Limited steps, against divergence at the rim of strong distortion.
-        step_x = np.clip((d * error_x - b * error_y) / determinant, -0.3, 0.3)
-        step_y = np.clip((a * error_y - c * error_x) / determinant, -0.3, 0.3)
-        x, y = x + step_x, y + step_y
-        if max(np.abs(step_x).max(), np.abs(step_y).max()) < 1e-14:
-            break
-    return x, y
-
-
-def _fisheye_radius(coefficients: FloatArray, angle: FloatArray) -> FloatArray:
-    k1, k2, k3, k4 = coefficients
-    a2 = angle * angle
-    return np.asarray(angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))))
-
-
-def _fisheye_rays(coefficients: FloatArray, x_bent: FloatArray, y_bent: FloatArray) -> FloatArray:
-    radius = np.hypot(x_bent, y_bent)
-    factors = coefficients * np.array([3.0, 5.0, 7.0, 9.0])
-    angle = radius.copy()
-    for _ in range(20):
-        a2 = angle * angle
-        derivative = 1.0 + a2 * (
-            factors[0] + a2 * (factors[1] + a2 * (factors[2] + a2 * factors[3]))
-        )
-        step = np.clip((radius - _fisheye_radius(coefficients, angle)) / derivative, -0.3, 0.3)
-        angle = angle + step
-        if np.abs(step).max() < 1e-14:
-            break
-    scale = np.sin(angle) / np.where(radius > 0.0, radius, 1.0)
-    return np.stack([x_bent * scale, y_bent * scale, np.cos(angle)], axis=-1)
+    fx, fy, cx, cy = camera.matrix
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return matrix, np.asarray(camera.distortion, dtype=float)

@@ -14,9 +14,9 @@ from visioncal.simulation.boards import (
     corners_m,
     detectable_in_part,
     outline_m,
-    pattern_box,
 )
 from visioncal.simulation.optics import rays, sees
+from visioncal.vision.targets import extent_m
 
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
@@ -103,9 +103,9 @@ def looking_at(point: FloatArray, away: FloatArray, distance_m: float) -> FloatA
 
 def filling_m(camera: Camera, board: Sheet) -> tuple[float, float]:
     """Smallest and largest distance at which a board fills a camera's image well [m]."""
-    left, top, right, bottom = pattern_box(board.target)
+    low, high = extent_m(board.target)
     focal, short_side = float(camera.matrix[0]), min(camera.resolution)
-    full = focal * float(np.hypot(right - left, bottom - top)) / short_side
+    full = focal * float(np.hypot(*(high - low))) / short_side
     return full / 1.15, full / 0.7
 
 

@@ -1,39 +1,38 @@
 """Rendering of a simulated board: one ray per sub-pixel, through the lens onto the sheet.
 
-An arm that holds a board before a fixed camera is drawn as shaded tubes. Rays are traced at the
-knots of a grid: over a hundredth of a radian perspective and distortion are so smooth that a cubic
-spline through them is accurate to far below a thousandth of a pixel, at a fraction of the cost.
-`LiveView` takes images while the arm stands or moves.
+Rays are traced at the knots of a grid: over a hundredth of a radian perspective and distortion are
+so smooth that a cubic spline through them is accurate to far below a thousandth of a pixel, at a
+fraction of the cost. `LiveView` takes images while the arm stands or moves.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import compose, invert, rotation_angle
-from visioncal.core.types import Camera, FloatArray, Image, IntArray
+from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.session import frame_name
-from visioncal.simulation.arms import DhArm, forward, link_frames, reach_m
+from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import Sheet, bow_depth_m, centre_m, corners_m, outline_m, unit_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
 from visioncal.simulation.layout import CameraOptions, RandomStream
 from visioncal.simulation.optics import project, rays, sees
-from visioncal.simulation.textures import SheetTexture, draw_sheet, draw_table, draw_wall, margin_m
-
-Float32Array: TypeAlias = npt.NDArray[np.float32]
+from visioncal.simulation.textures import (
+    Float32Array,
+    SheetTexture,
+    draw_backdrop,
+    draw_sheet,
+    margin_m,
+)
 
 # Distance of knots [rad].
 _KNOT_RAD = 0.01
-# Number of overlapping cubic splines.
-_TAPS = 4
 # Sub-pixels along a pixel's side.
 _SAMPLES = 3
 # Rows of pixels that are processed at a time, to stay in the processor's cache.
@@ -41,17 +40,11 @@ _BAND_PX = 48
 _BLACK_LEVEL, _FLOOR = 4.0, 118.0
 # Cosine of an angle beyond every lens's field of view: 84 degrees.
 _LEAST_COSINE = 0.1
-# Parts closer to the camera's plane are not drawn [m].
-_NEAREST_M = 0.15
-_SHADES = 18
 # Image shift below the accuracy of corner detection [px].
 _STILL_PX = 0.003
-# Shorter motion blur is averaged from exact images, as it may count as standstill; longer blur from
-# shifted ones.
-_SHORT_PX = 2.0
-_MOST_PARTS = 24
-# Substitute for the distance of a board that is not in front of the camera [m].
-_FAR_M = 1.0
+# Most moments of an exposure whose images make up its motion blur, and up to which blur they are as
+# fine as at rest [px]: shorter blur may count as standstill.
+_MOST_PARTS, _SHORT_PX = 8, 2.0
 
 
 @dataclass(frozen=True)
@@ -70,30 +63,20 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class _Spline:
-    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any point."""
-
-    coefficients: FloatArray  # (k, k) operator from values at the knots to spline coefficients.
-    first: IntArray  # (n,) first of the four splines at each sub-pixel.
-    weights: Float32Array  # (n, 4) values of the four splines there.
-
-
-@dataclass(frozen=True, eq=False)
 class Raster:
     """Rays at the knots of a grid over a patch, and their interpolation to sub-pixels."""
 
     px: FloatArray  # (a, b, 2) knots [px].
     directions: FloatArray  # (a, b, 3) unit vectors in the camera frame.
-    down: _Spline  # Splines along columns of pixels.
-    across: _Spline  # Splines along rows of pixels.
+    down: Float32Array  # (rows, a) cubic spline through the knots, at the rows of sub-pixels.
+    across: Float32Array  # (columns, b) the same at their columns.
 
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Values of a grid at all sub-pixel columns, as spline coefficients along the columns."""
-
-    mean: np.float32  # Mean of the values, subtracted to preserve single precision.
-    coefficients: Float32Array  # (a, columns).
+    def between(self, values: FloatArray) -> Float32Array:
+        """Interpolates values (a, b) at the knots to (rows, columns) values at the sub-pixels."""
+        # Without their mean they keep more digits in single precision.
+        mean = values.mean()
+        varying = (values - mean).astype(np.float32)
+        return np.asarray(self.down @ (varying @ self.across.T) + np.float32(mean))
 
 
 def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
@@ -105,45 +88,14 @@ def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
     return Raster(px, rays(camera, px), down, across)
 
 
-def between(raster: Raster, values: FloatArray) -> Float32Array:
-    """Interpolates values (a, b) at the knots to (rows, columns) values at the sub-pixels."""
-    return between_rows(raster, columns_of(raster, values), slice(0, len(raster.down.first)))
-
-
-def columns_of(raster: Raster, values: FloatArray) -> Columns:
-    """Interpolates values (a, b) at the knots along the rows of knots."""
-    mean = values.mean()
-    across = raster.across
-    coefficients = raster.down.coefficients @ (values - mean) @ across.coefficients.T
-    taps = [coefficients.astype(np.float32)[:, across.first + index] for index in range(_TAPS)]
-    return Columns(np.float32(mean), np.einsum("tac,ct->ac", taps, across.weights))
-
-
-def between_rows(raster: Raster, columns: Columns, rows: slice) -> Float32Array:
-    """Interpolates along columns: (rows, columns) values at some sub-pixel rows."""
-    first, weights = raster.down.first[rows], raster.down.weights[rows]
-    values = np.empty((len(first), columns.coefficients.shape[1]), np.float32)
-    starts = np.flatnonzero(np.diff(first, prepend=-1)).tolist()
-    for start, end in zip(starts, [*starts[1:], len(first)], strict=True):
-        four = columns.coefficients[first[start] : first[start] + _TAPS]
-        np.matmul(weights[start:end], four, out=values[start:end])
-    values += columns.mean
-    return values
-
-
-def _spline(first: int, end: int, knot_px: float, samples: int) -> tuple[FloatArray, _Spline]:
-    """Knots over pixels first ... end - 1, and the splines on them."""
+def _spline(first: int, end: int, knot_px: float, samples: int) -> tuple[FloatArray, Float32Array]:
+    """(k,) knots over pixels first ... end - 1, and (n, k) weights of them at sub-pixels."""
     count = max(int((end - first) / knot_px), 3) + 1
     knots = np.linspace(first - 0.5, end - 0.5, count)
     # Pixel centres are at integers.
     sub_pixels = first - 0.5 + (np.arange((end - first) * samples) + 0.5) / samples
-    interpolant = make_interp_spline(knots, np.eye(count))
-    weights = interpolant.design_matrix(sub_pixels, interpolant.t, interpolant.k)
-    return knots, _Spline(
-        interpolant.c,
-        weights.indices[::_TAPS].astype(np.int64),
-        weights.data.reshape(-1, _TAPS).astype(np.float32),
-    )
+    weights = make_interp_spline(knots, np.eye(count))(sub_pixels)
+    return knots, np.asarray(weights, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +118,6 @@ class RenderScene:
     sheet: SheetTexture  # Texture of the board.
     backdrop: Backdrop  # Background.
     sights: Sequence[SimulatedSight]  # Observations of the camera.
-    arm: DhArm | None  # Arm that holds the board before a fixed camera; None if not visible.
-    joints: FloatArray  # (s, n) postures of the arm at the stops [rad].
-    cam_from_base: FloatArray  # (4, 4) pose of the arm's base.
     noise: Callable[[int], np.random.Generator]  # Random generator by view.
 
 
@@ -189,11 +138,8 @@ def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = Non
     index = [camera_at.name for camera_at in cell.layout.cameras].index(camera)
     # The first camera has the same random stream as a single one.
     rng = options.stream(RandomStream.BACKDROP, *((index,) if index else ()))
-    seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", sheet.name))
-    arm, joints, cam_from_base = None, np.zeros((0, 0)), np.eye(4)
-    if holder is not None and cell.robot_of(seer) is None:
-        arm, joints = cell.robots[holder].arm, cell.robots[holder].joints
-        cam_from_base = cell.between(seer, frame_name("base", holder))
+    is_held = cell.robot_of(frame_name("target", sheet.name)) is not None
+    moves = not (is_held and cell.robot_of(frame_name("camera", camera)) is None)
     # The texture is as fine as the board's closest image needs.
     target = sheet.target
     nearest = min(float(np.linalg.norm(sight.cam_from_target[:3, 3])) for sight in sights)
@@ -206,13 +152,10 @@ def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = Non
         camera=optics,
         board=sheet,
         sheet=draw_sheet(target, texels),
-        backdrop=Backdrop(draw_table(rng, 1024), 0.0008, 0.006, 0.45, moves=True)
-        if arm is None
-        else Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, moves=False),
+        backdrop=Backdrop(draw_backdrop(rng, 1024, 0.8), 0.0008, 0.006, 0.45, moves=True)
+        if moves
+        else Backdrop(draw_backdrop(rng, 1024, 8.0), 0.004, 2.6, 2.0, moves=False),
         sights=sights,
-        arm=arm,
-        joints=joints,
-        cam_from_base=cam_from_base,
         noise=partial(options.stream, RandomStream.IMAGES),
     )
 
@@ -230,16 +173,13 @@ def render(scene: RenderScene, index: int) -> Image:
     if not 0 <= index < count:
         raise DataError(f"simulation: there is no view {index} among {count}.")
     sight = scene.sights[index]
-    shows_arm = scene.arm is not None and sight.stop >= 0
-    joints = scene.joints[sight.stop] if shows_arm else None
-    light = light_on(scene, sight.cam_from_target, joints)
+    light = light_on(scene, sight.cam_from_target)
     return developed(light, scene.camera, scene.noise(sight.view))
 
 
 def light_on(
     scene: RenderScene,
     cam_from_target: FloatArray,
-    joints: FloatArray | None,
     *,
     samples: int = _SAMPLES,
     shows_board: bool = True,
@@ -249,7 +189,6 @@ def light_on(
     Args:
         scene: Prepared scene.
         cam_from_target: (4, 4) pose of the board.
-        joints: (n,) posture of a visible arm [rad]; None for no arm.
         samples: Sub-pixels along a pixel's side.
         shows_board: Whether the board's face is visible, at least in part.
 
@@ -258,10 +197,10 @@ def light_on(
     """
     # On a busy machine, several BLAS threads mostly wait for each other.
     with one_blas_thread():
-        light, whole, shade = _background(scene, cam_from_target, joints)
+        light, whole, shade = _background(scene, cam_from_target)
         if shows_board:
             _draw_board(light, scene, cam_from_target, samples)
-        light *= between(whole, shade)
+        light *= whole.between(shade)
     blur_px = scene.camera.blur_px
     if blur_px > 0.0:
         light = np.asarray(
@@ -295,7 +234,7 @@ def encode(image: Image, jpeg_quality: int | None) -> bytes:
 
 
 def _background(
-    scene: RenderScene, cam_from_target: FloatArray, joints: FloatArray | None
+    scene: RenderScene, cam_from_target: FloatArray
 ) -> tuple[Float32Array, Raster, FloatArray]:
     """Background: its light, knots over the image, and brightness at the knots."""
     camera = scene.camera.camera
@@ -306,25 +245,17 @@ def _background(
         lower = compose(np.eye(3), np.array([0.0, 0.0, -scene.backdrop.depth_m]))
         plane_from_cam = lower @ invert(cam_from_target)
     hits = _plane_hits(plane_from_cam, raster.directions, 0.0)
-    background = np.asarray(
-        cv2.remap(
-            scene.backdrop.texture,
-            between(raster, hits[..., 0] / scene.backdrop.texel_m),
-            between(raster, hits[..., 1] / scene.backdrop.texel_m),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        ),
-        np.uint8,
+    x, y = (raster.between(hits[..., axis] / scene.backdrop.texel_m) for axis in range(2))
+    background = cv2.remap(
+        scene.backdrop.texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
     )
-    if scene.arm is not None and joints is not None:
-        _draw_arm(background, camera, scene.arm, joints, scene.cam_from_base)
     offset = (hits - scene.backdrop.lamp_m * np.array([-0.3, -0.2])) / scene.backdrop.lamp_m
     distance2 = (offset**2).sum(axis=-1)
     light = background.astype(np.float32)
     if scene.backdrop.moves:
         # Towards the horizon, the table fades into an even floor.
         light -= np.float32(_FLOOR)
-        light *= between(raster, np.exp(-((distance2 / 8.0) ** 2)))
+        light *= raster.between(np.exp(-((distance2 / 8.0) ** 2)))
         light += np.float32(_FLOOR)
     centre = 0.5 * np.array(camera.resolution) - 0.5
     edge = ((raster.px - centre) ** 2).sum(axis=-1) / (centre**2).sum()
@@ -366,15 +297,18 @@ def _draw_board(
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
-    at_x, at_y = (columns_of(raster, texels[..., index]) for index in range(2))
+    middle = texels.mean(axis=(0, 1))
+    columns = [
+        (texels[..., axis] - middle[axis]).astype(np.float32) @ raster.across.T for axis in range(2)
+    ]
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)
         band = slice(top * samples, (top + rows) * samples)
         seen = cv2.remap(
             sheet.levels[level],
-            between_rows(raster, at_x, band),
-            between_rows(raster, at_y, band),
+            raster.down[band] @ columns[0] + np.float32(middle[0]),
+            raster.down[band] @ columns[1] + np.float32(middle[1]),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(0, 0),
@@ -412,59 +346,6 @@ def _plane_hits(
     return np.asarray(start[:2] + direction[..., :2] * ((depth_m - start[2]) / descent)[..., None])
 
 
-def _draw_arm(
-    image: Image, camera: Camera, arm: DhArm, joints: FloatArray, cam_from_base: FloatArray
-) -> None:
-    """Draws an arm of Universal Robots' shape, scaled by its reach, far parts first."""
-    frames, size = link_frames(arm, joints[None])[0], reach_m(arm)
-    origin, axis = frames[:, :3, 3], frames[:, :3, 2]
-    wide, slim = 0.062 * size, 0.045 * size
-    # Upper arm and forearm are offset from the plane of their joints' origins.
-    upper, fore = 0.14 * size * axis[1], 0.03 * size * axis[1]
-    light, dark = 178.0, 96.0
-    # Housings and links: ends in the base [m], radius [m] and grey level.
-    tubes = (
-        (origin[0], origin[1], wide * 1.15, light),
-        (origin[1] - 0.05 * size * axis[1], origin[1] + upper, wide, dark),
-        (origin[1] + upper, origin[2] + upper, wide * 0.8, light),
-        (origin[2] + upper, origin[2] + fore, wide * 0.95, dark),
-        (origin[2] + fore, origin[3] + fore, slim, light),
-        (origin[3] + fore, origin[4], slim, dark),
-        (origin[4], origin[5], slim, light),
-        (origin[5], origin[6], slim * 0.9, dark),
-        (origin[6], origin[6] + 0.05 * axis[6], slim * 0.6, 130.0),
-    )
-    visible = []
-    for start, end, radius_m, grey in tubes:
-        ends = np.stack([start, end]) @ cam_from_base[:3, :3].T + cam_from_base[:3, 3]
-        if ends[:, 2].min() > _NEAREST_M:
-            visible.append((float(ends[:, 2].mean()), ends, radius_m, grey))
-    for _, ends, radius_m, grey in sorted(visible, key=lambda each: -each[0]):
-        radii = camera.matrix[0] * radius_m / ends[:, 2]
-        _draw_tube(image, project(camera, ends), radii, grey)
-
-
-def _draw_tube(image: Image, px: FloatArray, radii: FloatArray, grey: float) -> None:
-    """Draws a tapered, round-ended stripe, brightest slightly off its axis."""
-    direction = px[1] - px[0]
-    length = float(np.linalg.norm(direction))
-    normal = np.array([-direction[1], direction[0]]) / max(length, 1e-3)
-    # Light comes from above.
-    if normal[1] > 0.0:
-        normal = -normal
-    for shade in range(_SHADES):
-        share = 1.0 - shade / _SHADES
-        centre_line = px + 0.35 * (1.0 - share) * radii[:, None] * normal
-        tone = float(min(grey * (0.45 + 0.65 * np.sqrt(1.0 - share**2)), 235.0))
-        side = (share * radii)[:, None] * normal
-        outline = np.concatenate([centre_line + side, (centre_line - side)[::-1]])
-        # Fixed-point coordinates with four fractional bits keep edges smooth.
-        cv2.fillPoly(image, [np.rint(outline * 16).astype(np.int32)], tone, cv2.LINE_AA, 4)
-        for centre, radius in zip(centre_line, share * radii, strict=True):
-            x, y = np.rint(centre * 16).astype(int)
-            cv2.circle(image, (int(x), int(y)), round(radius * 16), tone, -1, cv2.LINE_AA, 4)
-
-
 class LiveView:
     """Takes images of a cell's board for any posture of its arm.
 
@@ -500,7 +381,7 @@ class LiveView:
         if smear_px < _STILL_PX:
             pose = poses[len(poses) // 2]
             if self._rest is None or self._moved_px(self._rest[0][None], pose[None]) > _STILL_PX:
-                self._rest = (pose, self._light(pose, joints[len(joints) // 2]))
+                self._rest = (pose, self._light(pose))
             light = self._rest[1]
         else:
             light = self._smeared(joints, smear_px)
@@ -512,9 +393,9 @@ class LiveView:
         """True board poses: (k, n) joints [rad] to (k, 4, 4)."""
         return self._before(forward(self._cell.robot.true_arm, joints))
 
-    def _light(self, pose: FloatArray, posture: FloatArray, **more: int) -> Float32Array:
+    def _light(self, pose: FloatArray, samples: int = _SAMPLES) -> Float32Array:
         shows_board = _faces(self._cell, pose)
-        return light_on(self._scene, pose, posture, shows_board=shows_board, **more)
+        return light_on(self._scene, pose, samples=samples, shows_board=shows_board)
 
     def _smeared(self, joints: FloatArray, smear_px: float) -> Float32Array:
         """Mean light over equal parts of the exposure."""
@@ -522,36 +403,9 @@ class LiveView:
         positions = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
         steps = np.arange(len(joints))
         postures = np.stack([np.interp(positions, steps, column) for column in joints.T], axis=1)
-        poses = self.cam_from_target(postures)
-        if smear_px < _SHORT_PX:
-            lights = (self._light(*pair) for pair in zip(poses, postures, strict=True))
-        else:
-            middle = self.cam_from_target(joints[len(joints) // 2, None])[0]
-            sharp = self._light(middle, joints[len(joints) // 2], samples=1)
-            lights = (self._shifted(sharp, pose @ invert(middle), middle) for pose in poses)
-        total = next(lights).copy()
-        for light in lights:
-            total += light
-        return np.asarray(total / np.float32(parts))
-
-    def _shifted(
-        self, light: Float32Array, now_from_middle: FloatArray, middle: FloatArray
-    ) -> Float32Array:
-        """Transforms an image as if all its content were at the board's distance."""
-        # Motion blur is then correct at the board's centre, and symmetric about each corner's true
-        # position everywhere.
-        camera = self._cell.camera().camera
-        raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
-        depth = float((middle[:3, :3] @ centre_m(self._cell.board()) + middle[:3, 3])[2])
-        plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
-        plane_from_now = invert(now_from_middle @ plane)
-        directions = raster.directions @ plane_from_now[:3, :3].T
-        start = plane_from_now[:3, 3]
-        hits = start - directions * (start[2] / directions[..., 2])[..., None]
-        px = project(camera, hits @ plane[:3, :3].T + plane[:3, 3])
-        map_x, map_y = between(raster, px[..., 0]), between(raster, px[..., 1])
-        shifted = cv2.remap(light, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(shifted, np.float32)
+        samples = _SAMPLES if smear_px < _SHORT_PX else 1
+        lights = [self._light(pose, samples) for pose in self.cam_from_target(postures)]
+        return np.asarray(np.mean(lights, axis=0))
 
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(k,) bounds of the image motion between board poses (k, 4, 4) [px]."""
