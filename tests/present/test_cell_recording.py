@@ -15,7 +15,7 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_calibration, read_session
 from visioncal.present.recording.reader import chunks
-from visioncal.present.recording.scene import SceneDrawing
+from visioncal.present.recording.scene import Scene
 from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, cell_session, simulate
@@ -63,7 +63,7 @@ def true_result(cell, session) -> Calibration:
 
 
 def test_frames_are_drawn_where_they_were(cell, session):
-    scene = SceneDrawing.of(session, true_result(cell, session), {})
+    scene = Scene.of(session, true_result(cell, session), {})
     for observation in session.observations:
         seer = scene.in_cell(observation.seer, observation.view.number)
         seen = scene.in_cell(observation.seen, observation.view.number)

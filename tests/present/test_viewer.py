@@ -242,8 +242,7 @@ def test_the_arm_reaches_from_the_base_to_the_flange(tmp_path):
     file = tmp_path / "arm.rrd"
     with rr.RecordingStream("arm") as stream:
         stream.save(file)
-        stream.set_time(paths.TIMELINE, sequence=0)
-        arm.log_arm(stream, frames)
+        arm.log_arms(stream, [frames], [0])
         stream.disconnect()
     entity = f"{paths.ROBOT}/links"
     starts = np.array(column(file, entity, "Capsules3D:translations")[0])

@@ -15,7 +15,7 @@ def column(
     found: dict[int, np.ndarray] = {}
     for chunk in RrdReader(path).stream().filter(content=entity):
         batch = chunk.to_record_batch()
-        if component in batch.schema.names:
+        if component in batch.schema.names and (chunk.is_static or timeline in batch.schema.names):
             times = range(1) if chunk.is_static else batch.column(timeline).to_numpy().tolist()
             values = map(np.array, batch.column(component).to_pylist())
             found |= dict(zip(times, values, strict=True))

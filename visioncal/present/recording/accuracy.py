@@ -276,15 +276,15 @@ class Uncertainty:
         )
         stream.log(f"{entity}/label", frame, label, static=True)
 
-    def log_views(self, stream: rr.RecordingStream, views: Sequence[int]) -> None:
-        """Marks the current view's target position, for all views of the session in order."""
+    def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
+        """Marks the current view's target position, for all views, by row."""
         for frame in self._target_frames:
             # For other targets, an empty part clears the mark of the previous view.
             marked = [
                 self._positions_m(
                     [view] if view in self.scatter_m and self.frames[view] == frame else []
                 )
-                for view in views
+                for view in rows
             ]
             entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
             radius = 1.5 * _POINT * self.size_m
@@ -292,7 +292,7 @@ class Uncertainty:
             stream.log(entity, rr.CoordinateFrame(frame), style, static=True)
             points = rr.Points3D.columns(positions=np.vstack(marked))
             parts = points.partition([len(array) for array in marked])
-            send_rows(stream, entity, range(len(views)), parts)
+            send_rows(stream, entity, rows.values(), parts)
 
     def _positions_m(self, views: Sequence[int]) -> FloatArray:
         """(k, 3) drawn positions of targets by some views, in their frames."""

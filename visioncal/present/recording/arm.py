@@ -9,8 +9,7 @@ import rerun as rr
 
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.recorder import send_rows
-from visioncal.robot import Robot
+from visioncal.present.recording.recorder import Row, send_rows
 
 # Radii of links at the base and at the flange, as shares of the arm's length; about a UR's.
 _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
@@ -25,35 +24,6 @@ _FLOOR = 1.3
 _BELOW_M = 0.004
 
 
-def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
-    """Draws an arm at the stream's current time, by its (n, 4, 4) link frames in the base [m]."""
-    capsules, balls = _shapes(link_frames[None])
-    stream.log(f"{paths.ROBOT}/links", rr.Capsules3D(**capsules, **_LINKS))
-    stream.log(f"{paths.ROBOT}/joints", rr.Ellipsoids3D(**balls, **_JOINTS))
-
-
-def log_pose(
-    stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray
-) -> None:
-    """Places a frame in the base at the stream's current time."""
-    stream.log(entity, placed(base_from_frame, paths.BASE_FRAME, frame))
-
-
-def log_arm_motion(
-    stream: rr.RecordingStream,
-    robot: Robot,
-    q: FloatArray,
-    times: Iterable[float | np.timedelta64],
-) -> None:
-    """Draws an arm and its flange over time, by (m, n) joint angles [rad] and their times [s]."""
-    for time, q_then in zip(times, q, strict=True):
-        stream.set_time(paths.MOTION_TIMELINE, duration=time)
-        links = robot.link_frames(q_then)
-        log_arm(stream, links)
-        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, links[-1])
-    stream.reset_time()
-
-
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
     """Transform of a child frame on its parent, from a (4, 4) pose `parent_from_child`."""
     return rr.Transform3D(
@@ -61,38 +31,24 @@ def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
     )
 
 
-def log_frames(
-    stream: rr.RecordingStream, axis_m: float, more: Sequence[tuple[str, str, float]] = ()
-) -> None:
-    """Draws the axes of base and flange, and places the arm in the base.
-
-    The flange's axes have the length `axis_m`, the base's are twice as long; `more` are other
-    entities with their frames and their lengths relative to the flange's.
-    """
-    base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
-    stream.log(paths.BASE, base, static=True)
-    standard = ((paths.BASE, paths.BASE_FRAME, 2.0), (paths.FLANGE, paths.FLANGE_FRAME, 1.0))
-    for entity, frame, scale in (*standard, *more):
-        axes = rr.TransformAxes3D(scale * axis_m, show_frame=True)
-        stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
-    for part in ("links", "joints"):
-        frame_of_arm = rr.CoordinateFrame(paths.BASE_FRAME)
-        stream.log(f"{paths.ROBOT}/{part}", frame_of_arm, static=True)
-
-
 def log_arms(
-    stream: rr.RecordingStream, views: Sequence[FloatArray | None], entity: str = paths.ROBOT
+    stream: rr.RecordingStream,
+    views: Sequence[FloatArray | None],
+    rows: Iterable[Row],
+    entity: str = paths.ROBOT,
+    timeline: str = paths.TIMELINE,
 ) -> None:
-    """Draws an arm in every view by (n, 4, 4) link frames; None clears the previous view's arm."""
-    known_views = [view for view in views if view is not None]
-    link_frames, rows = np.array(known_views or [np.zeros((0, 4, 4))]), range(len(views))
+    """Draws an arm in some views by (n, 4, 4) link frames; None clears the previous view's arm."""
+    known_views, rows = [view for view in views if view is not None], list(rows)
+    link_frames = np.array(known_views or [np.zeros((0, 4, 4))])
     counts = link_frames.shape[1] * np.array([view is not None for view in views])
     (capsules, balls), links, joints = _shapes(link_frames), f"{entity}/links", f"{entity}/joints"
     stream.log(links, rr.Capsules3D.from_fields(**_LINKS), static=True)
-    send_rows(stream, links, rows, rr.Capsules3D.columns(**capsules).partition(counts))
+    parts = rr.Capsules3D.columns(**capsules).partition(counts)
+    send_rows(stream, links, rows, parts, timeline)
     stream.log(joints, rr.Ellipsoids3D.from_fields(**_JOINTS), static=True)
     parts = rr.Ellipsoids3D.columns(**balls).partition(np.maximum(counts - 1, 0))
-    send_rows(stream, joints, rows, parts)
+    send_rows(stream, joints, rows, parts, timeline)
 
 
 def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -110,23 +110,18 @@ class Charts:
         for joint in self.joints:
             joint.log(stream)
 
-    def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks the current view, for all views, by row in the session, in one message a chart."""
+    def log_views(
+        self, stream: rr.RecordingStream, rows: Mapping[int, int], timeline: str = paths.TIMELINE
+    ) -> None:
+        """Marks the current view, for some views, by row, in one message a chart."""
         for chart in self.points:
             marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
             points = rr.Points2D.columns(positions=np.vstack(marked))
             entity = f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}"
             parts = points.partition([len(array) for array in marked])
-            send_rows(stream, entity, rows.values(), parts)
+            send_rows(stream, entity, rows.values(), parts, timeline)
         for joint in self.joints:
             joint.log_marks(stream, rows)
-
-    def log_view(self, stream: rr.RecordingStream, view: int) -> None:
-        """Marks one view, at the stream's current time."""
-        for chart in self.points:
-            positions = chart.points.get(view, np.zeros((0, 2)))
-            points = rr.Points2D.from_fields(positions=positions)
-            stream.log(f"{paths.COVERAGE}/{chart.name}/{paths.THIS_VIEW}", points)
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:

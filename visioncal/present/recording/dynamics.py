@@ -10,13 +10,13 @@ from rerun.blueprint import BlueprintLike
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.arm import log_arm_motion, log_frames
 from visioncal.present.recording.notes import markdown, plain, table_lines
+from visioncal.present.recording.scene import Scene, states_of
 from visioncal.present.recording.writer import recording
 from visioncal.present.torques import base_parameter_table, torque_note, torque_table
 
-# Length of the flange's axes [m].
-_AXIS_M = 0.08
+# Size of the cell [m], by which axes are drawn.
+_SIZE_M = 0.7
 # Pause between motions [s], and the rate at which the arm is drawn [Hz].
 _PAUSE_S, _DRAWN_HZ = 1.0, 20.0
 _LINES = (
@@ -49,7 +49,8 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
             _log_series(stream, prediction, times_s)
             steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
             drawn = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
-            log_arm_motion(stream, robot, prediction.q[drawn], times_s[drawn].tolist())
+            scene = Scene.planned(robot, states_of(robot, prediction.q[drawn]), _SIZE_M)
+            scene.log_views(stream, dict(enumerate(times_s[drawn])), paths.MOTION_TIMELINE)
             recorder.keep()
             start_s = float(times_s[-1]) + _PAUSE_S
 
@@ -57,7 +58,7 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
 def _log_static(
     stream: rr.RecordingStream, identified: Identified, predictions: Sequence[Prediction]
 ) -> None:
-    log_frames(stream, _AXIS_M)
+    Scene.planned(identified.robot, {}, _SIZE_M).log_static(stream)
     has_known = any(prediction.known_nm is not None for prediction in predictions)
     for joint in range(identified.robot.joint_count):
         torque = paths.of_joint(paths.TORQUES, joint)

@@ -4,18 +4,16 @@ from dataclasses import dataclass, field
 
 import rerun as rr
 
-from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
 from visioncal.present.coverage import corners_chart
-from visioncal.present.recording import board, colours, paths
-from visioncal.present.recording.arm import log_arm, log_frames, log_pose
+from visioncal.present.recording import colours, paths
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.notes import markdown
-from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane
+from visioncal.present.recording.scene import RobotState, Scene, Seen
 from visioncal.robot import Robot
 
-# Sizes of axes, lines and points [m].
-_AXIS_M, _LINE_M, _POINT_M = 0.08, 0.001, 0.003
+# Size of the cell [m], by which axes and points are drawn.
+_SIZE_M = 0.7
 # JPEG quality: pictures are for display only, and the arm waits for their transfer.
 _JPEG = 80
 
@@ -55,23 +53,15 @@ class LiveDrawing:
     stream: rr.RecordingStream
     cell: LiveCell
     _px: dict[int, FloatArray] = field(default_factory=dict)
-    _flange_poses: list[FloatArray] = field(default_factory=list)
+    _states: dict[int, RobotState] = field(default_factory=dict)
 
     def begin(self) -> None:
         """Draws the static part."""
-        stream, cell = self.stream, self.cell
-        more: list[tuple[str, str, float]] = []
-        if cell.x is not None:
-            more = [(paths.CAMERA, paths.CAM_FRAME, 1.0), (paths.TARGET, paths.TARGET_FRAME, 1.0)]
-            on_target = rr.CoordinateFrame(paths.TARGET_FRAME)
-            stream.log(f"{paths.TARGET}/sheet", on_target, board.sheet(cell.target), static=True)
-        log_frames(stream, _AXIS_M, more)
-        if cell.camera is not None:
-            log_image_plane(stream, cell.camera, 1.0)
+        self._scene.log_static(self.stream)
 
     def draw(self, view: LiveView) -> None:
         """Draws a view, and the charts of all views so far."""
-        stream = self.stream
+        stream, row = self.stream, {view.view: view.view}
         stream.set_time(paths.TIMELINE, sequence=view.view)
         in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
         model = rr.ColorModel.L if view.image.ndim == 2 else rr.ColorModel.BGR
@@ -80,42 +70,21 @@ class LiveDrawing:
         # Rerun's origin is the image's corner, not the first pixel's centre.
         points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
         stream.log(paths.DETECTED, in_image, points)
-        self._draw_cell(view)
+        self._states[view.view] = RobotState(view.base_from_flange, view.q)
+        self._scene.log_stops(stream)
+        self._scene.log_views(stream, row)
         self._px[view.view] = view.px
         chart = corners_chart(self.cell.resolution, self._px)
         charts = Charts((chart,), (), frozenset(self._px))
         charts.log_static(stream)
-        charts.log_view(stream, view.view)
+        charts.log_views(stream, row)
         if view.sigma_mm is not None:
             stream.log(paths.LIVE_SIGMA, rr.Scalars(view.sigma_mm))
         stream.log(paths.LIVE_NOTE, markdown(view.note))
 
-    def _draw_cell(self, view: LiveView) -> None:
-        cell, stream, flange = self.cell, self.stream, view.base_from_flange
-        log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, flange)
-        if cell.robot is not None and view.q is not None:
-            log_arm(stream, cell.robot.link_frames(view.q))
-        self._flange_poses.append(flange)
-        in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-        points = rr.Points3D(
-            [pose[:3, 3] for pose in self._flange_poses], colors=colours.USED, radii=_POINT_M
-        )
-        stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
-        if cell.x is None or cell.z is None:
-            return
-        if cell.mount == "eye-in-hand":
-            base_from_cam, base_from_target, flange_from_carried = flange @ cell.x, cell.z, cell.x
-            shapes = [] if cell.camera is None else frustum(cell.camera, SMALL_FRUSTUM)
-        else:
-            base_from_cam, base_from_target, flange_from_carried = cell.x, flange @ cell.z, cell.z
-            shapes = [board.closed_outline(cell.target)]
-        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, base_from_cam)
-        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, base_from_target)
-        strips = [
-            apply(pose @ flange_from_carried, shape)
-            for pose in self._flange_poses
-            for shape in shapes
-        ]
-        if strips:
-            lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
-            stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)
+    @property
+    def _scene(self) -> Scene:
+        cell, seen = self.cell, None
+        if cell.x is not None and cell.z is not None:
+            seen = Seen(cell.mount, cell.target, cell.camera, cell.x, cell.z)
+        return Scene.planned(cell.robot, self._states, _SIZE_M, seen)

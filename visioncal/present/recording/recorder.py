@@ -5,14 +5,18 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from threading import Thread
-from typing import Self
+from typing import Any, Self, TypeAlias
 
+import numpy as np
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
 from visioncal.present.recording.rrd_messages import scan
+
+# Place on a timeline: the view's row, or a time [s] on that of motions.
+Row: TypeAlias = int | float | np.timedelta64
 
 # Free space that one more view and the end of the file need at most.
 _ROOM_BYTES = 100_000_000
@@ -104,14 +108,17 @@ class Recorder:
 def send_rows(
     stream: rr.RecordingStream,
     entity: str,
-    rows: Iterable[int],
+    rows: Iterable[Row],
     columns: Iterable[rr.ComponentColumn],
+    timeline: str = paths.TIMELINE,
 ) -> None:
     """Logs an entity for many views, by row, in one message, whatever the stream's time.
 
     This takes a tenth of the time of single messages. Each component has one partition per view.
     """
-    time = rr.TimeColumn(paths.TIMELINE, sequence=rows)
+    is_time = timeline == paths.MOTION_TIMELINE
+    unit: dict[str, Any] = {"duration" if is_time else "sequence": rows}
+    time = rr.TimeColumn(timeline, **unit)
     rr.send_columns(entity, [time], columns, recording=stream)
 
 

@@ -12,10 +12,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
 from visioncal.present import result_parts
-from visioncal.present.recording import codec, notes, overlays, paths
+from visioncal.present.recording import codec, notes, paths, sights
+from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
+from visioncal.present.recording.charts import Charts
+from visioncal.present.recording.overlays import Overlay
 from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
-from visioncal.present.recording.scene import SceneDrawing
+from visioncal.present.recording.scene import Scene
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
@@ -152,23 +155,38 @@ def _draw(
     evidence: Mapping[int, ViewEvidence],
 ) -> None:
     """Draws a session and its result."""
-    views = dict(enumerate(session.views))
-    scene = SceneDrawing.of(session, calibration, evidence)
-    overlay = overlays.Overlay.of(session, calibration, evidence)
+    rows = {view.number: row for row, view in enumerate(session.views)}
+    seen = [evidence.get(view, ViewEvidence(view)) for view in rows]
+    scene = Scene.of(session, calibration, evidence)
     scene.log_static(stream)
-    seen = [evidence.get(view.number, ViewEvidence(view.number)) for view in session.views]
-    scene.log_views(stream, seen)
-    overlay.log_views(stream, seen)
+    scene.log_stops(stream)
+    scene.log_views(stream, rows)
+    Overlay.of(session, calibration, evidence).log_views(stream, seen)
     if calibration is None:
         return
+    if calibration.cell is not None:
+        sights.log_network(stream, scene, calibration)
+        sights.log_sights(stream, scene, session, calibration)
+    sights.log_seen_targets(stream, scene, session, calibration, seen)
+    frames = result_parts.target_frames(calibration, session)
+    for drawing in (
+        Uncertainty.of(calibration, evidence, scene.size_m, frames),
+        Charts.of(session, calibration, evidence),
+        ArmPicture.of(session, calibration, scene.size_m),
+    ):
+        if drawing is not None:
+            drawing.log_static(stream)
+            drawing.log_views(stream, rows)
     notes.log_static(stream, calibration, result_parts.stated_boards(session))
-    rows = {view.number: row for row, view in views.items()}
-    sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
-    unposed = {row: scene.unposed(view.number) for row, view in views.items()}
-    notes.log_views(stream, sights, views, unposed)
+    shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
+    unposed = {row: scene.unposed(view) for view, row in rows.items()}
+    notes.log_views(stream, shown, dict(enumerate(session.views)), unposed)
     for name, arm in calibration.by_name.robots.items():
         drifts = () if arm.thermal is None else arm.thermal.views
-        shown = {rows[drift.view]: drift for drift in drifts if drift.view in rows}
         for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
-            values = {row: float(getattr(drift, attribute)) for row, drift in shown.items()}
+            values = {
+                rows[drift.view]: float(getattr(drift, attribute))
+                for drift in drifts
+                if drift.view in rows
+            }
             notes.log_scalars(stream, paths.part_of(plot, name), values)
