@@ -237,34 +237,6 @@ def test_links_alone_leave_little_where_the_arm_was_measured_and_say_how_much(
     assert rms < 0.4 * rms_and_most_mm(real - plain.base_from_flange(q))[0]
 
 
-def test_links_and_corrections_together_are_the_arm():
-    result = calibrated(load_robot("ur5e"), waves=True)
-    links = document(result, "robot-urdf", Selection(with_corrections=True))
-    assert "The table of joint-corrections goes with it" in links.warnings[0]
-    written = of_urdf_text(links.text, result.robot.tip)
-    table = export(result, "joint-corrections").splitlines()
-    rows = [name.split(",") for name in table if not name.startswith("#")][1:]
-    corrections = {(joint, int(angle)): float(name) for joint, angle, name, _ in rows}
-    # Gears that err turn after turn have their range, of two turns.
-    degrees = np.random.default_rng(1).integers(-300, 300, (50, 6))
-    names = result.robot.joint_names
-    sent = np.array(
-        [
-            [value + corrections[joint, value] for joint, value in zip(names, row, strict=True)]
-            for row in degrees.tolist()
-        ]
-    )
-    wanted = written.base_from_flange(np.deg2rad(degrees))
-    # Corrections are written to a millionth of a degree, 2e-8 m a metre away.
-    reached = result.arm.robot.base_from_flange(np.deg2rad(sent))
-    np.testing.assert_allclose(reached, wanted, atol=1e-7)
-
-
-def test_corrections_of_joints_that_need_none_are_refused():
-    with pytest.raises(DataError, match="there is nothing to correct"):
-        export(calibrated(load_robot("ur5e")), "joint-corrections")
-
-
 @pytest.mark.parametrize("name", ARM_FORMATS)
 def test_the_file_says_where_it_comes_from(name):
     result = calibrated(load_robot("ur5e"), session_name="a -- b --- c\n</robot>\nhash: x")
@@ -303,8 +275,6 @@ def test_without_a_calibrated_arm_the_next_step_is_told(name, source, words):
         ("robot-urdf", Selection(convention="hayati"), "no place for --convention"),
         ("robot-dh", Selection(calibration_hash="calib_1"), "no place for --hash"),
         ("robot-dh", Selection(convention="craig"), "standard, modified, hayati"),
-        ("robot-json", Selection(with_corrections=True), "no place for --with-corrections"),
-        ("ros", Selection(with_corrections=True), "no place for --with-corrections"),
         ("ros", Selection(convention="hayati"), "no place for --convention"),
         ("ur", Selection(calibration_hash="calib_1"), "no place for --hash"),
     ],

@@ -26,7 +26,7 @@ from visioncal.results import CameraResult, Edge
 from visioncal.vision.camera import normalise, project_with_jacobian
 
 NAMES = [export_format.name for export_format in EXPORT_FORMATS]
-EDGE_NAMES = [name for name in NAMES if name not in (*readers.ARM_FORMATS, "joint-corrections")]
+EDGE_NAMES = [name for name in NAMES if name not in readers.ARM_FORMATS]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
 LENSES = {"camera-info", "kalibr"}
 RNG = np.random.default_rng(3)
@@ -82,7 +82,7 @@ def test_any_edge_and_its_inverse(name, edge):
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
     known = set(READERS) | set(TOOL_READERS) | set(FIXTURE_READERS) | LENSES
-    assert set(NAMES) == known | set(readers.ARM_FORMATS) | set(readers.ARM_TABLES)
+    assert set(NAMES) == known | set(readers.ARM_FORMATS)
     assert len(set(NAMES)) == len(NAMES)
 
 
@@ -100,9 +100,7 @@ def test_the_inverse_carries_the_covariance_along():
     assert abs(edge.sigma_mm / sampled_mm - 1) > 0.1
 
 
-@pytest.mark.parametrize(
-    "name", ["ros", "ros-launch", "moveit", "easy-handeye", "easy-handeye2", "urdf"]
-)
+@pytest.mark.parametrize("name", ["ros", "ros-launch", "easy-handeye", "easy-handeye2", "urdf"])
 @pytest.mark.parametrize(("mount", "parent"), [("eye-in-hand", "tool0"), ("eye-to-hand", "base")])
 def test_ros_gets_its_own_names_and_is_told_what_they_mean(name, mount, parent):
     text = export(calibration(np.eye(4), mount), name)
@@ -117,9 +115,8 @@ def test_frames_stand_where_their_readers_look():
     transform = yaml.safe_load(export(SAMPLE, "ros", chosen))
     assert transform["header"]["frame_id"] == "arm/tool-1"
     assert transform["child_frame_id"] == "cam.2"
-    for name in ("ros-launch", "moveit"):
-        options = readers.launch_arguments(export(SAMPLE, name, chosen))
-        assert (options["--frame-id"], options["--child-frame-id"]) == ("arm/tool-1", "cam.2")
+    options = readers.launch_arguments(export(SAMPLE, "ros-launch", chosen))
+    assert (options["--frame-id"], options["--child-frame-id"]) == ("arm/tool-1", "cam.2")
     robot = ET.fromstring(export(SAMPLE, "urdf", chosen))
     assert robot.find("link").get("name") == "cam.2"
     joint = robot.find("joint")

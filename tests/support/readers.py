@@ -267,14 +267,11 @@ FIXTURE_READERS = {
 
 # Those of an arm, which test_arm_exports.py reads.
 ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")
-# Read by the tests of what they are of.
-ARM_TABLES = ("joint-corrections",)
 
 # By the format's name: every format that holds any transform.
 READERS = {
     "ros": ros,
     "ros-launch": launch,
-    "moveit": launch,
     "easy-handeye": easy_handeye,
     "easy-handeye2": ros,
     "urdf": urdf,

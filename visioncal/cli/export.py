@@ -28,7 +28,6 @@ def export_command(options: ExportOptions) -> None:
         options.part.camera,
         options.part.robot,
         options.part.target,
-        options.with_corrections,
         options.lens,
     )
     written = document(load_exportable(options.source), options.to, selection)

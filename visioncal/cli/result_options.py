@@ -226,10 +226,6 @@ class ExportOptions:
     calibration_hash: str | None = option(
         "ur-kinematics: the hash that ur_calibration extracts.", "--hash"
     )
-    with_corrections: bool = flag(
-        "robot-urdf, robot-dh, ur-kinematics: links for use with the table of "
-        "joint-corrections; without it, those that leave the least alone."
-    )
     lens: Path | None = option(
         "The receiving program's own lens, as convert --intrinsics reads it: the "
         "camera's transform is written for that.",

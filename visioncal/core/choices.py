@@ -25,11 +25,11 @@ FOREIGN_NAMES = (
     *("moveit", "views", "table"),
 )
 EXPORT_NAMES = (
-    *("ros", "ros-launch", "moveit", "easy-handeye", "easy-handeye2", "urdf", "camera-info"),
+    *("ros", "ros-launch", "easy-handeye", "easy-handeye2", "urdf", "camera-info"),
     *("kalibr", "opencv", "zivid", "text", "ur", "kuka", "fanuc", "abb", "staubli"),
     *("yaskawa", "doosan", "ur-tcp", "ur-feature", "abb-tooldata", "abb-wobjdata"),
     *("kuka-tool", "kuka-base", "robot-urdf", "robot-dh"),
-    *("ur-kinematics", "robot-json", "joint-corrections"),
+    *("ur-kinematics", "robot-json"),
 )
 # Simulated arms, and built-in descriptions of whole cells.
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")

@@ -26,7 +26,7 @@ from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT
 from visioncal.interchange.result_files import load_calibration
 from visioncal.present.viewer import blueprint
 
-POSES = ("ros", "ros-launch", "moveit", "easy-handeye2", "urdf", "opencv", "zivid", "text", "ur",
+POSES = ("ros", "ros-launch", "easy-handeye2", "urdf", "opencv", "zivid", "text", "ur",
          "kuka", "fanuc", "abb", "staubli", "yaskawa", "doosan")  # fmt: skip
 LENSES = ("camera-info", "kalibr", "oak")
 ARMS = ("robot-urdf", "robot-dh", "robot-json")

@@ -1,10 +1,9 @@
-"""The calibrated arm as a URDF, a DH table, UR's own file or JSON, and the table of corrections.
+"""The calibrated arm as a URDF, a DH table, UR's own file or JSON.
 
 What a format cannot hold of the arm is said in its comments and warnings.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -32,8 +31,8 @@ from visioncal.robot.writing import (
     without_functions,
 )
 
-# Numbers of postures for the largest error, and for fitting constant links.
-_POSTURES, _FITTED = 4000, 800
+# Number of postures for fitting constant links.
+_FITTED = 800
 # Weight of the workspace relative to the measured ranges: links fitted to a small range alone would
 # have large errors beyond it.
 _WORKSPACE_WEIGHT = 0.1
@@ -52,7 +51,6 @@ class ArmContent:
     # The arm with fitted constant links, where the format cannot hold it as a whole, and the
     # remaining error in words.
     links: tuple[Robot, str] | None = None
-    with_corrections: bool = False  # Whether the table of joint corrections is used with the links.
 
     @property
     def written(self) -> Robot:
@@ -134,32 +132,18 @@ class ArmContent:
         missing = (*unexportable_functions(self.robot), *sag)
         if not missing:
             return ""
-        text = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
-        if not self.with_corrections:
-            text += "Its links and offsets are those that leave the least of that"
-            return text if self.links is None else f"{text}: {self.links[1]}"
-        return (
-            f"{text}The table of joint-corrections goes with it: a reader without that is off by "
-            f"up to {joint_function_error_mm(self.written):.2g} mm{self.bending_error_words}"
+        text = (
+            f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. Its "
+            "links and offsets are those that leave the least of that"
         )
-
-    @property
-    def bending_error_words(self) -> str:
-        """What links and joint corrections together leave of an arm that bends."""
-        if self.links is None:
-            return ""
-        return (
-            ". Its links hold what they can of how it bends under its own weight; with both that "
-            f"leaves {self.links[1]}"
-        )
+        return text if self.links is None else f"{text}: {self.links[1]}"
 
 
 @dataclass(frozen=True)
 class ArmFormat(Format[ArmContent]):
     """A foreign format of arms."""
 
-    # Everything; links and offsets only; or joint functions for use with such links.
-    holds: Literal["all", "links", "functions"] = "all"
+    links_alone: bool = True  # Whether it holds links and offsets, and no functions of joints.
 
 
 def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
@@ -191,24 +175,15 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
             culprits=[form.name],
             next_step=f"{step}.",
         )
-    if form.holds == "functions" and not unexportable_functions(arm.robot):
-        raise DataError(
-            f"--to {form.name}: nothing was found of this arm's joints that is a function of "
-            "their angles: there is nothing to correct.",
-            culprits=[source.session_name],
-            next_step="--to robot-urdf and --to robot-dh hold all of its links and offsets.",
-        )
     if selection.convention is not None and selection.convention not in CONVENTIONS:
         raise DataError(
             f"There is no convention {selection.convention!r}; the names are "
             f"{', '.join(CONVENTIONS)}.",
             culprits=["--convention"],
         )
-    corrected = form.holds == "functions" or selection.with_corrections
-    loses = not corrected and bool(unexportable_functions(arm.robot))
     links = None
-    if form.holds != "all" and (loses or _sag_mm(source)):
-        robot = arm.robot if corrected else without_functions(arm.robot)
+    if form.links_alone and (unexportable_functions(arm.robot) or _sag_mm(source)):
+        robot = without_functions(arm.robot)
         # They are fitted over its measured ranges, where these are known, and the workspace.
         samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
         if arm.measured:
@@ -230,7 +205,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         places = ["where the arm was measured", "over the workspace"][-len(errors) :]
         links = fitted, ", ".join(map(" ".join, zip(errors, places, strict=True)))
     convention, known_hash = selection.convention, selection.calibration_hash
-    return ArmContent(source, nominal, arm.robot, convention, known_hash, links, corrected)
+    return ArmContent(source, nominal, arm.robot, convention, known_hash, links)
 
 
 def _sag_mm(calibration: Calibration) -> float:
@@ -243,23 +218,11 @@ def _sag_mm(calibration: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
 
 
-def joint_function_error_mm(robot: Robot) -> float:
-    """Largest flange error without gear ratios, eccentricity and harmonics [mm].
-
-    Over random postures within the joints' limits, at most a turn from zero.
-    """
-    q = postures(robot, _POSTURES)
-    differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
-    return 1e3 * float(np.linalg.norm(differences[:, :3, 3], axis=1).max())
-
-
 # A longer offset along an axis is an artefact of nearly parallel axes, whose common normal is far
 # away [m].
 _FAR_M = 10.0
 # Tolerance of the flange's pose, below which no note is needed [mm, deg].
 _TOLERANCE = 1e-4
-# Range of corrections for joints without limits [deg].
-_WIDEST_DEG = 360.0
 # Placeholder for an unknown hash, which no controller has.
 _NO_HASH = "calib_visioncal"
 
@@ -316,54 +279,21 @@ def _warn_ur(content: ArmContent) -> tuple[str, ...]:
     return warnings
 
 
-def _write_corrections(content: ArmContent) -> str:
-    """A table of corrections: a line for each joint and degree."""
-    robot, arm = content.written, content.calibration.arm
-    functions = None if arm is None else arm.functions
-    lines = [f"# {note}" for note in content.notes]
-    lines.append("joint,angle_deg,correction_deg,sigma_deg")
-    limits = np.rad2deg([robot.lower_rad, robot.upper_rad]).clip(-_WIDEST_DEG, _WIDEST_DEG)
-    for at, joint in enumerate(robot.joint_names):
-        if robot.chain.prismatic[at]:
-            continue
-        # One turn, or the joint's range if its gear ratio is not 1.
-        degrees = np.arange(-180, 180)
-        if robot.chain.functions[at, 1] != 1.0:
-            low, high = limits[:, at]
-            degrees = np.arange(int(np.floor(low)), int(np.ceil(high)) + 1)
-        angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
-        # The joint with its links alone: with its offset, and a ratio of 1.
-        sent = robot.chain.encoded(robot.chain.functions[:, 0] + angles)
-        corrections = np.rad2deg(sent - angles)[:, at]
-        sigmas = [""] * len(degrees)
-        if functions is not None:
-            nodes_deg = np.rad2deg(1e-3 * np.array(functions.joints[at].sigma_mrad))
-            nodes = np.linspace(-180.0, 180.0, len(nodes_deg), endpoint=False)
-            interpolated = np.interp(degrees, nodes, nodes_deg, period=360.0)
-            sigmas = [f"{value:.6f}" for value in interpolated.tolist()]
-        rows = zip(degrees.tolist(), corrections.tolist(), sigmas, strict=True)
-        lines += [f"{joint},{angle},{correction:.6f},{sigma}" for angle, correction, sigma in rows]
-    return "\n".join([*lines, ""])
-
-
 ARMS = (
     ArmFormat(
         "robot-urdf",
         "the calibrated arm as a URDF: the session's own with other origins, or a small one "
         "[m, rad]",
         _write_urdf,
-        takes=frozenset({"with-corrections"}),
         warn=_warn_urdf,
-        holds="links",
     ),
     ArmFormat(
         "robot-dh",
         "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati "
         "[m, rad]",
         lambda content: table_toml(content.table, "visioncal", content.all_notes),
-        takes=frozenset({"convention", "with-corrections"}),
+        takes=frozenset({"convention"}),
         warn=_warn_dh,
-        holds="links",
     ),
     ArmFormat(
         "ur-kinematics",
@@ -375,29 +305,15 @@ ARMS = (
             like=content.nominal_table,
             notes=content.all_notes,
         ),
-        takes=frozenset({"hash", "with-corrections"}),
+        takes=frozenset({"hash"}),
         warn=_warn_ur,
-        holds="links",
     ),
     ArmFormat(
         "robot-json",
         "the calibrated arm with all that was found: 4x4 placements, axes, joints' functions "
         "[m, rad]",
         lambda content: json_text({**content.robot.document, "source": "; ".join(content.notes)}),
-    ),
-    ArmFormat(
-        "joint-corrections",
-        "what to add to each joint's angle, degree by degree, for encoders that err (CSV) [deg]",
-        _write_corrections,
-        warn=lambda content: (
-            "It corrects what joints err by as functions of their angles, for the links and "
-            "offsets that --to robot-urdf, robot-dh or ur-kinematics writes --with-corrections: "
-            "send each joint to its angle and the correction there. Without it the flange of that "
-            f"arm is off by up to {joint_function_error_mm(content.written):.2g} mm"
-            f"{content.bending_error_words}.",
-            *(f"{name}." for name in content.omitted),
-        ),
-        holds="functions",
+        links_alone=False,
     ),
 )
 # Formats that hold the inertias of an arm's links.

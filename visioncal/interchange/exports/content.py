@@ -321,9 +321,7 @@ _OF_LENS = "it goes with the lens of that calibration: for other intrinsics, exp
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # Options that apply to formats: to all of transforms, and to some formats.
 OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child", "lens"]
-Takes: TypeAlias = (
-    OfTransforms | Literal["number", "load", "convention", "hash", "with-corrections"]
-)
+Takes: TypeAlias = OfTransforms | Literal["number", "load", "convention", "hash"]
 _OPTIONS: Mapping[Takes, str] = {"load": "--mass-kg and --cog-mm"}
 _T = TypeVar("_T")
 
@@ -355,7 +353,6 @@ class Selection:
     # Which robot of a cell: its part is exported as of one camera and robot.
     robot: str | None = None
     target: str | None = None  # Which target of a cell; likewise.
-    with_corrections: bool = False  # Whether the table of joint corrections is used with the arm.
     # A file with the lens of the receiving program, for which the camera's transform is written;
     # None for the calibration's own.
     lens: Path | None = None
@@ -447,7 +444,6 @@ class Format(Generic[_T]):
             "load": selection.load,
             "convention": selection.convention,
             "hash": selection.calibration_hash,
-            "with-corrections": selection.with_corrections,
             "lens": selection.lens,
         }
         given = [name for name, option in options.items() if option not in (None, False)]

@@ -233,8 +233,14 @@ def _urdf_joint(content: Content) -> str:
     )
 
 
-def _launch(first: str, notes: Sequence[str], contents: Sequence[Content]) -> str:
+def _write_launch(contents: Sequence[Content]) -> str:
     """Writes a launch file (tf2_ros, static_transform_publisher's named options)."""
+    if len(contents) == 1:
+        what = f"where {contents[0].child} is in {contents[0].parent}"
+        notes = _ros_notes(contents[0])
+    else:
+        what = "where all frames of a cell are"
+        notes = [contents[0].origin, *(note for one in contents for note in one.notes[1:])]
     nodes = ""
     for content in contents:
         pose = numbers(write_pose(content.matrix, POSE_FORMS["ros"]))
@@ -255,7 +261,7 @@ def _launch(first: str, notes: Sequence[str], contents: Sequence[Content]) -> st
             "        ),\n"
         )
     return (
-        f"{first}{comments('#', notes)}"
+        f'"""Publishes {what}."""\n\n{comments("#", notes)}'
         "from launch import LaunchDescription\n"
         "from launch_ros.actions import Node\n"
         "\n\n"
@@ -263,27 +269,6 @@ def _launch(first: str, notes: Sequence[str], contents: Sequence[Content]) -> st
         f"    nodes = [\n{nodes}    ]\n"
         "    return LaunchDescription(nodes)\n"
     )
-
-
-def _write_launch(content: Content) -> str:
-    first = f'"""Publishes where {content.child} is in {content.parent}."""\n\n'
-    return _launch(first, _ros_notes(content), [content])
-
-
-def _write_launches(contents: Sequence[Content]) -> str:
-    notes = [note for content in contents for note in content.notes[1:]]
-    first = '"""Publishes where all frames of a cell are."""\n\n'
-    return _launch(first, [contents[0].origin, *notes], contents)
-
-
-def _write_moveit(content: Content) -> str:
-    """Writes a launch file laid out as MoveIt 2's calibration does."""
-    # moveit_calibration, handeye_control_widget.cpp (ROS 2), puts the mount and both frames first.
-    # Its comment with Euler angles is left out: their order differs from the publisher's --roll,
-    # --pitch and --yaw.
-    mount = "" if content.mount is None else f"{content.mount.upper()}: "
-    first = f'""" {mount}{content.parent} -> {content.child} """\n'
-    return _launch(first, _ros_notes(content), [content])
 
 
 def _message(content: Content) -> dict[str, dict[str, float]]:
@@ -354,15 +339,9 @@ ROS_FORMATS = (
     ExportFormat(
         "ros-launch",
         "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
-        _write_launch,
+        lambda content: _write_launch([content]),
         frames=ROS_FRAMES,
-        write_all=_write_launches,
-    ),
-    ExportFormat(
-        "moveit",
-        "the same laid out as MoveIt 2's hand-eye calibration writes it [m, quaternion]",
-        _write_moveit,
-        frames=ROS_FRAMES,
+        write_all=_write_launch,
     ),
     ExportFormat(
         "easy-handeye",
