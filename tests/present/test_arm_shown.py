@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from support.arm_documents import NOT_TOLD, calibrated, stays_stated, with_holdout
+from support.arm_documents import calibrated, stays_stated, with_holdout
 from support.drawn import column
 from support.findings import with_findings
-from support.pages import Page, section
 from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, read_calibration, write_recording
 from visioncal.present.recording.accuracy import ArmPicture
-from visioncal.present.report.page import render
 from visioncal.present.viewer import blueprint
 from visioncal.results import Calibration, to_document
 
@@ -27,86 +25,6 @@ def sample() -> Sample:
 
 def with_arm(sample: Sample, document: dict[str, Any]) -> Calibration:
     return with_findings(sample, {"kinematics": document})
-
-
-def page_of(sample: Sample, document: dict[str, Any]) -> Page:
-    return Page(render(with_arm(sample, document), sample.session, sample.evidence))
-
-
-@pytest.fixture(scope="module")
-def html(sample: Sample) -> str:
-    return render(with_arm(sample, calibrated()), sample.session, sample.evidence)
-
-
-@pytest.fixture(scope="module")
-def page(html: str) -> Page:
-    return Page(html)
-
-
-@pytest.fixture(scope="module")
-def rows(page: Page) -> list[str]:
-    return [" ".join(row.split()) for row in page.rows]
-
-
-def of_arm(page: Page) -> str:
-    return section(page, "The arm Taken", "Where the uncertainty comes from")
-
-
-def test_the_levels_are_compared_and_the_taken_one_says_why(page, rows):
-    words = of_arm(page)
-    assert (
-        "Taken: geometry of the links. It predicts stops that are left out of the fit to 0.085 mm "
-        "and 0.0055 deg, the arm as stated to 0.79 mm and 0.086 deg."
-    ) in words
-    assert "the arm as stated 0 0.76 0.083 0.79 0.086 \N{EN DASH}" in rows
-    assert "offsets of the joints 6 0.61 0.063 0.66 0.067 24" in rows
-    assert "geometry of the links (taken) 36 0.073 0.0049 0.085 0.0055 1027" in rows
-    assert "a sigma of 0.071 mm (median; 95 % of the places: under 0.14 mm)" in words
-
-
-def test_parameters_have_their_change_with_the_digits_of_its_sigma(page, html, rows):
-    assert "a 0 1.20 +1.20 \N{PLUS-MINUS SIGN} 0.10 mm" in rows
-    alpha = "\N{GREEK SMALL LETTER ALPHA} 90 89.9885 -0.0115 \N{PLUS-MINUS SIGN} 0.0086"
-    assert f"{alpha} \N{DEGREE SIGN}" in rows
-    # What is held has no sigma.
-    assert "d -572.3 -572.300 0 mm" in rows
-    assert "eccentricity, sine 0 0.0688 +0.0688 \N{PLUS-MINUS SIGN} 0.0057 \N{DEGREE SIGN}" in rows
-    assert "2 of 4 changes are beyond three sigma" in of_arm(page)
-    sure = re.findall(r'<tr class="sure">(.*?)</tr>', html)
-    assert len(sure) == 2
-    assert all("+" in row for row in sure)
-
-
-def test_no_key_of_the_document_stands_in_the_section(page):
-    said = of_arm(page).replace(" ".join(NOT_TOLD.split()), "")
-    assert re.findall(r"\w+_\w+", said) == []
-
-
-def test_the_workspace_is_drawn_from_the_side_and_from_above(html):
-    for name in ("side", "top"):
-        assert f'aria-label="The workspace from the {name}, sigma 0.' in html
-    for label in ("base z [m]", "base x [m]", "sigma [mm]"):
-        assert label in html
-
-
-def test_views_held_back_stand_apart_from_those_left_out(sample, page):
-    held = page_of(sample, with_holdout())
-    assert "left out in turn held back by the session" in of_arm(held)
-    assert "held back by the session" not in of_arm(page)
-    # The residuals of those left out: 0.06 mm each, up to 0.85 mm with the arm as stated.
-    assert "rms 0.060" in of_arm(held)
-
-
-def test_the_pictures_have_words_for_those_who_do_not_see_them(html):
-    pictures = re.findall(r"<svg[^>]*>", html)
-    assert len(pictures) > 8
-    for picture in pictures:
-        assert "aria-label=" in picture or "aria-hidden" in picture
-
-
-def test_a_session_without_joints_has_no_arm(sample):
-    words = Page(render(sample.calibration, sample.session, sample.evidence)).words
-    assert "The arm" not in words
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,12 @@
 import re
 from dataclasses import replace
 
-import numpy as np
-from support.aligned_cells import made_up_cell, with_cell
+from support.aligned_cells import made_up_cell
 
 from visioncal.core.number_format import significant
-from visioncal.present.network_layout import pairs, weakest_frame
-from visioncal.present.report.network import known_in_each_other
-from visioncal.present.report.page import render, write_report
-from visioncal.results import Calibration, Moved, RobotResult, UnconnectedFrame, ViewResult
-from visioncal.results.arm import ArmLevel, ArmResult
+from visioncal.present.network_layout import pairs
+from visioncal.present.report.page import render
+from visioncal.results import Calibration, ViewResult
 
 CELL = made_up_cell(5)
 
@@ -51,48 +48,3 @@ def test_observations_are_counted_by_who_saw_whom():
     words = text_of(render_cell(replace(CELL, views=views)))
     assert "2 (\N{MINUS SIGN}1)" in words
     assert "view 2 not used cam_top of target_plate: disagrees" in words
-
-
-def test_the_table_has_any_frame_in_any_other():
-    table = next(known_in_each_other(CELL.tree))
-    assert table.titles == ("the cell", "base_a", "base_b", "cam_top")
-    rows = {row.cells[0]: row.cells[1:] for row in table.rows}
-    assert list(rows) == ["base_a", "base_b", "cam_top"]
-    edge = CELL.between("cam_top", "base_b")
-    assert rows["cam_top"][1].startswith(f"{significant(edge.sigma_mm)} mm")
-    assert rows["cam_top"][2] == ""
-
-
-def test_errors_of_robots_are_told_where_they_were_estimated():
-    levels = tuple(
-        ArmLevel(level=name, unknowns=6, rms_mm=mm, held_out_mm=mm, likelihood_ratio=0.0)
-        for name, mm in (("nominal", 0.31), ("offsets", 0.17))
-    )
-    arm = RobotResult(arm=ArmResult(level="offsets", levels=levels))
-    words = text_of(render_cell(with_cell(CELL, robots={"a": arm})))
-    assert "The arm of a Taken: offsets of the joints." in words
-    assert "left out of the fit to 0.17 mm, the arm as stated to 0.31 mm." in words
-    assert "The arm" not in text_of(render_cell(CELL))
-
-
-def test_what_moved_and_what_is_untied_is_told(tmp_path):
-    tree = {**CELL.cell.tree, "cam_top_until_stop_4": "cell"}
-    edges = {**CELL.edges, "cell_from_cam_top_until_stop_4": CELL.tree.edge_of("cam_top")}
-    found = with_cell(
-        replace(CELL, edges=edges, joint_covariance=np.pad(CELL.joint_covariance, (0, 6))),
-        tree=tree,
-        moved=(Moved("cam_top", "cam_top_until_stop_4", 4, 5, 0.58, 0.03, ("target_plate",)),),
-        untied=(UnconnectedFrame("cam_<far>", "Let it see target_plate."),),
-    )
-    write_report(tmp_path / "report.html", found, None, ())
-    html = (tmp_path / "report.html").read_text(encoding="utf-8")
-    words = text_of(html)
-    assert "Between stops 4 and 5. cam_top is where it stood last" in words
-    assert "It may have been target_plate instead" in words
-    assert "Let it see target_plate." in words
-    # Names are text, never markup.
-    assert "<far>" not in html
-    # The network shows the cell as it is now.
-    graph = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
-    assert "until_stop" not in graph
-    assert weakest_frame(found.tree) == weakest_frame(CELL.tree)

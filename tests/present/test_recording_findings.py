@@ -14,7 +14,6 @@ from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, write_recording
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.viewer import blueprint
-from visioncal.results import Calibration
 from visioncal.vision.targets import corner_positions, load_target
 
 
@@ -28,22 +27,6 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, sample.evidence, None)
     return path
-
-
-def figures(sample: Sample, calibration: Calibration) -> str:
-    return notes.result_markdown("figures", calibration, sample.session.boards).replace("\\", "")
-
-
-def test_the_figures_tell_what_a_sick_cell_suffers_from(sample: Sample) -> None:
-    text = figures(sample, with_findings(sample, sick()))
-    assert "| errors of the arm's links | 1.2 | 94 % |" in text
-    assert text.index("arm's links") < text.index("from stop to stop") < text.index("| total | 1.2")
-    assert "with a sigma of 1.2 mm; 95 % of such results are right to within 0.16 mm" in text
-    assert "- robot translation: 0.051 mm (95 %: 0.041 to 0.062)" in text
-    assert "- squares, found: 30.045 \N{MULTIPLICATION SIGN} 30.075 mm" in text
-    assert "- bend: 0.29 mm (of depth over its corners)" in text
-    assert "typically off by: 0.46 mm, 0.053 deg\n- likelihood ratio: 356" in text
-    assert "- its errors were: estimated along with the result" in text
 
 
 @pytest.mark.parametrize(

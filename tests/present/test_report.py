@@ -10,14 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.findings import CONTRADICTS, sick, with_contradiction, with_findings
+from support.findings import CONTRADICTS, with_contradiction
 from support.pages import Page, section
 from support.samples import REJECTED, Sample, made_up
 
 from visioncal.calibration.run import Run, run
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
-from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
@@ -25,14 +24,6 @@ from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report.page import render, write_report
 from visioncal.present.report.thumbnails import thumbnail
-from visioncal.results import (
-    Calibration,
-    Finding,
-    Remedy,
-    Rms,
-    Verdict,
-    VerdictStatus,
-)
 from visioncal.results.views import worst_view
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -47,79 +38,6 @@ def sample() -> Sample:
 @pytest.fixture(scope="module")
 def html(sample: Sample) -> str:
     return render(sample.calibration, sample.session, sample.evidence)
-
-
-def test_verdict_comes_first_with_its_reasons(sample: Sample, html: str) -> None:
-    words = Page(html).words
-    places = [words.index("Check before use")]
-    places += [words.index(reason) for reason in sample.calibration.verdict.reasons]
-    places += [words.index(heading) for heading in ("flange_from_cam", "base_from_target")]
-    places += [
-        words.index(heading)
-        for heading in ("How it was obtained", "Solvers compared", "All views", "Provenance")
-    ]
-    assert places == sorted(places)
-
-
-def test_every_view_has_a_row_and_every_reason_too(sample: Sample, html: str) -> None:
-    rows = [" ".join(row.split()) for row in Page(html).rows]
-    for view in sample.calibration.views:
-        end = "yes" if view.used else "no"
-        assert sum(row.startswith(f"{view.view} ") and row.endswith(f" {end}") for row in rows) == 1
-        if not view.used:
-            assert f"view {view.view} not used {view.reason}" in rows
-
-
-def with_outliers(sample: Sample, status: VerdictStatus) -> Calibration:
-    """The sample's calibration with two used views far from the others."""
-    views = tuple(
-        replace(view, residual_mm=9.5) if view.view in (1, 4) else view
-        for view in sample.calibration.views
-    )
-    tilted = Remedy("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
-    found = (
-        Finding("weak_motion", "Its z is weakly determined.", tilted),
-        Finding("place", "Its y is weakly determined.", tilted),
-        Finding("wrong_views", "View 1 is wrong.", Remedy("Look at it."), (1,), 0.9),
-        Finding("lens", "The lens is another.", Remedy("Measure it."), probability=0.3),
-        Finding("note", "It was cold."),
-    )
-    return replace(sample.calibration, views=views, verdict=Verdict(status, found))
-
-
-def test_wrong_views_are_named_and_marked(sample: Sample) -> None:
-    html = render(with_outliers(sample, "bad"), sample.session, sample.evidence)
-    words, rows = Page(html).words, [" ".join(row.split()) for row in Page(html).rows]
-    steps = words[words.index("What to do next") : words.index("camera position, sigma")]
-    assert steps.count("Add views tilted by 20 degrees.") == 1
-    assert steps.index("Look at it.") < steps.index("Add views") < steps.index("Measure it.")
-    for view in (1, 4):
-        assert any(row.startswith(f"view {view} used off by 9.5 mm") for row in rows)
-        assert any(row.startswith(f"{view} ") and row.endswith(" look") for row in rows)
-
-
-def test_three_findings_are_read_first_and_the_rest_is_folded(sample: Sample) -> None:
-    html = render(with_outliers(sample, "bad"), None, ())
-    first, folded = html.split("<details><summary>What else was found (2)")[:2]
-    assert "Most likely (90 %): View 1 is wrong." in first
-    assert "Possibly (30 %): The lens is another." in first
-    assert "Its z is weakly determined." in first
-    assert "It was cold." in folded.split("</details>")[0]
-
-
-def test_exact_cells_and_single_markers_have_a_report() -> None:
-    many = made_up(5, images=False)
-    documents = sick()
-    documents["uncertainty"]["budget_mm"] = {"poses": 0.0, "total": 0.0}
-    documents["uncertainty"]["spectrum"] = [0.0] * 12
-    documents["board"]["shape"]["bow_xy"] = 3e-4
-    marker = Target("marker", "marker", 1, 1, 0.1, 1e-4, dictionary="DICT_4X4_50", marker_id=7)
-    session = replace(many.session, target=marker)
-    words = Page(render(with_findings(many, documents), session, many.evidence)).words
-    assert "noise of the poses" in words
-    assert "depth [mm]" in words
-    assert "The largest part" not in words
-    assert "sigma / largest accepted" not in words
 
 
 def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
@@ -141,39 +59,6 @@ def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
     calibration = run(tmp_path / "cell").calibration
     assert sum(suspect.contradict for suspect in suspects(calibration)) == 1
     assert "the largest part" in Page(render(calibration, None, ())).words.lower()
-
-
-def test_views_that_share_a_reason_share_a_row(sample: Sample) -> None:
-    views = tuple(
-        replace(view, used=False, reason="blurred") if view.view in (0, 2, 5) else view
-        for view in sample.calibration.views
-    )
-    page = Page(render(replace(sample.calibration, views=views), None, ()))
-    assert "views 0, 2 and 5 not used blurred" in [" ".join(row.split()) for row in page.rows]
-    assert "Views not used" in page.words
-
-
-def test_joint_angles_get_a_plot_where_there_are_any(sample: Sample, html: str) -> None:
-    assert "q6 [deg]" in Page(html).text
-    views = tuple(
-        replace(
-            view, numbers={name: number for name, number in view.numbers.items() if name[0] != "q"}
-        )
-        for view in sample.session.views
-    )
-    without = render(sample.calibration, replace(sample.session, views=views), sample.evidence)
-    assert "Residuals over joint angles" not in Page(without).words
-
-
-def test_the_solver_that_gave_the_result_is_named(sample: Sample, html: str) -> None:
-    assert "joint (result)" in Page(html).words
-    park = sample.calibration.solvers["park"].matrices
-    edges = {
-        name: replace(edge, matrix=park[name]) for name, edge in sample.calibration.edges.items()
-    }
-    words = Page(render(replace(sample.calibration, edges=edges), None, ())).words
-    assert "park (result)" in words
-    assert "solver park a closed form" in words
 
 
 @pytest.fixture(scope="module")
@@ -277,23 +162,6 @@ def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html:
         assert cv2.imdecode(jpeg, cv2.IMREAD_COLOR) is not None
 
 
-def test_figures_are_those_of_the_calibration(sample: Sample, html: str) -> None:
-    words = Page(html).words
-    edge = sample.calibration.edges["flange_from_cam"]
-    for value in edge.matrix.ravel():
-        assert f"{value:.9f}" in words
-    assert sample.calibration.session_sha256 in words
-    assert f"{edge.sigma_mm:.2f} mm" in words
-
-
-def test_pose_pairs_leave_out_what_does_not_apply() -> None:
-    sample = made_up(images=False)
-    page = Page(render(sample.calibration, sample.session, sample.evidence))
-    for absent in ("Lens", "reprojection", "image x [px]", "Pictures", "data:image"):
-        assert absent not in page.text
-    assert "position [mm]" in page.text
-
-
 def test_spoilt_images_do_not_spoil_the_report(sample: Sample) -> None:
     files = {view.image: b"no image" for view in sample.session.views[:5]}
     files[sample.session.views[5].image] = b""
@@ -325,17 +193,6 @@ def test_pictures_of_one_row_are_drawn(size: tuple[int, int]) -> None:
     assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
 
 
-def test_one_used_view_and_no_residuals_still_give_a_report(sample: Sample) -> None:
-    views = tuple(
-        replace(view, residual_mm=0.0, residual_deg=None, rms_px=None)
-        for view in sample.calibration.views[:1]
-    )
-    poor = replace(sample.calibration, views=views, rms=Rms(0.0, 0.0), solvers={})
-    page = Page(render(poor, sample.session, sample.evidence))
-    assert "1 of 1" in page.words
-    assert "Solvers compared" not in page.words
-
-
 def test_many_corners_become_a_bitmap() -> None:
     many = made_up(90, images=True)
     html = render(many.calibration, None, many.evidence)
@@ -347,15 +204,6 @@ def test_many_corners_become_a_bitmap() -> None:
     bitmap = cv2.imdecode(np.frombuffer(base64.b64decode(uri), np.uint8), cv2.IMREAD_UNCHANGED)
     # Dots on nothing.
     assert 0.0 < np.mean(bitmap[:, :, 3] > 0) < 1.0
-
-
-def test_report_is_whole_or_absent(sample: Sample, tmp_path: Path) -> None:
-    path = tmp_path / "report.html"
-    write_report(path, sample.calibration, sample.session, sample.evidence)
-    assert path.read_text(encoding="utf-8").endswith("</html>")
-    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
-    with pytest.raises(DataError, match="cannot be written"):
-        write_report(tmp_path / "absent" / "report.html", sample.calibration, None, ())
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 from support.aligned_cells import made_up_cell, with_cell
-from support.pages import Page
 from support.samples import made_up
 
 from visioncal.core.number_format import significant
-from visioncal.present import facts, result_parts
+from visioncal.present import result_parts
 from visioncal.present.recording.notes import result_markdown, table_lines
-from visioncal.present.report.page import render
 from visioncal.present.tables import Table, TableRow
-from visioncal.results import Moved, ViewResult
+from visioncal.results import Moved
 
 CELL = made_up_cell(3)
 
@@ -44,19 +42,6 @@ def test_cells_of_a_table_are_text_in_markdown():
     ]
 
 
-def test_page_and_recording_have_the_same_figures():
-    sample = made_up()
-    for calibration in (sample.calibration, CELL):
-        words = Page(render(calibration, None, ())).words
-        text = result_markdown("figures", calibration).replace("\\", "")
-        for fact in facts.noise_facts(calibration):
-            assert f"{fact.label} {fact.value}" in words
-            assert f"- {fact.label}: {fact.value}" in text
-        for row in facts.residual_table(calibration).rows:
-            assert " ".join(row.cells) in words
-            assert f"| {' | '.join(row.cells)} |" in text
-
-
 def test_one_camera_has_one_of_each_without_a_name():
     calibration = made_up().calibration
     assert result_parts.cameras(calibration) == {"": calibration.camera}
@@ -86,11 +71,3 @@ def test_frames_of_a_cell_hang_as_they_did_last():
     # The frame of the cell is that of its reference.
     np.testing.assert_array_equal(frames.matrices[CELL.cell.reference], np.eye(4))
     assert "Between stops 4 and 5." in result_markdown("verdict", moved).replace("\\", "")
-
-
-def test_views_left_out_of_a_cell_say_who_saw_whom():
-    of = {"seer": "cam_top", "seen": "target_plate"}
-    views = tuple(ViewResult(name, False, "blurred", **of, stop=name) for name in (3, 4))
-    text = result_markdown("verdict", replace(CELL, views=views))
-    assert "- views 3 and 4 (cam_top of target_plate): blurred" in text.replace("\\", "")
-    assert "0 of 2 views used" in text
