@@ -224,7 +224,7 @@ def test_what_cannot_be_checked_is_said(tmp_path):
         (("--payload", "2,0,0"), "--payload is '2,0,0'; kg,x,y,z is needed"),
         (("--payload", "-2,0,0,0"), "a mass of 0 kg or more"),
         (("--tool", "100,0"), "a length and a radius above zero"),
-        (("--speed-deg", -5), "a number above zero is needed"),
+        (("--speed-deg", -5), "--speed-deg"),
         (("--speed", 2), "speed is 2.0; 0.01 to 1 is needed"),
         (("--floor", 1900), "no posture was found from which its joints could sweep"),
         (("--floor", 1900, "--no-sweeps"), "none of 2000 postures within the limits is clear"),

@@ -1,26 +1,17 @@
 """`visioncal locate`, and `tcp` and `fixture` with images, as a user runs them."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.commands import visioncal
 from support.imaged import Shot, calibrated_cell, picture, session_of, shots
 from support.plates import CENTRES, marked_plate, plate_session
 from support.samples import fixture_frame
 
-from visioncal.cli.framing import fixture_command, tcp_command
-from visioncal.cli.locate import locate_command
-from visioncal.cli.options import PartOptions
-from visioncal.cli.result_options import (
-    FixtureOptions,
-    FrameOptions,
-    LocateOptions,
-    TcpOptions,
-    TouchOptions,
-)
-from visioncal.core.errors import DataError
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import locate
 from visioncal.results import Calibration, Edge, FrameFile, Verdict
@@ -29,11 +20,32 @@ IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
 PIXEL = "700,350"
 
 
-def _placed(command, source, calibration=None, *, out=None, name=None, touch_noise=None, **rest):
-    goes = FrameOptions(calibration=calibration, out=out, name=name)
-    written = TouchOptions(touch_noise=touch_noise)
-    record = FixtureOptions if command is fixture_command else TcpOptions
-    command(record(goes=goes, written=written, part=PartOptions(), touches=source, **rest))
+# Options whose names have a unit.
+NAMES = {"plane_sigma": "plane-sigma-mm", "point": "point-mm", "touch_noise": "touch-noise-mm"}
+
+
+def run(command, source=None, *flags, **options):
+    """Runs a command with options by their names; None for those that are not given."""
+    words = [*flags] if source is None else [source, *flags]
+    for name, given in options.items():
+        values = given if isinstance(given, list) else [given]
+        words += [f"--{NAMES.get(name, name)}={value}" for value in values if value is not None]
+    return visioncal(command, *words)
+
+
+def done(*words, **options):
+    """What a command prints."""
+    ended = run(*words, **options)
+    assert ended.status == 0, ended.err
+    return ended.out
+
+
+def refused(expected, *words, **options):
+    """Checks that a command ends with status 2 and a message, and returns what it says."""
+    ended = run(*words, **options)
+    assert ended.status == 2
+    assert re.search(expected, ended.err), ended.err
+    return ended.err
 
 
 @pytest.fixture(scope="module", params=[IN_HAND, TO_HAND])
@@ -52,10 +64,9 @@ def cell(request, tmp_path_factory):
     return made, folder / "calibration.json", folder / "part"
 
 
-def shown(capsys, **options):
+def shown(source=None, **options):
     """What `locate --json` prints."""
-    locate_command(LocateOptions(**options, as_json=True))
-    return json.loads(capsys.readouterr().out)
+    return json.loads(done("locate", source, "--json", **options))
 
 
 def pose_words(pose):
@@ -63,11 +74,11 @@ def pose_words(pose):
     return ",".join(repr(float(value)) for value in [*pose[:3, 3], *turn])
 
 
-def test_every_view_tells_where_the_target_is(cell, capsys):
+def test_every_view_tells_where_the_target_is(cell):
     made, calibration, session = cell
     to_hand = made.options.mount == TO_HAND
     point = np.array([0.135, 0.09, 0.0])
-    places = shown(capsys, source=session, calibration=calibration, point="135,90,0")
+    places = shown(source=session, calibration=calibration, point="135,90,0")
     # A camera that stands still needs no pose of the robot.
     assert [place["view"] for place in places] == [30, 31, 32, *([33] if to_hand else [])]
     for place in places:
@@ -83,37 +94,32 @@ def test_every_view_tells_where_the_target_is(cell, capsys):
         )
         assert place["budget_mm"]["total"] < 2.0
         assert place["warnings"] == []
-    locate_command(LocateOptions(source=session, calibration=calibration, view=31))
-    told = capsys.readouterr()
-    assert told.out.startswith("view 31: (")
-    assert "95 % within" in told.out
-    assert told.out.count("\n") == 1
-    locate_command(LocateOptions(source=session, calibration=calibration))
-    lost = capsys.readouterr().err
+    told = done("locate", session, calibration=calibration, view=31)
+    assert told.startswith("view 31: (")
+    assert "95 % within" in told
+    assert told.count("\n") == 1
+    lost = run("locate", session, calibration=calibration).err
     assert ("view 33: no pose of the robot" in lost) == (not to_hand)
 
 
-def test_one_image_needs_a_target_and_a_pose(cell, capsys, tmp_path):
+def test_one_image_needs_a_target_and_a_pose(cell, tmp_path):
     made, calibration, session = cell
     image = tmp_path / "shot.png"
     image.write_bytes(picture(made.options.mount, 1))
     pose = None if made.options.mount == TO_HAND else pose_words(made.robot.base_from_flange[1])
     wanted = {"source": image, "calibration": calibration, "target": "charuco_9x6_30mm"}
-    (found,) = shown(capsys, **wanted, pose=pose)
-    (same,) = shown(capsys, source=session, calibration=calibration, view=31)
+    (found,) = shown(**wanted, pose=pose)
+    (same,) = shown(source=session, calibration=calibration, view=31)
     assert found["image"] == "shot.png"
     np.testing.assert_allclose(found["p_base_m"], same["p_base_m"], atol=1e-9)
-    with pytest.raises(DataError, match="--target is needed"):
-        locate_command(LocateOptions(source=image, calibration=calibration))
-    with pytest.raises(DataError, match=r"shot\.png: target checkerboard"):
-        locate_command(LocateOptions(**wanted | {"target": "checkerboard_9x6_25mm"}, pose=pose))
+    refused("--target is needed", "locate", image, calibration=calibration)
+    other = wanted | {"target": "checkerboard_9x6_25mm"}
+    refused(r"shot\.png: target checkerboard", "locate", **other, pose=pose)
     if pose is not None:
-        with pytest.raises(DataError, match="robot's pose at the image is missing") as caught:
-            locate_command(LocateOptions(**wanted))
-        assert "--pose" in caught.value.next_step
+        assert "--pose" in refused("robot's pose at the image is missing", "locate", **wanted)
 
 
-def test_pixels_are_placed_on_planes(cell, capsys):
+def test_pixels_are_placed_on_planes(cell):
     made, file, session = cell
     at = None if made.options.mount == TO_HAND else made.robot.base_from_flange[1]
     given = {"calibration": file, "pose": None if at is None else pose_words(at)}
@@ -121,34 +127,32 @@ def test_pixels_are_placed_on_planes(cell, capsys):
     (expected,) = locate(Calibration.load(file), np.array([[700.0, 350.0]]), plane, at)
     forms = ["z=-50", "0,0,2,-100", "0,0,-1,50"]
     for words in forms:
-        (found,) = shown(capsys, pixel=[PIXEL], plane=words, plane_sigma=0.2, **given)
+        (found,) = shown(pixel=[PIXEL], plane=words, plane_sigma=0.2, **given)
         assert found["pixel"] == [700.0, 350.0]
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-12)
         np.testing.assert_allclose(found["covariance"], expected.covariance, atol=1e-18)
-    both = shown(capsys, pixel=[PIXEL, "600,500"], plane="z=-50", **given)
+    both = shown(pixel=[PIXEL, "600,500"], plane="z=-50", **given)
     assert [value["pixel"] for value in both] == [[700.0, 350.0], [600.0, 500.0]]
     assert "plane" not in both[0]["budget_mm"]
     # The jig's frame is the base's own, and not known exactly.
     for words in ("jig:z=-50", "base_from_jig:z=-50"):
-        (found,) = shown(capsys, pixel=[PIXEL], plane=words, **given)
+        (found,) = shown(pixel=[PIXEL], plane=words, **given)
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-12)
         assert found["budget_mm"]["plane"] > 0.1
-    (found,) = shown(capsys, pixel=[PIXEL], plane="loose", **given)
+    (found,) = shown(pixel=[PIXEL], plane="loose", **given)
     assert "The verdict of base_from_loose is bad: Loose." in found["warnings"]
     if at is not None:
         wanted = {"source": session, "calibration": file, "pixel": [PIXEL], "plane": "z=-50"}
-        (found,) = shown(capsys, **wanted, view=31)
+        (found,) = shown(**wanted, view=31)
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-9)
-        with pytest.raises(DataError, match=r"4 views, .* --view is needed"):
-            locate_command(LocateOptions(**wanted))
-        with pytest.raises(DataError, match=r"view 33 .* has no pose of the robot"):
-            locate_command(LocateOptions(**wanted, view=33))
+        refused(r"4 views, .* --view is needed", "locate", **wanted)
+        refused(r"view 33 .* has no pose of the robot", "locate", **wanted, view=33)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"calibration": None}, r"calibration \(-c\) is needed"),
+        ({"calibration": None}, "Missing option '-c'"),
         ({"calibration": "nowhere"}, "nowhere"),
         ({}, "nothing to look for"),
         ({"source": "part", "plane": "z=1"}, "--plane: it is for --pixel"),
@@ -183,16 +187,15 @@ def test_mistakes_are_named(cell, options, words):
         options["source"] = session.parent / options["source"]
     if options["calibration"] == "nowhere":
         options["calibration"] = session.parent / "nowhere"
-    with pytest.raises(DataError, match=words):
-        locate_command(LocateOptions(**options))
+    refused(words, "locate", **options)
 
 
-def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):
+def test_a_frame_from_images_joins_the_calibration(tmp_path):
     cell, calibration = calibrated_cell(TO_HAND)
     calibration.save(tmp_path / "calibration.json")
     session_of(cell, shots(cell, 4)).save(tmp_path / "part")
-    _placed(tcp_command, tmp_path / "part", tmp_path, name="gripper", point="0,0,-120")
-    told = capsys.readouterr().out
+    at = {"calibration": tmp_path}
+    told = done("tcp", tmp_path / "part", **at, name="gripper", point="0,0,-120")
     assert told.startswith("good  flange_from_gripper")
     assert "its point (0, 0, -120) mm" in told
     kept = Calibration.load(tmp_path).frames["flange_from_gripper"]
@@ -202,8 +205,8 @@ def test_a_frame_from_images_joins_the_calibration(capsys, tmp_path):
     assert 1e3 * np.linalg.norm(kept.edge.matrix[:3, 3] - tip) < 4 * kept.edge.sigma_mm
     assert "flange_from_gripper" in (tmp_path / "report.html").read_text(encoding="utf-8")
     file = tmp_path / "frames.json"
-    _placed(tcp_command, tmp_path / "part", tmp_path, out=file, as_json=True)
-    assert json.loads(capsys.readouterr().out).keys() == {"flange_from_tool"}
+    told = done("tcp", tmp_path / "part", "--json", **at, out=file)
+    assert json.loads(told).keys() == {"flange_from_tool"}
     assert FrameFile.load(file).frames.keys() == {"flange_from_tool"}
 
 
@@ -214,36 +217,30 @@ def test_options_and_sources_that_do_not_fit_are_named(tmp_path):
     session_of(cell, shots(cell, 2)).save(part)
     session_of(cell, shots(cell, 2), kind=["", "point"]).save(both)
     table.write_text("x_m,y_m,z_m,qx,qy,qz,qw\n0,0,1,0,0,0,1\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"images \(view 30\) and touches \(.* view 31\)"):
-        _placed(tcp_command, both, tmp_path)
-    with pytest.raises(DataError, match=r"the camera's calibration \(-c\) is needed"):
-        _placed(tcp_command, part)
-    with pytest.raises(DataError, match="--touch-noise-mm: session 'the part' has images"):
-        _placed(tcp_command, part, tmp_path, touch_noise=0.1)
-    with pytest.raises(DataError, match="--tool: session 'the part' has images"):
-        _placed(fixture_command, part, tmp_path, tool="none")
-    for command in (tcp_command, fixture_command):
-        with pytest.raises(DataError, match="--point-mm: touches say"):
-            _placed(command, table, tmp_path, point="1,2,3")
-        with pytest.raises(DataError, match="--point-mm is 'up'"):
-            _placed(command, part, tmp_path, point="up")
+    at = {"calibration": tmp_path}
+    refused(r"images \(view 30\) and touches \(.* view 31\)", "tcp", both, **at)
+    refused(r"the camera's calibration \(-c\) is needed", "tcp", part)
+    message = "--touch-noise-mm: session 'the part' has images"
+    refused(message, "tcp", part, **at, touch_noise=0.1)
+    refused("--tool: session 'the part' has images", "fixture", part, **at, tool="none")
+    for command in ("tcp", "fixture"):
+        refused("--point-mm: touches say", command, table, **at, point="1,2,3")
+        refused("--point-mm is 'up'", command, part, **at, point="up")
     cad = tmp_path / "cad.csv"
     cad.write_text("point,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n3,0,9,0\n", encoding="utf-8")
-    with pytest.raises(DataError, match="a charuco; beside a drawing"):
-        _placed(fixture_command, part, tmp_path, cad=cad)
-    with pytest.raises(DataError, match="beside --cad the drawing's origin"):
-        _placed(fixture_command, part, tmp_path, cad=cad, point="1,2,3")
+    refused("a charuco; beside a drawing", "fixture", part, **at, cad=cad)
+    message = "beside --cad the drawing's origin"
+    refused(message, "fixture", part, **at, cad=cad, point="1,2,3")
 
 
-def test_markers_place_a_fixture_from_the_command_line(capsys, tmp_path):
+def test_markers_place_a_fixture_from_the_command_line(tmp_path):
     calibration, base_from_plate, sights = marked_plate()
     calibration.save(tmp_path / "calibration.json")
     plate_session(sights).save(tmp_path / "plate")
     cad = tmp_path / "cad.csv"
     lines = [f"{name},{x},{y},0.0" for name, (x, y) in CENTRES.items()]
     cad.write_text("\n".join(["point,x_m,y_m,z_m", *lines]), encoding="utf-8")
-    _placed(fixture_command, tmp_path / "plate", tmp_path, cad=cad, name="plate")
-    told = capsys.readouterr().out
+    told = done("fixture", tmp_path / "plate", calibration=tmp_path, cad=cad, name="plate")
     assert "best fit of 4 points to cad.csv" in told
     # Markers in one plane have no hand, and the drawing's z points into the plate.
     assert "the side that the camera looked from" in " ".join(told.split())

@@ -1,9 +1,8 @@
 """`visioncal batch`."""
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answers
+from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answer
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import BatchOptions
 from visioncal.core.errors import DataError
@@ -29,10 +28,10 @@ def batch_command(options: BatchOptions) -> None:
             against=options.against,
             progress=progress,
         )
-    console, counts = answers(), found.counts
+    counts = found.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
-    console.print(f"{len(found.rows)} sessions: {words}")
+    answer(f"{len(found.rows)} sessions: {words}")
     lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
     lines += [f"{row.name}: {row.change}" for row in found.rows if row.changed][:_MOST_NAMED]
     failed = [
@@ -41,8 +40,8 @@ def batch_command(options: BatchOptions) -> None:
         if row.state == "failed"
     ]
     for line in [*lines, *failed[:_MOST_NAMED]]:
-        console.print(escape(f"  {line}"))
-    console.print(escape(f"written: {found.page}, {found.table}"))
+        answer(f"  {line}")
+    answer(f"written: {found.page}, {found.table}")
     if found.is_cut_short:
         done = sum(row.state != "failed" for row in found.rows)
         raise DataError(

@@ -5,7 +5,6 @@ import typer
 from visioncal.calibration.pipeline.run_state import CalibrationOptions
 from visioncal.calibration.run import run
 from visioncal.cli.console import exit_status, report_written, say, with_run_paths
-from visioncal.cli.parsing import views_in
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
@@ -23,7 +22,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
     with with_run_paths(session, options.out):
         loaded = _joined(options)
         if options.views is not None:
-            loaded = loaded.only(views_in(options.views, "--views"))
+            loaded = loaded.only(options.views)
     asked = CalibrationOptions(
         solver=options.solver,
         level=options.level,

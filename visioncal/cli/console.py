@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # is bad, or a check failed (verify).
 _EXIT_BUG, EXIT_NO_RESULT, EXIT_BAD = 1, 2, 3
 _LISTED_CULPRITS = 10
+_LEAST_WIDTH = 110  # of tables
 _SHORT = 12  # culprits of fewer characters share a line
 
 
@@ -32,16 +33,33 @@ def messages() -> "Console":
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def say(words: str) -> None:
-    """Prints a message without markup."""
-    messages().print(words, markup=False)
+def answers() -> "Console":
+    """The console for results: stdout."""
+    from rich.console import Console
+
+    return Console(highlight=False, soft_wrap=True)
+
+
+def say(words: str, label: str = "", style: str = "bold") -> None:
+    """Prints a message as it is, after a label in a style."""
+    _print(messages(), words, label, style)
 
 
 def warn(words: str) -> None:
     """Prints a warning about the result."""
-    from rich.markup import escape
+    say(words, "warning: ", "bold yellow")
 
-    messages().print(f"[bold yellow]warning:[/] {escape(words)}")
+
+def answer(words: str, label: str = "", style: str = "bold") -> None:
+    """Prints a line of the result as it is, after a label in a style."""
+    _print(answers(), words, label, style)
+
+
+def _print(console: "Console", words: str, label: str, style: str) -> None:
+    from rich.text import Text
+
+    # No markup: names and texts of files may have brackets.
+    console.print(Text.assemble((label, style), words))
 
 
 def print_json(document: object) -> None:
@@ -49,11 +67,27 @@ def print_json(document: object) -> None:
     typer.echo(json.dumps(document, indent=2))
 
 
-def answers(*, markup: bool = True) -> "Console":
-    """The console for results: stdout."""
-    from rich.console import Console
+def print_table(
+    titles: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    caption: str = "",
+    bold: int | None = None,
+    is_message: bool = False,
+) -> None:
+    """Prints a table of plain texts without frames, one row in bold; numbers are not folded."""
+    from rich.table import Column, Table
+    from rich.text import Text
 
-    return Console(highlight=False, soft_wrap=True, markup=markup)
+    first, *rest = map(Text, titles)
+    columns = (Column(first, no_wrap=True), *(Column(name, overflow="fold") for name in rest))
+    table = Table(*columns, box=None, pad_edge=False, caption=caption, caption_justify="left")
+    for at, cells in enumerate(rows):
+        table.add_row(*map(Text, cells), style="bold green" if at == bold else "")
+    console = messages() if is_message else answers()
+    # Names of cells' frames are long, and are not truncated.
+    console.width = max(console.width, _LEAST_WIDTH)
+    console.print(table)
 
 
 def asked(question: str) -> str:
@@ -71,8 +105,6 @@ def asked(question: str) -> str:
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
     """Prints an error as one message to stderr, and with `as_json` as JSON to stdout, too."""
-    from rich.markup import escape
-
     next_step = error.next_step
     if not next_step and error.culprits and isinstance(error, DataError):
         # The message says what is needed.
@@ -85,17 +117,16 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
             "next": next_step,
         }
         print_json({"error": document})
-    console = messages()
-    console.print(f"[bold red]error:[/] {escape(error.message)}")
+    say(error.message, "error: ", "bold red")
     other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
     if all(len(name) < _SHORT for name in other_culprits):
         other_culprits = [", ".join(other_culprits)] if other_culprits else []
     for culprit in other_culprits[:_LISTED_CULPRITS]:
-        console.print(f"  - {escape(culprit)}")
+        say(f"  - {culprit}")
     if len(other_culprits) > _LISTED_CULPRITS:
-        console.print(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
+        say(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
     if next_step:
-        console.print(escape(next_step))
+        say(next_step)
 
 
 def exit_status(verdict: "Verdict") -> int:
@@ -139,15 +170,14 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
     Raises:
         typer.Exit: The status is not 0.
     """
-    from rich.markup import escape
-
     for file in () if quiet else written.files:
         say(f"wrote {file}")
     for undrawn in written.failed_drawings:
-        messages().print(
-            f"[bold red]bug:[/] {escape(f'{undrawn.file} could not be drawn ({undrawn.cause}).')}\n"
-            f"The result is safe in {escape(str(written.files[0]))}. Please report this, with the "
-            "session if it can be given away."
+        say(
+            f"{undrawn.file} could not be drawn ({undrawn.cause}).\nThe result is safe in "
+            f"{written.files[0]}. Please report this, with the session if it can be given away.",
+            "bug: ",
+            "bold red",
         )
     if status or written.failed_drawings:
         raise typer.Exit(status or _EXIT_BUG)

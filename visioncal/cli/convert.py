@@ -5,12 +5,9 @@ from dataclasses import replace
 from functools import partial
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
 from visioncal.calibration.guess import Candidate
-from visioncal.cli.console import messages, say
-from visioncal.cli.parsing import names_in, pair_in, size_in
+from visioncal.cli.console import print_table, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
@@ -25,11 +22,13 @@ from visioncal.interchange.formats import (
 def convert_command(options: ConvertOptions) -> None:
     """Runs `visioncal convert`."""
     written = options.written
-    camera_columns = names_in(written.camera_columns, "--camera-columns")
     requested = replace(
         import_options(written),
         camera=PoseImportOptions(
-            camera_columns, written.camera_form, written.camera_unit, written.camera_inverse
+            written.camera_columns or (),
+            written.camera_form,
+            written.camera_unit,
+            written.camera_inverse,
         ),
         image=written.image_column,
         camera_file=written.camera_file,
@@ -38,14 +37,9 @@ def convert_command(options: ConvertOptions) -> None:
         intrinsics=written.intrinsics,
         images=written.images,
         corners=written.corners,
-        resolution=None if written.resolution is None else size_in(written.resolution),
+        resolution=written.resolution,
         tip=written.tip,
     )
-    if options.yes and not options.guess:
-        raise DataError("--yes takes the best guess; it needs --guess.", culprits=["--yes"])
-    if options.mirror_poses and not options.guess:
-        words = "--mirror-poses is for what a guess finds; it needs --guess."
-        raise DataError(words, culprits=["--mirror-poses"])
     choose = partial(_chosen, yes=options.yes) if options.guess else None
     session = convert(
         options.source,
@@ -55,7 +49,7 @@ def convert_command(options: ConvertOptions) -> None:
         force=options.force,
         choose=choose,
         mirrors_poses=options.mirror_poses,
-        exchange=None if options.exchange is None else pair_in(options.exchange, "--exchange"),
+        exchange=options.exchange,
     )
     for warning in session.warnings:
         say(f"note: {warning}")
@@ -63,15 +57,12 @@ def convert_command(options: ConvertOptions) -> None:
 
 
 def import_options(poses: RobotPoseOptions) -> ImportOptions:
-    """The import options of a robot's poses.
-
-    Raises:
-        DataError: A name is empty or occurs twice.
-    """
-    columns = names_in(poses.robot_columns, "--robot-columns")
+    """The import options of a robot's poses."""
     return ImportOptions(
-        robot=PoseImportOptions(columns, poses.robot_form, poses.robot_unit, poses.robot_inverse),
-        joints=names_in(poses.joint_columns, "--joint-columns"),
+        robot=PoseImportOptions(
+            poses.robot_columns or (), poses.robot_form, poses.robot_unit, poses.robot_inverse
+        ),
+        joints=poses.joint_columns or (),
         joints_deg=poses.joint_unit == "deg",
         robot_model=poses.robot_model,
     )
@@ -81,15 +72,16 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and returns the clearly best or confirmed one."""
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
-    console = messages()
-    table = Table("reading", "chain closes to", "views that agree", box=None, pad_edge=False)
-    for candidate in guess.candidates:
-        cells = (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
-        table.add_row(*map(escape, cells), style="bold green" if candidate is guess.best else "")
-    console.print(table)
-    console.print(escape(guess.sentence))
-    for note in guess.notes:
-        console.print(escape(f"note: {note}"))
+    print_table(
+        ("reading", "chain closes to", "views that agree"),
+        [
+            (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
+            for candidate in guess.candidates
+        ],
+        bold=guess.candidates.index(guess.best),
+        is_message=True,
+    )
+    say("\n".join([guess.sentence, *(f"note: {note}" for note in guess.notes)]))
     if not guess.stands_out:
         if guess.declared.closes:
             return guess.declared

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import answers, check_usable, messages, print_json, say, warn
+from visioncal.cli.console import answer, check_usable, print_json, say, warn
 from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
 from visioncal.core.errors import DataError
@@ -34,7 +33,6 @@ from visioncal.session.columns import column_of
 from visioncal.session.selecting import ARM, EYE
 
 _MOST_SHOWN = 10
-_MOST_DEG = 720.0
 # Away from singularities a millimetre turns joints by some tenths of a degree at most; beyond the
 # second limit the exact value does not matter.
 _SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
@@ -58,12 +56,6 @@ def correct_command(options: CorrectOptions) -> None:
     if file is not None:
         check_free(file, force=options.force)
     targets = read_targets(options.targets, arm.real)
-    if not 0.0 < options.widest_deg <= _MOST_DEG:
-        raise DataError(
-            f"--widest-deg is {options.widest_deg:g}; degrees above 0 and up to {_MOST_DEG:g} are "
-            "needed.",
-            culprits=["--widest-deg"],
-        )
     flange_from_tool = _tool(calibration, options.tool)
     base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
     corrected = correct(
@@ -74,7 +66,7 @@ def correct_command(options: CorrectOptions) -> None:
         loads=Loads.alike(
             len(base_from_flange),
             options.payload_kg,
-            numbers_in(options.payload_m, "--payload-m", "x,y,z"),
+            options.payload_m,
             (0.0, 0.0, 0.0),
         ),
     )
@@ -253,7 +245,6 @@ def _report(
     *,
     is_answer: bool,
 ) -> None:
-    console = messages()
     mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
     words = (
         f"{len(rows)} of {len(rows) + len(unreachable)} targets corrected: moved by "
@@ -263,10 +254,10 @@ def _report(
     if "sigma_mm" in columns:
         words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
     # Where stdout has no table, this is the command's answer.
-    (answers() if is_answer else console).print(escape(words))
+    (answer if is_answer else say)(words)
     for place, why in unreachable[:_MOST_SHOWN]:
-        console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")
+        say(f"{place}: {why}", "left out: ", "bold yellow")
     if len(unreachable) > _MOST_SHOWN:
-        console.print(f"  and {len(unreachable) - _MOST_SHOWN} more")
+        say(f"  and {len(unreachable) - _MOST_SHOWN} more")
     for warning in warnings:
         warn(warning)

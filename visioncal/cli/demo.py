@@ -6,10 +6,17 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import typer
 
 from visioncal.calibration.run import run
-from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_error, report_written, say
+from visioncal.cli.console import (
+    EXIT_BAD,
+    answer,
+    exit_status,
+    print_table,
+    report_error,
+    report_written,
+    say,
+)
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import (
     RecordedSetup,
@@ -20,7 +27,7 @@ from visioncal.cli.record import (
     scene_of,
 )
 from visioncal.cli.session_options import DemoOptions
-from visioncal.cli.summary import print_summary, truth_table
+from visioncal.cli.summary import print_summary, truth_rows
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.quantiles import chi2_limit
@@ -127,8 +134,6 @@ _CHANCE, _SIGMA_FACTOR = 1e-3, 1.5
 
 def demo_command(options: DemoOptions) -> None:
     """Runs `visioncal demo`."""
-    if options.fault is not None and not options.live:
-        raise typer.BadParameter("--fault belongs to --live.")
     if options.live:
         client_library("rtde_control", "ur")
     session, result = options.out / "session", options.out / "result"
@@ -153,10 +158,11 @@ def demo_command(options: DemoOptions) -> None:
         written = write_outputs(result, loaded, done)
     print_summary(done.calibration, verbose=True)
     truth = read_truth(session)
-    answers().print(truth_table(done.calibration, truth.transforms, truth.camera))
+    rows = truth_rows(done.calibration, truth.transforms, truth.camera)
+    print_table(("against the truth", "error", "sigma", "error / sigma"), rows)
     squared, limit = chi_square(done.calibration, truth)
     verb = "is explained by" if squared <= limit else "is more than"
-    answers().print(
+    answer(
         f"the error {verb} the sigmas: chi-square {squared:.1f}, and up to {limit:.0f} is believed"
     )
     for file in (session, truth_path(session)):

@@ -1,10 +1,9 @@
 """`visioncal doctor`."""
 
 import typer
-from rich.markup import escape
 
 from visioncal.calibration.pipeline.checkup import doctor, next_command, to_document
-from visioncal.cli.console import EXIT_BAD, answers, print_json, with_run_paths
+from visioncal.cli.console import EXIT_BAD, answer, print_json, with_run_paths
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import DoctorOptions
 
@@ -16,16 +15,15 @@ def doctor_command(options: DoctorOptions) -> None:
     if options.as_json:
         print_json(to_document(found))
     else:
-        console = answers()
-        console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
+        answer(f"{found.session}: {'; '.join(found.seen)}")
         for at, finding in enumerate(found.findings, 1):
-            console.print(f"[bold]{at}.[/] {escape(finding.words)}")
+            answer(f" {finding.words}", f"{at}.")
             if finding.do is not None:
-                console.print(escape(f"   {finding.do.words}"))
+                answer(f"   {finding.do.words}")
                 if finding.do.command:
-                    console.print(f"   [bold]{escape(finding.do.command)}[/]")
+                    answer("", f"   {finding.do.command}")
         if found.is_sound:
             command = next_command(found, options.session)
-            console.print(f"[bold green]Nothing is wrong.[/] Next: [bold]{escape(command)}[/]")
+            answer(f" Next: {command}", "Nothing is wrong.", "bold green")
     if not found.is_sound:
         raise typer.Exit(EXIT_BAD)

@@ -1,16 +1,21 @@
 """`visioncal dynamics`."""
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from visioncal.cli.console import answers, exit_status, messages, print_json, report_written, say
+from visioncal.cli.console import (
+    answer,
+    exit_status,
+    print_json,
+    print_table,
+    report_written,
+    say,
+)
 from visioncal.cli.dynamics_options import (
     FRICTION,
     PLANNED_FRICTION,
@@ -22,11 +27,9 @@ from visioncal.cli.dynamics_options import (
     DynamicsValidateOptions,
     StreamOptions,
 )
-from visioncal.cli.parsing import numbers_in
 from visioncal.cli.plan import boxes_of, floor_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
-from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import figure, matched, significant, some_of
@@ -78,12 +81,10 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     boxes = boxes_of(kept)
     bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
     if limits.tool is not None:
-        length, radius = (
-            1e-3 * number for number in numbers_in(limits.tool, "--tool", "length,radius")
-        )
+        length, radius = (1e-3 * number for number in limits.tool)
         if min(length, radius) <= 0.0:
             raise DataError(
-                f"--tool is {limits.tool!r}; a length and a radius above zero [mm] are needed.",
+                f"--tool is {limits.tool}; a length and a radius above zero [mm] are needed.",
                 culprits=["--tool"],
             )
         flange = arm.chain.placements[-1]
@@ -100,10 +101,13 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
             floor_of(kept),
         ),
         missing=DefaultLimits(
-            *map(_radians, (limits.range_deg, limits.speed_deg, limits.acceleration_deg))
+            *(
+                None if degrees is None else math.radians(degrees)
+                for degrees in (limits.range_deg, limits.speed_deg, limits.acceleration_deg)
+            )
         ),
         bodies=tuple(bodies),
-        payload=None if limits.payload is None else _payload(limits.payload),
+        payload=None if limits.payload is None else _payload(*limits.payload),
     )
     request = ExcitationRequest(
         motion.duration,
@@ -126,11 +130,10 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     if options.as_json:
         print_json(document)
     else:
-        console = answers()
         for words in plan_words(plan):
-            console.print(escape(words))
+            answer(words)
         for words in plan_warnings(plan):
-            console.print(f"[bold yellow]warning:[/] {escape(words)}")
+            answer(words, "warning: ", "bold yellow")
     report_written(written, quiet=options.as_json)
 
 
@@ -146,23 +149,11 @@ def _friction_terms(words: str, known: Sequence[str]) -> FrictionTerms:
     return FrictionTerms(*(name in wanted for name in known))
 
 
-def _radians(degrees: float | None) -> float | None:
-    if degrees is None:
-        return None
-    if not 0.0 < degrees < np.inf:
-        raise DataError(
-            f"a limit of {degrees:g} deg is given; a number above zero is needed.",
-            culprits=["--range-deg", "--speed-deg", "--acceleration-deg"],
-        )
-    return float(np.deg2rad(degrees))
-
-
-def _payload(words: str) -> FloatArray:
+def _payload(kg: float, *centre_mm: float) -> FloatArray:
     """(10,) inertial parameters of a point mass, in the flange's frame."""
-    kg, *centre_mm = numbers_in(words, "--payload", "kg,x,y,z")
     if kg < 0.0:
         raise DataError(
-            f"--payload is {words!r}; a mass of 0 kg or more is needed.", culprits=["--payload"]
+            f"--payload is of {kg:g} kg; a mass of 0 kg or more is needed.", culprits=["--payload"]
         )
     x, y, z = (1e-3 * value for value in centre_mm)
     about = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
@@ -181,7 +172,7 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
     path = options.out / STREAMS / f"{options.stream}.csv"
     check_free(path, force=False, replaceable=False)
     with signals_as_interrupts(), closing(UrMotion(host)) as joints:
-        found = record_motion(joints, rest_s=options.rest_s, report=messages().print)
+        found = record_motion(joints, rest_s=options.rest_s, report=say)
         model = options.robot or joints.model
     check_stream(options.stream, found)
     out, streams = options.out, {options.stream: found}
@@ -194,17 +185,6 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
         f"wrote {len(found)} samples to {path}. They hold currents: identify needs --gains, "
         "which visioncal dynamics gains finds"
     )
-
-
-def _identified_of(against: Path | None, command: str) -> Identified:
-    """Loads identified dynamics."""
-    if against is None:
-        raise DataError(
-            f"dynamics {command}: what was identified (--against {DYNAMICS_FILE}) is needed.",
-            culprits=["--against"],
-            next_step="Name the output folder of visioncal dynamics identify.",
-        )
-    return Identified.load(against)
 
 
 def _requested(streams: StreamOptions) -> IdentificationRequest:
@@ -250,7 +230,7 @@ def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
 
 def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
     """Predicts the torques of a session's streams, and prints the prediction errors."""
-    identified = _identified_of(options.against, "validate")
+    identified = Identified.load(options.against)
     request = _requested(options.streams)
     predictions = validate_session(Session.load(options.session), identified, request)
     if options.as_json:
@@ -268,39 +248,40 @@ def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
         print_json(documents)
         return
     for prediction in predictions:
-        answers().print(escape("\n".join([prediction.label, *prediction.notes])))
+        answer("\n".join([prediction.label, *prediction.notes]))
         validation, fitted = validate(identified, prediction), identified.fitted_rms_nm
-        table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
-        for joint, name in enumerate(identified.robot.joint_names):
-            table.add_row(
-                name,
-                figure(float(validation.rms_nm[joint])),
-                f"{figure(100.0 * float(validation.shares[joint]))} %",
-                figure(float(fitted[joint])),
-            )
-        answers().print(table)
+        print_table(
+            ("joint", "predicted to [N m]", "of its range", "fitted to [N m]"),
+            [
+                (name, figure(rms_nm), f"{figure(100.0 * share)} %", figure(fitted_nm))
+                for name, rms_nm, share, fitted_nm in zip(
+                    identified.robot.joint_names,
+                    validation.rms_nm.tolist(),
+                    validation.shares.tolist(),
+                    fitted.tolist(),
+                    strict=True,
+                )
+            ],
+        )
 
 
 def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
     """Prints the verdict, the fit, and the notes on the validation samples."""
-    console = answers()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
         left_out = f", {stream.left_out} torques left out" if stream.left_out else ""
-        console.print(
-            escape(
-                f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
-                f"a motion up to {figure(stream.band_hz)} Hz{left_out}"
-            )
+        answer(
+            f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
+            f"a motion up to {figure(stream.band_hz)} Hz{left_out}"
         )
         for note in stream.notes:
-            console.print(f"  - {escape(note)}")
+            answer(f"  - {note}")
     fitted = {note for stream in identified.streams for note in stream.notes}
     for note in (name for name in validation_notes if name not in fitted):
-        console.print(f"  - {escape(note)}")
+        answer(f"  - {note}")
     counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
     shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
-    console.print(
+    answer(
         f"{identified.base.rank} base parameters: {shares}, {counts[-1][1]} {counts[-1][0]}, "
         f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
     )
@@ -324,20 +305,17 @@ def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
         for name, column in columns.items()
         if any(value is not None for value in column)
     }
-    table = Table("joint", *filled, box=None)
-    for at, joint in enumerate(joints):
-        row = [
-            None if group[at] is None else figure(float(group[at] or 0.0))
-            for group in filled.values()
-        ]
-        table.add_row(str(joint), *row)
-    console.print(table)
-    console.print("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
+    rows = [
+        (str(joint), *("" if value is None else figure(float(value)) for value in values))
+        for joint, *values in zip(joints, *filled.values(), strict=True)
+    ]
+    print_table(("joint", *filled), rows)
+    answer("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
 
 
 def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
     """Estimates the payload, and prints it."""
-    identified = _identified_of(options.against, "payload")
+    identified = Identified.load(options.against)
     loaded = conditioned_streams(
         Session.load(options.session), identified, _requested(options.streams)
     )
@@ -427,10 +405,7 @@ def _ur_words(payload: Payload) -> str:
 
 def _body(options: DynamicsGainsOptions) -> FloatArray:
     """(10,) the body's inertial parameters in the flange's frame."""
-    centre = 1e-3 * np.array(numbers_in(options.com_mm, "--com-mm", "x,y,z"))
-    about = symmetric_matrices(
-        np.array(numbers_in(options.inertia, "--inertia", "xx,xy,yy,xz,yz,zz"))
-    )
+    centre, about = 1e-3 * np.array(options.com_mm), symmetric_matrices(np.array(options.inertia))
     body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
     if not (options.mass_kg > 0.0 and body.consistent):
         raise DataError(

@@ -4,10 +4,18 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from visioncal.cli.options import json_flag, out_folder, robot_name
+from visioncal.cli.options import (
+    REQUIRED,
+    argument,
+    flag,
+    json_flag,
+    numbers_option,
+    option,
+    out_folder,
+    robot_name,
+)
 from visioncal.cli.session_options import ClearanceOptions, kept_option
 from visioncal.core.choices import DYNAMICS_FILE, GAIN_SIGMA
-from visioncal.core.options import REQUIRED, argument, flag, option
 
 # Terms of friction that torques determine, and those that a motion can be planned for.
 FRICTION = ("coulomb", "viscous", "offset")
@@ -19,7 +27,9 @@ motions_argument = partial(
 cutoff_option = partial(
     option, "Of the low-pass. Default: ten times the motion's band.", "--cutoff-hz", min=0.1
 )
-against_option = partial(option, f"A folder of identify, or its {DYNAMICS_FILE}.", "--against")
+against_option = partial(
+    option, f"A folder of identify, or its {DYNAMICS_FILE}.", "--against", default=REQUIRED
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,16 +82,23 @@ class ArmOptions:
     torque_margin: float = kept_option(
         "Safety factor on the torques of the nominal inertias.", default=1.2
     )
-    tool: str | None = kept_option(
-        "What sticks out of the flange, along its z, in mm.", metavar="LENGTH,RADIUS"
+    tool: tuple[float, float] | None = numbers_option(
+        "What sticks out of the flange, along its z, in mm.",
+        form="length,radius",
+        panel="What the arm must keep",
     )
-    payload: str | None = kept_option(
+    payload: tuple[float, ...] | None = numbers_option(
         "What the flange carries: its mass, and its centre in the flange's frame in mm.",
-        metavar="KG,X,Y,Z",
+        form="kg,x,y,z",
+        panel="What the arm must keep",
     )
-    range_deg: float | None = _missing("Range to either side of joints without limits.")
-    speed_deg: float | None = _missing("Maximum speed, in deg/s.")
-    acceleration_deg: float | None = _missing("Maximum acceleration, in deg/s^2.")
+    range_deg: float | None = _missing(
+        "Range to either side of joints without limits.", min=1e-3, max=1e6
+    )
+    speed_deg: float | None = _missing("Maximum speed, in deg/s.", min=1e-3, max=1e6)
+    acceleration_deg: float | None = _missing(
+        "Maximum acceleration, in deg/s^2.", min=1e-3, max=1e6
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +173,7 @@ class DynamicsValidateOptions:
 
     session: Path = motions_argument()
     streams: StreamOptions
-    against: Path | None = against_option()
+    against: Path = against_option()
     as_json: bool = json_flag()
 
 
@@ -169,7 +186,7 @@ class DynamicsPayloadOptions:
 
     session: Path = motions_argument()
     streams: StreamOptions
-    against: Path | None = against_option()
+    against: Path = against_option()
     same_friction: bool = flag("Friction is as it was without the payload, however it presses.")
     gains_sigma: float = option(
         "Sigma of each of the --gains, in percent.", default=100.0 * GAIN_SIGMA, min=0.0
@@ -187,13 +204,13 @@ class DynamicsGainsOptions:
     session: Path = motions_argument()
     loaded: Path = option("A session of the same arm with the body on it.", default=REQUIRED)
     mass_kg: float = option("Of the body (kg).", default=REQUIRED)
-    com_mm: str = option(
-        "Its centre of mass in the flange's frame (mm).", default=REQUIRED, metavar="X,Y,Z"
+    com_mm: tuple[float, float, float] = numbers_option(
+        "Its centre of mass in the flange's frame (mm).", form="x,y,z", default=REQUIRED
     )
-    inertia: str = option(
+    inertia: tuple[float, ...] = numbers_option(
         "Its inertia about that centre (kg m^2).",
+        form="xx,xy,yy,xz,yz,zz",
         default="0,0,0,0,0,0",
-        metavar="XX,XY,YY,XZ,YZ,ZZ",
     )
     cutoff_hz: float | None = cutoff_option()
     named: str | None = robot_name()

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import check_usable, messages, say
+from visioncal.cli.console import check_usable, say
 from visioncal.cli.result_options import ExportOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
@@ -33,7 +32,7 @@ def export_command(options: ExportOptions) -> None:
     written = document(load_exportable(options.source), options.to, selection)
     bad = check_usable(written.verdict, "what is exported", force=options.force)
     for warning in (*bad, *written.warnings):
-        messages().print(f"[bold red]warning:[/] {escape(warning)}")
+        say(warning, "warning: ", "bold red")
     if options.out is None or options.out == Path("-"):
         typer.echo(written.text, nl=False)
         return

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.markup import escape
 
-from visioncal.cli.console import answers, exit_status, print_json, report_written, say
+from visioncal.cli.console import answer, exit_status, print_json, report_written, say
 from visioncal.cli.convert import import_options
-from visioncal.cli.parsing import numbers_in, refuse_given
+from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions, TouchOptions
 from visioncal.cli.summary import print_verdict
@@ -168,7 +167,6 @@ def keep_and_report(place: FrameLocation, frame: Frame, source: Path, *, as_json
         print_json(frames_document({place.name: frame}))
         report_written(written, quiet=True, status=status)
         return
-    console = answers()
     print_verdict(frame.verdict, place.name)
     turn = ", ".join(
         f"{value:.3f}" for value in frame.edge.transform.rotation.as_rotvec(degrees=True)
@@ -179,9 +177,9 @@ def keep_and_report(place: FrameLocation, frame: Frame, source: Path, *, as_json
         else "rotation not measured"
     )
     position = f"{frame.edge.place_words(3)}, sigma {figure(frame.edge.sigma_mm)} mm"
-    console.print(f"{place.name}: {position}; {rotation}")
+    answer(f"{place.name}: {position}; {rotation}")
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
-    console.print(escape(f"{frame.method}: {fit}"))
+    answer(f"{frame.method}: {fit}")
     joins = place.file is not None or place.folder is not None
     if joins and not written.files:
         say(f"nothing was written: a bad {place.name} does not join {place.folder}")
@@ -294,9 +292,9 @@ def _by_images(
             {"--point-mm": request.point}, "beside --cad the drawing's origin is the frame's"
         )
         return fixture_from_marker_images(session, calibration, drawing)
-    point = 1e-3 * np.array(numbers_in(request.point or "0,0,0", "--point-mm", "x,y,z"))
     with shown_progress(quiet=request.as_json) as progress:
-        return seen_frame(session, calibration, kind, point, progress=progress)
+        point_m = np.array(request.point or np.zeros(3))
+        return seen_frame(session, calibration, kind, point_m, progress=progress)
 
 
 def tcp_command(options: TcpOptions) -> None:

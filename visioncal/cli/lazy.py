@@ -1,26 +1,27 @@
 """Commands with plain-text help, and groups that import a command on demand."""
 
 import inspect
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast, get_type_hints
+from typing import Annotated, Any, ClassVar, cast, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import some_of
 
 # As shells report a program ended by SIGINT.
 _EXIT_CTRL_C = 128 + 2
 # Source of a parameter that was typed.
 _TYPED = "COMMANDLINE"
+# Attributes of options that are not typer's.
+_OWN = ("panel", "parse", "needs")
 # Base class of usage errors; typer exports only a subclass.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
@@ -64,15 +65,11 @@ class PlainCommand(TyperCommand):
         return rest
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
-        """Runs the command; on Ctrl-C, lists the files that it has written."""
-        start_s = time.time()
+        """Runs the command; Ctrl-C ends it with a message."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            paths = [param for param in ctx.params.values() if isinstance(param, Path)]
-            written = sorted(str(file) for path in paths for file in _written_since(path, start_s))
-            words = f"written so far: {some_of(written)}" if written else "nothing was written"
-            typer.echo(f"stopped by Ctrl-C; {words}", err=True)
+            typer.echo("stopped by Ctrl-C", err=True)
             raise typer.Exit(_EXIT_CTRL_C) from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
@@ -85,14 +82,6 @@ class PlainCommand(TyperCommand):
         for name, records in panels.items():
             with formatter.section(name):
                 formatter.write_dl(records)
-
-
-def _written_since(path: Path, since_s: float) -> Iterator[Path]:
-    """The files at a path that were written since a time [s]."""
-    for file in (path, *path.rglob("*")):
-        # File systems may round times this coarsely.
-        if file.is_file() and file.stat().st_mtime > since_s - 0.01:
-            yield file
 
 
 class LazyGroup(TyperGroup):
@@ -158,16 +147,20 @@ class LazyGroup(TyperGroup):
 
 
 def _flattened(record: type) -> Iterator[inspect.Parameter]:
-    """Command-line parameters of a record's fields (`core.options`), at any depth."""
+    """Command-line parameters of a record's fields (`cli.options`), at any depth."""
     hints = get_type_hints(record)
     for field in fields(record):
         kind = hints[field.name]
         if is_dataclass(kind):
             yield from _flattened(cast(type, kind))
         for form, (words, names, attributes) in field.metadata.items():
-            stated = {**attributes, "help": words, "rich_help_panel": attributes.get("panel")}
-            stated.pop("panel", None)
-            own = (f"--{field.name.replace('_', '-')}",) if form == "flag" else ()
+            stated = {key: value for key, value in attributes.items() if key not in _OWN}
+            stated |= {"help": words, "rich_help_panel": attributes.get("panel")}
+            if "parse" in attributes:
+                is_list = any(get_origin(part) is list for part in (kind, *get_args(kind)))
+                typed: Any = list[str] if is_list else str
+                kind = typed | None if field.default is None else typed
+            own = (_option_of(field),) if form == "flag" else ()
             declare = typer.Argument if form == "argument" else typer.Option
             yield inspect.Parameter(
                 field.name,
@@ -178,14 +171,32 @@ def _flattened(record: type) -> Iterator[inspect.Parameter]:
 
 
 def _gathered(record: Any, values: Mapping[str, Any], given: frozenset[str]) -> Any:  # noqa: ANN401
-    """Builds a record from the command line's values, and the names of those that were typed."""
-    hints = get_type_hints(record)
-    content = {"given": given, **values}
-    return record(
-        **{
-            field.name: _gathered(hints[field.name], values, given)
-            if is_dataclass(hints[field.name])
-            else content[field.name]
-            for field in fields(record)
-        }
-    )
+    """Builds a record from the command line's values, and the names of those that were typed.
+
+    Raises:
+        DataError: A value cannot be parsed, or an option goes with another that is not given.
+    """
+    hints, content = get_type_hints(record), {"given": given, **values}
+    for field in fields(record):
+        if is_dataclass(hints[field.name]):
+            content[field.name] = _gathered(hints[field.name], values, given)
+        for _, _, attributes in field.metadata.values():
+            option, value = _option_of(field), content[field.name]
+            needs = attributes.get("needs")
+            if needs is not None and field.name in given and not values[needs]:
+                raise DataError(
+                    f"{option} is for --{needs}.",
+                    culprits=[option],
+                    next_step="Give that, too, or leave it out.",
+                )
+            if "parse" in attributes and value is not None:
+                parse = partial(attributes["parse"], option=option)
+                content[field.name] = [*map(parse, value)] if type(value) is list else parse(value)
+    return record(**{field.name: content[field.name] for field in fields(record)})
+
+
+def _option_of(field: Field[Any]) -> str:
+    """The long name of a field's option."""
+    ((_, names, _),) = field.metadata.values()
+    long = (name for name in names if name.startswith("--"))
+    return next(long, f"--{field.name.replace('_', '-')}").partition("/")[0]

@@ -10,7 +10,7 @@ import typer
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.cli.console import check_usable, print_json, say, warn
-from visioncal.cli.parsing import FORMS, named_result, numbers_in, refuse_given
+from visioncal.cli.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import LocateOptions
 from visioncal.core.errors import DataError
@@ -30,7 +30,6 @@ from visioncal.session.selecting import EYE, Choice, has_several, select
 from visioncal.vision.finders.imaging import read_image
 from visioncal.vision.targets import target_from_document
 
-POSE = "x,y,z,qx,qy,qz,qw"
 # Rounding to four digits keeps a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
 _LEAD = "base_from_"
@@ -47,8 +46,7 @@ class _Point:
 
 def locate_command(options: LocateOptions) -> None:
     """Runs `visioncal locate`."""
-    what = "locate: the camera's calibration"
-    result = load_result(named_result(options.calibration, "-c", what))
+    result = load_result(options.calibration)
     source, target, choice = options.source, options.target, Choice(options.camera, options.robot)
     session, several = None, False
     if source is not None and (source.is_dir() or source.suffix.lower() == ".rrd"):
@@ -82,7 +80,7 @@ def locate_command(options: LocateOptions) -> None:
                 culprits=["--plane"],
                 next_step=f"It is {FORMS}.",
             )
-        px = np.array([numbers_in(pixel, "--pixel", "u,v") for pixel in options.pixel or ()])
+        px = np.array(options.pixel)
         declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)
         sigma_px = options.sigma_px
         places = locate(calibrated, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
@@ -97,7 +95,7 @@ def locate_command(options: LocateOptions) -> None:
     else:
         needless = {"--plane": options.plane, "--plane-sigma-mm": options.plane_sigma}
         refuse_given(needless, "it is for --pixel")
-        origin_m = 1e-3 * np.array(numbers_in(options.point or "0,0,0", "--point-mm", "x,y,z"))
+        origin_m = np.array(options.point or np.zeros(3))
         other_target = None if target is None else _target(target, result)
         if session is not None:
             points = _by_views(options, session, calibrated, other_target, origin_m)
@@ -119,9 +117,8 @@ def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
     return chosen
 
 
-def _flange(words: str) -> FloatArray:
-    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]."""
-    values = numbers_in(words, "--pose", POSE)
+def _flange(values: Sequence[float]) -> FloatArray:
+    """Checks a pose of the robot, (4, 4) `base_from_flange` [m]."""
     norm = float(np.linalg.norm(values[3:]))
     if abs(norm - 1.0) > _NORM_TOLERANCE:
         raise DataError(

@@ -1,16 +1,44 @@
-"""Shared options, each declared once, as a field of a dataclass or a parameter's type."""
+"""Options of commands, declared as fields of the records that they take; shared ones once."""
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from visioncal.cli.parsing import numbers_in, size_in
 from visioncal.core.choices import ImagesKept
-from visioncal.core.options import argument, flag, option
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.session.selecting import Choice
+
+# Of an option or an argument that has to be given.
+REQUIRED: Any = MISSING
+
+
+def option(words: str, *names: str, default: object = None, **attributes: object) -> Any:  # noqa: ANN401
+    """A field of a record that the command line sets by an option.
+
+    Args:
+        words: What it is, with its unit.
+        *names: Its names; by default that of the field.
+        default: Its value where it is not given; `REQUIRED` for none.
+        **attributes: `min`, `max`, `metavar`, `panel` (its heading in the help), or others of
+            typer's; `parse`, which makes the value of the typed words and the option's name; and
+            `needs`, a field without whose value the option is refused.
+    """
+    return field(default=default, metadata={"option": (words, names, attributes)})
+
+
+def flag(words: str, *names: str, **attributes: object) -> Any:  # noqa: ANN401 - as `option`
+    """A field that an option without a value switches on; see `option`."""
+    return field(default=False, metadata={"flag": (words, names, attributes)})
+
+
+def argument(words: str, default: object = REQUIRED, **attributes: object) -> Any:  # noqa: ANN401
+    """A field that the command line sets by its place; see `option`."""
+    return field(default=default, metadata={"argument": (words, (), attributes)})
+
 
 session_argument = partial(argument, "A session's folder, or its .rrd recording.")
 out_folder = partial(option, "The folder to write into.", "-o", "--out", file_okay=False)
@@ -26,6 +54,18 @@ view_flag = partial(flag, "Show it in the rerun viewer as it goes.", "--view")
 seed_option = partial(option, "Random seed.", "--seed", default=0, min=0)
 camera_name = partial(option, "Of a whole cell: which camera, as left.", "--camera")
 robot_name = partial(option, "Of a whole cell: which robot, as a.", "--robot")
+against_option = partial(
+    option, "The calibration: an output folder of calibrate, or its .rrd.", default=REQUIRED
+)
+size_option = partial(option, parse=size_in, metavar="W,H")
+
+
+def numbers_option(
+    words: str, *names: str, form: str, scale: float = 1.0, **attributes: object
+) -> Any:  # noqa: ANN401 - as `option`
+    """An option of numbers with commas between, as `form` names them; see `option`."""
+    parse = partial(numbers_in, form=form, scale=scale)
+    return option(words, *names, metavar=form.upper(), parse=parse, **attributes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 
 # Digits of a view's number, and of the width or height of an image.
 _MOST_DIGITS = 6
+# A pose of the robot, as typed.
+POSE = "x,y,z,qx,qy,qz,qw"
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
     "may point down: a board's points into it), or nx,ny,nz,d (a normal, and its product with any "
@@ -16,8 +17,8 @@ FORMS = (
 )
 
 
-def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
-    """Parses an option of numbers, such as `12.5,-3,0`.
+def numbers_in(words: str, option: str, form: str, scale: float = 1.0) -> tuple[float, ...]:
+    """Parses an option of numbers, such as `12.5,-3,0`, and multiplies them by `scale`.
 
     `form` has their names, separated by commas: `x,y,z`.
 
@@ -33,7 +34,7 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
             f"{option} is {words[:80]!r}; {form} is needed, numbers with commas between.",
             culprits=[option],
         )
-    return values
+    return tuple(scale * value for value in values)
 
 
 def pair_in(words: str, option: str) -> tuple[int, int]:
@@ -51,7 +52,7 @@ def pair_in(words: str, option: str) -> tuple[int, int]:
     return numbers[0], numbers[1]
 
 
-def views_in(words: str, option: str) -> list[int]:
+def views_in(words: str, option: str) -> tuple[int, ...]:
     """Parses numbers of views, written as 1-12,14.
 
     Raises:
@@ -66,10 +67,25 @@ def views_in(words: str, option: str) -> list[int]:
                 culprits=[option],
             )
         found += range(ends[0], ends[-1] + 1)
-    return found
+    return tuple(found)
 
 
-def size_in(words: str) -> tuple[int, int]:
+def serial_in(words: str, option: str) -> tuple[str, str]:
+    """Parses what a serial number is of, and the number, written as camera=1234.
+
+    Raises:
+        DataError: One of both is missing.
+    """
+    what, sign, number = words.partition("=")
+    if not sign or not what:
+        raise DataError(
+            f"{option} is {words!r}; what it is of and the number are needed, as camera=1234.",
+            culprits=[option],
+        )
+    return f"serial number, {what}", number
+
+
+def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
     """Parses the width and height of images [px], written as 1280,800 or 1280x800.
 
     Raises:
@@ -78,9 +94,9 @@ def size_in(words: str) -> tuple[int, int]:
     numbers = _whole_numbers(words.replace("x", ","))
     if len(numbers) != 2 or min(numbers) < 1:
         raise DataError(
-            f"--resolution is {words[:40]!r}; width and height of the images are needed [px], two "
+            f"{option} is {words[:40]!r}; width and height of the images are needed [px], two "
             "whole numbers above 0, as 1280,800.",
-            culprits=["--resolution"],
+            culprits=[option],
         )
     return numbers[0], numbers[1]
 
@@ -92,14 +108,12 @@ def _whole_numbers(words: str) -> list[int]:
     return [int(cell) for cell in cells] if are_whole else []
 
 
-def names_in(words: str | None, option: str) -> tuple[str, ...]:
+def names_in(words: str, option: str) -> tuple[str, ...]:
     """Parses an option of names separated by commas.
 
     Raises:
         DataError: A name is empty or occurs twice.
     """
-    if words is None:
-        return ()
     names = tuple(part.strip() for part in words.split(","))
     if not all(names) or len(set(names)) < len(names):
         raise DataError(
@@ -120,20 +134,3 @@ def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leav
     given = [name for name, value in options.items() if value is not None]
     if given:
         raise DataError(f"{some_of(given)}: {why}.", culprits=given, next_step=next_step)
-
-
-def named_result(path: Path | None, option: str, what: str) -> Path:
-    """The path of a result, which an option has to name.
-
-    `what` describes it in messages: `verify: the calibration to check`.
-
-    Raises:
-        DataError: None is named.
-    """
-    if path is None:
-        raise DataError(
-            f"{what} ({option}) is needed.",
-            culprits=[option],
-            next_step="Name the output folder of visioncal calibrate.",
-        )
-    return path

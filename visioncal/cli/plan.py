@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from rich.markup import escape
 from scipy.spatial.transform import Rotation
 
-from visioncal.cli.console import answers, print_json, report_written, warn
-from visioncal.cli.parsing import numbers_in, refuse_given, size_in
+from visioncal.cli.console import answer, print_json, report_written, warn
+from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import (
     MOST_FOR_NEED,
@@ -75,8 +74,8 @@ def plan_command(options: PlanOptions) -> None:
     sight, kept = options.sight, options.kept
     limits = Limits(
         math.radians(kept.margin_deg),
-        _span(sight.distance_mm, "--distance-mm"),
-        _span(sight.focus_mm, "--focus-mm"),
+        sight.distance_m,
+        sight.focus_m,
         math.radians(sight.tilt_deg),
         sight.edge_px,
         1e-3 * kept.clearance_mm,
@@ -159,13 +158,6 @@ def _box_of(words: str, option: str = "--box", name: str = "") -> Box:
     return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
 
 
-def _span(words: str | None, option: str) -> tuple[float, float] | None:
-    if words is None:
-        return None
-    near, far = numbers_in(words, option, "near,far")
-    return 1e-3 * near, 1e-3 * far
-
-
 def _begin(
     source: Source,
     words: PlanCellOptions,
@@ -188,30 +180,28 @@ def _begin(
 
 
 def _report(plan: Plan) -> None:
-
-    console = answers()
-    console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
+    answer(f"{plan.request.purpose.name}: {summary_of(plan)}")
     if plan.start is not None and plan.start.refusal:
-        console.print(escape(f"  so far: {plan.start.refusal}"))
+        answer(f"  so far: {plan.start.refusal}")
     for stop in sorted(plan.stops, key=lambda value: value.rank)[:_SHOWN]:
-        console.print(escape(f"  view {stop.view}: {stop.words}"))
+        answer(f"  view {stop.view}: {stop.words}")
     if len(plan.stops) > _SHOWN:
-        console.print(f"  and {len(plan.stops) - _SHOWN} more, in plan.json and in the preview")
+        answer(f"  and {len(plan.stops) - _SHOWN} more, in plan.json and in the preview")
     if plan.in_the_way:
         count, obstacles = len(plan.in_the_way), some_of(list(dict.fromkeys(plan.in_the_way)))
         stops = "1 stop was" if count == 1 else f"{count} stops were"
-        console.print(escape(f"{stops} exchanged for want of a safe way ({obstacles})"))
+        answer(f"{stops} exchanged for want of a safe way ({obstacles})")
     if plan.shortfall:
-        console.print(f"[bold yellow]warning:[/] {escape(plan.shortfall)}")
+        answer(plan.shortfall, "warning: ", "bold yellow")
     elif note := looks_note(plan):
-        console.print(escape(note))
+        answer(note)
     if plan.design.met:
         after = plan.design.predicted.words
-        console.print(escape(f"that meets the wish, with {len(plan.stops)} stops: {after}"))
+        answer(f"that meets the wish, with {len(plan.stops)} stops: {after}")
     if plan.need is not None and plan.need.met:
-        console.print(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
+        answer(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
     if plan.request.start_q is None:
-        console.print(
+        answer(
             "the way from where the arm stands to the first stop was not looked at; --start-joints "
             "says where that is"
         )
@@ -400,11 +390,6 @@ def _guess(words: PlanCellOptions) -> RoughEdges:
 
 
 def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
-    for name in ("noise_px", "noise_mm", "noise_deg"):
-        value = getattr(words, name)
-        option = f"--{name.replace('_', '-')}"
-        if value is not None and not 0.0 <= value < np.inf:
-            raise DataError(f"{option} is {value}; zero or more is needed.", culprits=[option])
     sigma_rad, sigma_m = cell.noise.robots[0].tolist()
     sigma_m = sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
     sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
@@ -412,7 +397,7 @@ def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
     return replace(cell, noise=Noise.of_robot(sigma_rad, sigma_m), pixel_px=pixel_px)
 
 
-def _camera(words: str, resolution: str | None) -> Camera:
+def _camera(words: str, resolution: tuple[int, int] | None) -> Camera:
     matrix = _camera_numbers(words)
     if matrix is not None:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
@@ -438,10 +423,10 @@ def _camera_numbers(words: str | None) -> tuple[float, ...] | None:
     return numbers_in(words, "--camera", "fx,fy,cx,cy")
 
 
-def _size(words: str | None) -> tuple[int, int]:
-    if words is None:
+def _size(resolution: tuple[int, int] | None) -> tuple[int, int]:
+    if resolution is None:
         raise DataError(
             "--resolution is needed beside this --camera: width and height of the images [px].",
             culprits=["--resolution"],
         )
-    return size_in(words)
+    return resolution

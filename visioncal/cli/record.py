@@ -9,10 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
-
-from visioncal.cli.console import asked, messages, print_json, say
-from visioncal.cli.parsing import size_in
+from visioncal.cli.console import asked, print_json, say
 from visioncal.cli.session_options import RecordCellOptions, RecordOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import counted, figure
@@ -62,8 +59,7 @@ def record_command(options: RecordOptions) -> None:
         single=is_folder(options.camera),
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
-    resolution = None if device.resolution is None else size_in(device.resolution)
-    requested = DeviceSetup(resolution, device.exposure_us, device.gain, device.focus)
+    requested = DeviceSetup(device.resolution, device.exposure_us, device.gain, device.focus)
     answers = sys.stdin.isatty()
     wish = ArmSetup("", not drives or options.dry_run, asked, options.described.pose_form, answers)
     with signals_as_interrupts(), opened(options.arm, wish, options.camera, requested) as cell:
@@ -331,7 +327,7 @@ def record_driven(
 
 def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
     """Prints what is about to be driven."""
-    say, count = messages().print, len(leaving.stops)
+    count = len(leaving.stops)
     if not count:
         say("All stops of the plan have their view; nothing is left to drive.")
         return
@@ -344,10 +340,8 @@ def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOpti
         else ""
     )
     say(
-        escape(
-            f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
-            f"{taking.speed:g} rad/s, about {duration}"
-        )
+        f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
+        f"{taking.speed:g} rad/s, about {duration}"
     )
     say(
         f"  first to view {first.view}{via}; a joint turns by up to "

@@ -9,29 +9,30 @@ from typing import get_args
 import typer
 
 from visioncal.cli.options import (
+    REQUIRED,
     NeedOptions,
     PartOptions,
     WorkOptions,
+    against_option,
+    argument,
     camera_name,
+    flag,
     force_bad,
     force_both,
     force_flag,
     json_flag,
+    numbers_option,
+    option,
     out_file,
     out_folder,
     robot_name,
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import FORMS
+from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
 from visioncal.core.choices import EXPORT_NAMES, UNITS_M, WIDEST_RAD, Convention, SolverName
-from visioncal.core.errors import DataError
-from visioncal.core.options import REQUIRED, argument, flag, option
 from visioncal.interchange.outputs import REPORT, VERIFY
-
-# A pose of the robot, as typed.
-POSE = "x,y,z,qx,qy,qz,qw"
 
 
 def _show_formats(wanted: bool) -> None:
@@ -65,8 +66,10 @@ class CalibrateOptions:
     need: NeedOptions
     work: WorkOptions
     out: Path = out_folder(default=Path("out"))
-    views: str | None = option(
-        "These views alone, as those before or after something moved.", metavar="1-12,14"
+    views: tuple[int, ...] | None = option(
+        "These views alone, as those before or after something moved.",
+        metavar="1-12,14",
+        parse=views_in,
     )
     solver: SolverName = option(
         "The joint fit, or a closed form by name; all are compared anyway.", default="joint"
@@ -148,14 +151,20 @@ class ShowOptions:
     )
     out: Path | None = option("The page; report.html or certificate.html otherwise.", "-o", "--out")
     viewer: bool = flag("Open the recording in the rerun viewer, instead.")
-    web: bool = flag("With --viewer: in a browser, not in a window.")
+    web: bool = flag("With --viewer: in a browser, not in a window.", needs="viewer")
     view: int | None = option(
         "With --viewer: the number of the view to open the window at. Default: the worst; "
-        "in a browser the first."
+        "in a browser the first.",
+        needs="viewer",
     )
     certificate: bool = flag("One page to print and sign, instead.")
-    operator: str = option("With --certificate: who calibrated.", default="")
-    serial: list[str] | None = option("With --certificate, as camera=1234.", metavar="WHAT=NUMBER")
+    operator: str = option("With --certificate: who calibrated.", default="", needs="certificate")
+    serial: list[tuple[str, str]] | None = option(
+        "With --certificate, as camera=1234.",
+        metavar="WHAT=NUMBER",
+        parse=serial_in,
+        needs="certificate",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +176,7 @@ class VerifyOptions:
 
     session: Path = argument("Five stops or more of the same cell: a folder or an .rrd.")
     part: PartOptions
-    against: Path | None = option("The calibration: an output folder of calibrate, or its .rrd.")
+    against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
     policy: Path | None = option("Your own table of when to calibrate again (.toml).")
@@ -247,13 +256,7 @@ class CorrectOptions:
         "A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
         "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
     )
-    calibration: Path = option(
-        "Of the calibrated arm: an output folder of calibrate, or its .rrd.",
-        "-c",
-        "--against",
-        "--calibration",
-        default=REQUIRED,
-    )
+    calibration: Path = against_option("-c", "--against", "--calibration")
     part: PartOptions
     out: Path | None = out_file()
     tool: str | None = option(
@@ -266,12 +269,14 @@ class CorrectOptions:
         metavar="Q1,Q2,...",
     )
     payload_kg: float = option("Payload on the flange, for joints that bend (kg).", default=0.0)
-    payload_m: str = option(
-        "Its centre of mass in the flange's frame (m).", default="0,0,0", metavar="X,Y,Z"
+    payload_m: tuple[float, float, float] = numbers_option(
+        "Its centre of mass in the flange's frame (m).", form="x,y,z", default="0,0,0"
     )
     widest_deg: float = option(
         "Warn where a joint turns farther than this from one target to the next.",
         default=math.degrees(WIDEST_RAD),
+        min=1e-3,
+        max=720.0,
     )
     temperatures: str | None = option(
         "Temperatures of the links behind the joints, in degrees Celsius, for an arm "
@@ -284,10 +289,11 @@ class CorrectOptions:
 
 
 point_option = partial(
-    option,
+    numbers_option,
     "For images: the frame's origin in the target's frame, such as the tool's tip.",
     "--point-mm",
-    metavar="X,Y,Z",
+    form="x,y,z",
+    scale=1e-3,
 )
 
 
@@ -315,25 +321,13 @@ class TouchOptions(RobotPoseOptions):
     """Convention and repeatability of touches."""
 
     touch_noise: float | None = option(
-        "Repeatability of a touch, per axis, in mm.", "--touch-noise-mm"
+        "Repeatability of a touch, per axis, in mm.", "--touch-noise-mm", min=1e-4, max=1e3
     )
 
     @property
     def noise_m(self) -> float | None:
-        """Repeatability of a touch [m].
-
-        Raises:
-            DataError: It is no length from 0 to 1000 mm.
-        """
-        noise_mm = self.touch_noise
-        if noise_mm is None:
-            return None
-        if not 0.0 < noise_mm < 1e3:
-            raise DataError(
-                f"--touch-noise-mm is {noise_mm:g}; millimetres above 0 and under 1000 are needed.",
-                culprits=["--touch-noise-mm"],
-            )
-        return 1e-3 * noise_mm
+        """Repeatability of a touch [m]."""
+        return None if self.touch_noise is None else 1e-3 * self.touch_noise
 
     def given(self) -> dict[str, object]:
         """The options by their names; None for those that were not given."""
@@ -360,7 +354,7 @@ class TcpOptions:
         "point. Or a session whose images show a target on the tool.",
         default=None,
     )
-    point: str | None = point_option()
+    point: tuple[float, float, float] | None = point_option()
     as_json: bool = json_flag()
 
 
@@ -391,7 +385,7 @@ class FixtureOptions:
         "What touched: a tool of the calibration, a file of frames (frames.json, or "
         "frames.json:gripper), or none, where the poses are of the tip itself."
     )
-    point: str | None = point_option()
+    point: tuple[float, float, float] | None = point_option()
     as_json: bool = json_flag()
 
 
@@ -406,7 +400,7 @@ class TouchTestOptions:
     """
 
     session: Path = session_argument()
-    calibration: Path | None = option("An output folder of calibrate.", "-c", "--calibration")
+    calibration: Path = against_option("-c", "--calibration")
     tool: str | None = option(
         "Which tool of the calibration has the tip, see tcp; its only tool need not be "
         "named. none: a gauge of --clearance-mm before the flange."
@@ -444,16 +438,14 @@ class LocateOptions:
         "A session, or one image (png, jpg, tif, bmp, webp); may be left out with --pixel.",
         default=None,
     )
-    calibration: Path | None = option(
-        "The camera's: an output folder of calibrate, or its .rrd.", "-c", "--calibration"
-    )
-    pixel: list[str] | None = option(
-        "A feature, in the image as it was taken; several may be given.", metavar="U,V"
+    calibration: Path = against_option("-c", "--calibration")
+    pixel: list[tuple[float, float]] | None = numbers_option(
+        "A feature, in the image as it was taken; several may be given.", form="u,v"
     )
     plane: str | None = option(f"Plane of the features: {FORMS}.")
     plane_sigma: float | None = option("Sigma of the plane's height, in mm.", "--plane-sigma-mm")
-    point: str | None = option(
-        "A point of the target, instead of its origin.", "--point-mm", metavar="X,Y,Z"
+    point: tuple[float, float, float] | None = numbers_option(
+        "A point of the target, instead of its origin.", "--point-mm", form="x,y,z", scale=1e-3
     )
     target: str | None = option(
         "What to look for, instead of the session's own: a name in targets/, a .toml, or "
@@ -462,9 +454,8 @@ class LocateOptions:
     camera: str | None = camera_name()
     robot: str | None = robot_name()
     view: int | None = option("Which of the session's views; else all that show the target.")
-    pose: str | None = option(
-        "Pose of the flange at the image, in metres, for a camera on the flange.",
-        metavar=POSE.upper(),
+    pose: tuple[float, ...] | None = numbers_option(
+        "Pose of the flange at the image, in metres, for a camera on the flange.", form=POSE
     )
     sigma_px: float | None = option(
         "Noise of a feature's coordinate; else that of the calibration's corners."

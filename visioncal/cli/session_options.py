@@ -6,14 +6,21 @@ from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
 from visioncal.cli.options import (
+    REQUIRED,
+    argument,
+    flag,
     force_flag,
     json_flag,
+    numbers_option,
+    option,
     out_folder,
     seed_option,
     session_argument,
+    size_option,
     view_flag,
     yes_flag,
 )
+from visioncal.cli.parsing import names_in, pair_in
 from visioncal.core.choices import (
     FOREIGN_NAMES,
     PLAN_SPEED,
@@ -25,7 +32,6 @@ from visioncal.core.choices import (
     Faults,
     Mount,
 )
-from visioncal.core.options import REQUIRED, argument, flag, option
 from visioncal.live.capture.options import Keep, Stillness
 from visioncal.live.planning.purposes import PURPOSES
 
@@ -34,11 +40,13 @@ _what = partial(option, panel="What is planned")
 _cell = partial(option, panel="The cell, where the source does not say it")
 _certainty = partial(option, panel="How well it is known")
 kept_option = partial(option, panel="What the arm must keep")
+_span = partial(numbers_option, form="near,far", scale=1e-3, panel="What the arm must keep")
 _record_cell = partial(option, panel="The cell, where no plan says it")
 _taking = partial(option, panel="How views are taken")
 _moving = partial(option, panel="How the arm is moved")
 _device = partial(option, panel="What the camera is set to")
 _poses = partial(option, panel="The poses of somebody else's recording")
+_names = partial(_poses, parse=names_in)
 _recording = partial(option, panel="The recording itself")
 _camera = partial(option, panel="Its camera")
 _doubt = partial(option, panel="Poses that may be misread, of a session as well")
@@ -72,6 +80,7 @@ class DemoOptions:
         f"With --live, let this happen half way: {', '.join(get_args(Faults))}.",
         metavar="FAULT",
         show_default=False,
+        needs="live",
     )
 
 
@@ -265,7 +274,9 @@ class PlanCellOptions:
         "The lens: four numbers in pixels, a file of intrinsics, or an earlier calibration.",
         metavar="FX,FY,CX,CY | FILE",
     )
-    resolution: str | None = _cell("Size of the images in pixels.", metavar="W,H")
+    resolution: tuple[int, int] | None = size_option(
+        "Size of the images in pixels.", panel="The cell, where the source does not say it"
+    )
     mount: Mount | None = _cell("Where the camera is.")
     cam: str | None = _cell(
         "Rough place of the camera on the flange (or in the base), in mm and degrees: "
@@ -284,13 +295,13 @@ class PlanCellOptions:
         "The same of their rotations, in degrees.", default=5.0, min=0.01, max=45.0
     )
     noise_px: float | None = _certainty(
-        "Sigma of a corner in the image; by default 0.1, or as recorded."
+        "Sigma of a corner in the image; by default 0.1, or as recorded.", min=0.0, max=1e3
     )
     noise_mm: float | None = _certainty(
-        "Sigma of the robot at a stop, per axis; by default 0.03, or as recorded."
+        "Sigma of the robot at a stop, per axis; by default 0.03, or as recorded.", min=0.0, max=1e3
     )
     noise_deg: float | None = _certainty(
-        "The same of its rotation; by default 0.003, or as recorded."
+        "The same of its rotation; by default 0.003, or as recorded.", min=0.0, max=1e3
     )
 
     def options(self, *names: str) -> dict[str, object]:
@@ -334,11 +345,11 @@ class SightOptions:
     edge_px: float = kept_option(
         "Distance of the board from the image's edge.", default=20.0, min=0.0, max=10000.0
     )
-    distance_mm: str | None = kept_option(
+    distance_m: tuple[float, float] | None = _span(
         "Distance of the camera from the board; by default as the board fills the image.",
-        metavar="NEAR,FAR",
+        "--distance-mm",
     )
-    focus_mm: str | None = kept_option("Depths at which images are sharp.", metavar="NEAR,FAR")
+    focus_m: tuple[float, float] | None = _span("Depths at which images are sharp.", "--focus-mm")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,7 +407,9 @@ class TakingOptions:
 class DeviceOptions:
     """Camera settings."""
 
-    resolution: str | None = _device("Size of the images in pixels.", metavar="W,H")
+    resolution: tuple[int, int] | None = size_option(
+        "Size of the images in pixels.", panel="What the camera is set to"
+    )
     exposure_us: int | None = _device("Exposure time in microseconds.")
     gain: int | None = _device("ISO, or the device's own unit.")
     focus: int | None = _device("Lens position, in the device's own unit.")
@@ -446,7 +459,7 @@ class RecordOptions:
 class RobotPoseOptions:
     """Options for the convention of the robot's poses."""
 
-    robot_columns: str | None = _poses(
+    robot_columns: tuple[str, ...] | None = _names(
         "Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
         "--robot-columns",
         "--robot-key",
@@ -456,7 +469,7 @@ class RobotPoseOptions:
     robot_inverse: bool | None = _poses(
         "They give the base in the flange.", "--robot-inverse/--robot-as-is"
     )
-    joint_columns: str | None = _poses(
+    joint_columns: tuple[str, ...] | None = _names(
         "Columns or keys of the joint angles.", "--joint-columns", "--joint-key"
     )
     joint_unit: Literal["rad", "deg"] = _poses("Unit of the joint angles.", default="rad")
@@ -474,7 +487,7 @@ class ForeignOptions(RobotPoseOptions):
         "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm."
     )
     tip: str | None = _recording("The frame that the poses are of.")
-    camera_columns: str | None = _poses(
+    camera_columns: tuple[str, ...] | None = _names(
         "Columns or keys of measured poses of the target: rvec,tvec.",
         "--camera-columns",
         "--camera-key",
@@ -501,7 +514,9 @@ class ForeignOptions(RobotPoseOptions):
         "A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
         "of the source."
     )
-    resolution: str | None = _camera("WIDTH,HEIGHT that the intrinsics hold for.")
+    resolution: tuple[int, int] | None = size_option(
+        "Size of the images, in pixels, that the intrinsics hold for.", panel="Its camera"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -517,11 +532,18 @@ class ConvertOptions:
     written: ForeignOptions
     force: bool = force_flag()
     guess: bool = _doubt("Try other readings of the poses, and ask.", "--guess", default=False)
-    yes: bool = _doubt("Take the best one where it stands out clearly.", "--yes", default=False)
-    mirror_poses: bool = _doubt(
-        "Mirror the robot's poses where its frame is left-handed.", "--mirror-poses", default=False
+    yes: bool = _doubt(
+        "Take the best one where it stands out clearly.", "--yes", default=False, needs="guess"
     )
-    exchange: str | None = _doubt("Two views whose images are exchanged, by number: 8,17.")
+    mirror_poses: bool = _doubt(
+        "Mirror the robot's poses where its frame is left-handed.",
+        "--mirror-poses",
+        default=False,
+        needs="guess",
+    )
+    exchange: tuple[int, int] | None = _doubt(
+        "Two views whose images are exchanged, by number: 8,17.", parse=pair_in
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,14 +23,9 @@ _MAGIC = b"RRF2"
 
 def show_command(options: ShowOptions) -> None:
     """Runs `visioncal show`."""
-    if not options.certificate:
-        given = {"--operator": options.operator or None, "--serial": options.serial}
-        refuse_given(given, "they are for --certificate", "Give that, too, or leave it out.")
     if not options.viewer:
-        given_view = {"--web": options.web or None, "--view": options.view}
-        refuse_given(given_view, "they are for --viewer", "Give that, too, or leave it out.")
         signed = {"operator": options.operator} if options.operator else {}
-        signed |= dict(map(_serial_number, options.serial or ()))
+        signed |= dict(options.serial or ())
         _write_page(options.result, options.out, signed if options.certificate else None)
         return
     if options.web and options.view is not None:
@@ -70,16 +65,6 @@ def _write_page(result: Path, out: Path | None, signed: dict[str, str] | None) -
         if stored.note and stored.calibration.cell is None:
             say(stored.note)
     say(f"wrote {out}")
-
-
-def _serial_number(text: str) -> tuple[str, str]:
-    what, sign, number = text.partition("=")
-    if not sign or not what:
-        raise DataError(
-            f"--serial is {text!r}; what it is of and the number are needed, as camera=1234.",
-            culprits=["--serial"],
-        )
-    return f"serial number, {what}", number
 
 
 def _row(file: Path, view: int | None) -> int | None:

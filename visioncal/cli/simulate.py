@@ -1,8 +1,7 @@
 """`visioncal simulate`."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
-from typing import TypeVar
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,14 +15,12 @@ from visioncal.simulation import (
     BOARDS,
     CAMERAS,
     ArmOptions,
-    CameraAt,
     CellOptions,
     InstrumentAt,
     Moved,
     NetworkOptions,
     Payload,
     PointAt,
-    RobotAt,
     Round,
     Second,
     SimulatedCell,
@@ -57,23 +54,20 @@ _SINGLE = frozenset(
         *("images", "stiffness_knm", "payload_kg", "recording", "camera_moved_mm", "seed"),
     )
 )
-_ARM = frozenset(
-    (
-        *("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"),
-        *("stiffness_knm", "payload_kg"),
-    )
-)
 # Kinds of session that a whole cell can include.
 _WITH_CELL = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
     "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
-    "cell": _ARM
-    | _WITH_CELL
-    | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"}
-    | {"board_scale", "with_intrinsics"},
-    "instrument": _ARM | {"views", "robot", "seed"},
+    "cell": _WITH_CELL
+    | {"views", "images", "seed", "recording", "camera_moved_mm", "touches", "currents"},
+    "instrument": frozenset(
+        (
+            *("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"),
+            *("stiffness_knm", "payload_kg", "views", "robot", "seed"),
+        )
+    ),
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
 }
 
@@ -94,8 +88,8 @@ def simulate_command(asked: SimulateOptions) -> None:
         )
     kind = kinds[0] if kinds else ""
     takes = _TAKES[kind]
-    if kind == "cell" and asked.torques:
-        takes = takes | {"currents"}
+    if kind == "cell" and not asked.torques:
+        takes = takes - {"currents"}
     for wrong in sorted(asked.given - takes - {"folder", kind}):
         possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
         raise DataError(
@@ -103,7 +97,7 @@ def simulate_command(asked: SimulateOptions) -> None:
             culprits=[_option(wrong)],
             next_step="Leave it out."
             if kind != "cell"
-            else "Leave it out; what a whole cell is made of is said by a file of your own.",
+            else "Leave it out: a file of your own says what a cell is made of, and its errors.",
         )
     given, folder = asked.given, asked.folder
     options = CellOptions(
@@ -179,17 +173,6 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}" if name else "a plain cell of one robot"
 
 
-_T = TypeVar("_T", RobotAt, CameraAt)
-# Fields of robots and cameras, by the parameters that set them.
-_FIELDS: Mapping[str, str] = {
-    "robot_sigma_mm": "robot_sigma_m",
-    "robot_sigma_mrad": "robot_sigma_rad",
-    "arm_sigma_mm": "dh_sigma_m",
-    "arm_sigma_mrad": "dh_sigma_rad",
-    "stiffness_knm": "compliance_rad_per_nm",
-    "payload_kg": "payloads",
-    "with_intrinsics": "state_intrinsics",
-}
 # Centre of a simulated load in the flange's frame [m].
 _CENTRE_M = (0.0, 0.0, 0.1)
 # Half the side of a cubic load [m], and torque constant of each drive [N m/A].
@@ -220,22 +203,9 @@ def _described(
 ) -> NetworkOptions:
     """A cell's description, with the user's options in its place."""
     described = read_cell(name)
-    fields_by_option = {"views": "stops", "wrong_views": "stray_images"}
-    fields_by_option |= {"seed": "seed", "recording": "recording"}
-    described = replace(
-        described,
-        **{
-            field: getattr(options, parameter)
-            for parameter, field in fields_by_option.items()
-            if parameter in given
-        },
-        robots=tuple(_with_given(robot, options, given) for robot in described.robots),
-        cameras=tuple(_with_given(camera, options, given) for camera in described.cameras),
-        boards=tuple(
-            replace(board, scale=options.board_scale) if "board_scale" in given else board
-            for board in described.boards
-        ),
-    )
+    fields = {"stops": "views", "seed": "seed", "recording": "recording"}
+    changes = {field: getattr(options, name) for field, name in fields.items() if name in given}
+    described = replace(described, **changes)
     if "camera_moved_mm" in given:
         if not described.cameras:
             raise DataError(
@@ -245,13 +215,6 @@ def _described(
         knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
         described = replace(described, moved=(*described.moved, knocked))
     return described if instrument is None else _with_instrument(name, described, instrument)
-
-
-def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
-    """A robot or a camera with the user's options."""
-    names = {field.name for field in fields(thing)}
-    changes = {_FIELDS[name] for name in given & _FIELDS.keys()} & names
-    return replace(thing, **{name: getattr(options, name) for name in changes})
 
 
 def _with_instrument(

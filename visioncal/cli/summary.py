@@ -3,10 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
-from rich.markup import escape
-from rich.table import Column, Table
 
-from visioncal.cli.console import answers
+from visioncal.cli.console import answer, print_table
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
@@ -23,62 +21,55 @@ _SHOWN_LEVEL = 1.2
 
 def print_verdict(verdict: Verdict, name: str) -> None:
     """Prints a verdict with its reasons and next steps."""
-    console, colour = answers(), _COLOURS[verdict.status]
-    console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
+    answer(f"  {name}", verdict.status, _COLOURS[verdict.status])
     for line in verdict.top:
-        console.print(f"  - {escape(line)}")
+        answer(f"  - {line}")
     print_steps(verdict.next_steps)
     if verdict.rest:
-        console.print("What else was found:")
+        answer("What else was found:")
     for line in verdict.rest:
-        console.print(f"  - {escape(line)}")
+        answer(f"  - {line}")
 
 
 def print_steps(steps: Sequence[Remedy]) -> None:
     """Prints the next steps, each command on a line of its own."""
-    console = answers()
     if steps:
-        console.print("What to do next:")
+        answer("What to do next:")
     for at, step in enumerate(steps, 1):
-        console.print(f"  {at}. {escape(step.words)}")
+        answer(f"  {at}. {step.words}")
         if step.command:
-            console.print(f"     [bold]{escape(step.command)}[/]")
+            answer("", f"     {step.command}")
 
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result: the verdict first, then the transforms and errors."""
-    console, cell = answers(), calibration.cell
+    cell = calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
     for words in calibration.unstated_conditions:
-        console.print(f"[bold yellow]only where:[/] {escape(words)}")
+        answer(words, "only where: ", "bold yellow")
     if cell is not None:
-        console.print(f"the cell's frame is that of {cell.reference}")
+        answer(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}")
-        console.print(f"  {edge.rotation_words(calibration.controller)}")
+        answer(f"{name}: {edge.place_words()}, {edge.sigma_words}")
+        answer(f"  {edge.rotation_words(calibration.controller)}")
     if cell is not None:
         _print_noise(cell)
     else:
         _print_residuals(calibration)
     for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
-        console.print(escape(f"  {suspects.words}"))
+        answer(f"  {suspects.words}")
     if cell is not None:
-        console.print(escape(cell.weakest))
+        answer(cell.weakest)
     solvers = solver_table(calibration)
     if verbose and solvers is not None:
-        first, *rest = solvers.titles
-        columns = (Column(first, no_wrap=True), *(Column(name, overflow="fold") for name in rest))
-        table = Table(*columns, box=None, pad_edge=False)
-        for row in solvers.rows:
-            table.add_row(*row.cells)
-        console.print(table)
+        print_table(solvers.titles, [row.cells for row in solvers.rows])
 
 
 def _print_residuals(calibration: Calibration) -> None:
     """Prints the number of used views, and the errors of held-out predictions."""
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
-    answers().print(
+    answer(
         f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
         f"{figure(held.mm)} mm"
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
@@ -88,7 +79,6 @@ def _print_residuals(calibration: Calibration) -> None:
 
 def _print_noise(cell: CellResult) -> None:
     """Prints the noise of a whole cell."""
-    console = answers()
     for name, levels in cell.noise.items():
         words = [
             f"{figure(value)} {key.rpartition('_')[2]}"
@@ -98,7 +88,7 @@ def _print_noise(cell: CellResult) -> None:
         level = levels.get("level", 1.0)
         if level > _SHOWN_LEVEL or not words:
             words.append(f"{figure(level)} times what is said of it")
-        console.print(f"noise of {name}: {', '.join(words)}")
+        answer(f"noise of {name}: {', '.join(words)}")
 
 
 def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
@@ -112,24 +102,20 @@ def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[V
             yield view
 
 
-def truth_table(
+def truth_rows(
     calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
-) -> Table:
-    """Table of errors against the truth, in millimetres, degrees, pixels and units of sigma."""
-    table = Table("against the truth", "error", "sigma", "error / sigma", box=None)
+) -> Iterator[tuple[str, str, str, str]]:
+    """Errors against the truth in mm, deg and px, their sigmas, and the ratios of both."""
     for name, edge_error in edge_errors(calibration, transforms).items():
         for error, sigma, unit in (
             (edge_error.mm, edge_error.sigma_mm, "mm"),
             (edge_error.deg, edge_error.sigma_deg, "deg"),
         ):
-            table.add_row(
-                name, f"{error:.3f} {unit}", f"{sigma:.3f} {unit}", f"{error / sigma:.2f}"
-            )
+            yield name, f"{error:.3f} {unit}", f"{sigma:.3f} {unit}", f"{error / sigma:.2f}"
     if calibration.camera is not None and calibration.camera.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.camera.covariance))[:4]
         errors = calibration.camera.camera.matrix - camera.matrix
         for name, error, sigma in zip(("fx", "fy", "cx", "cy"), errors, sigmas, strict=True):
             # A fixed parameter has no sigma.
             ratio = f"{abs(error) / sigma:.2f}" if sigma > 0.0 else ""
-            table.add_row(name, f"{error:+.2f} px", f"{sigma:.2f} px", ratio)
-    return table
+            yield name, f"{error:+.2f} px", f"{sigma:.2f} px", ratio

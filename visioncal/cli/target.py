@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from dataclasses import fields
 
 import typer
-from rich.markup import escape
 
-from visioncal.cli.console import answers, print_json, say
+from visioncal.cli.console import answer, print_json, say
 from visioncal.cli.session_options import (
     BoardKind,
     BoardOptions,
@@ -110,7 +109,7 @@ def target_check_command(options: TargetCheckOptions) -> None:
         typer.echo(description, nl=False)
     if options.out is not None:
         if not options.as_json:
-            answers().print(escape(describe(identity)))
+            answer(describe(identity))
         for note in identity.notes:
             say(note)
         say(f"wrote {options.out}")

@@ -2,30 +2,27 @@
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.cli.console import (
     EXIT_BAD,
-    answers,
+    answer,
     asked,
     check_usable,
-    messages,
     print_json,
     report_error,
     report_written,
     say,
     warn,
 )
-from visioncal.cli.parsing import named_result, numbers_in, refuse_given
+from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
 from visioncal.core.errors import DataError, DriverError
@@ -48,13 +45,13 @@ from visioncal.results import Calibration, to_document
 from visioncal.results.compensation.correction import correct
 from visioncal.session import Session
 
-_FORM = "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
+_FORM = "Flange targets: x, y, z [mm], rotation vector [rad]; hover first, then touch."
 
 
 def touch_test_command(options: TouchTestOptions) -> None:
     """Runs `visioncal touch-test`."""
     loaded = Session.load(options.session)
-    calibration = named_result(options.calibration, "-c", "touch-test: the calibration to prove")
+    calibration = options.calibration
     result = load_result(calibration)
     if result.cell is not None:
         raise DataError(
@@ -89,11 +86,10 @@ def touch_test_command(options: TouchTestOptions) -> None:
         board = next(iter(loaded.boards.values()))
         gaps = _drive(options, result, board, located, targets)
     elif sys.stdin.isatty() and not options.as_json:
-        console = messages()
-        console.print(_FORM)
+        say(_FORM)
         gaps = []
         for point, target in zip(points, targets, strict=True):
-            _report_point(point, target, console)
+            _report_point(point, target, say)
             gaps.append(_gap())
     else:
         _report(points, targets, as_json=options.as_json)
@@ -104,7 +100,7 @@ def touch_test_command(options: TouchTestOptions) -> None:
     if options.as_json:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
-        answers().print(escape(touch_test_finding(test).reason))
+        answer(touch_test_finding(test).reason)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
 
 
@@ -148,24 +144,23 @@ def _report(
     if as_json:
         print_json({"points": targets})
         return
-    console = answers()
-    console.print(_FORM)
+    answer(_FORM)
     for point, target in zip(points, targets, strict=True):
-        _report_point(point, target, console)
-    console.print("Enter the gaps with --gaps-mm, in this order.")
+        _report_point(point, target, answer)
+    answer("Enter the gaps with --gaps-mm, in this order.")
 
 
-def _report_point(point: TouchPoint, target: dict[str, Any], console: Console) -> None:
+def _report_point(point: TouchPoint, target: dict[str, Any], show: Callable[[str], None]) -> None:
     """Prints a point's position, and the targets of the robot."""
     x, y, z = 1e3 * point.base_m
-    console.print(
+    show(
         f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
         "mm"
     )
     for name in ("hover", "touch"):
         place, turn = target[name][:3], target[name][3:]
         numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
-        console.print(f"  {name}: {', '.join(numbers)}")
+        show(f"  {name}: {', '.join(numbers)}")
 
 
 def _drive(
@@ -186,7 +181,7 @@ def _drive(
             place, turn = target["hover"][:3], Rotation.from_rotvec(target["hover"][3:])
             hover = np.asarray(RigidTransform.from_components(place, turn).as_matrix())
             _bring(hovering, hover, point.name)
-            _report_point(point, target, messages())
+            _report_point(point, target, say)
             gaps.append(_gap())
     return gaps
 

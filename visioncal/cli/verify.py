@@ -4,7 +4,6 @@ import json
 import sys
 
 import typer
-from rich.markup import escape
 
 from visioncal.calibration.verification import (
     facts_of,
@@ -14,8 +13,7 @@ from visioncal.calibration.verification import (
     verdict_of,
     verify,
 )
-from visioncal.cli.console import EXIT_BAD, answers, report_written
-from visioncal.cli.parsing import named_result
+from visioncal.cli.console import EXIT_BAD, answer, report_written
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.summary import print_steps
@@ -24,17 +22,17 @@ from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
 
-# Headings of the policy's triggers by state.
+# Headings of the policy's triggers by state, with their styles.
 _TRIGGERED = {
-    "fired": "[bold yellow]calibrate again[/] because of",
-    "quiet": "no reason to calibrate again",
-    "unknown": "could not be checked",
+    "fired": ("calibrate again because of: ", "bold yellow"),
+    "quiet": ("no reason to calibrate again: ", ""),
+    "unknown": ("could not be checked: ", ""),
 }
 
 
 def verify_command(options: VerifyOptions) -> None:
     """Runs `visioncal verify`."""
-    against = named_result(options.against, "--against", "verify: the calibration to check")
+    against = options.against
     if options.output is not None:
         refuse_calibration(options.output)
     triggers = load_policy(options.policy)
@@ -57,18 +55,17 @@ def verify_command(options: VerifyOptions) -> None:
     if options.as_json:
         typer.echo(document, nl=False)
     else:
-        console = answers()
         word, colour = ("pass", "green") if check.passed else ("fail", "red")
-        name = escape(check.predicted.observed.session.name)
-        reference = escape(f"{check.calibration.session_name}, {check.calibration.created}")
-        console.print(f"[bold {colour}]{word}[/]  {name} against {reference}")
+        name, against_result = check.predicted.observed.session.name, check.calibration
+        reference = f"{against_result.session_name}, {against_result.created}"
+        answer(f"  {name} against {reference}", word, f"bold {colour}")
         for line in (*verdict.top, *verdict.rest, *check.predicted.warnings):
-            console.print(f"  - {escape(line)}")
+            answer(f"  - {line}")
         print_steps(verdict.next_steps)
         for view, reason in sorted(check.predicted.observed.reasons.items()):
-            console.print(f"  view {view} was not used: {escape(reason)}")
-        for state, begin in _TRIGGERED.items():
+            answer(f"  view {view} was not used: {reason}")
+        for state, (begin, style) in _TRIGGERED.items():
             words = "; ".join(trigger.words for trigger in fired if trigger.state == state)
             if words:
-                console.print(f"{begin}: {escape(words)}")
+                answer(words, begin, style)
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

@@ -125,8 +125,10 @@ MOST_IMAGE_BYTES = 300_000_000
 # Longest name in file systems [bytes].
 _LONGEST_NAME = 255
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+# Each value costs about a hundred bytes in memory once it is read.
+MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
-_DEEPEST = 40
+MAX_DEPTH = 40
 # tomllib's messages on repeated tables and keys.
 _TWICE = re.compile("twice|overwrite a value")
 
@@ -256,16 +258,31 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
             ),
         ) from error
     except RecursionError as error:
-        raise _too_deep(label) from error
+        raise too_deep(label) from error
     except ValueError as error:
         # Integers of thousands of digits, and impossible dates.
         raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
+    check_values(document, label)
+    return document
+
+
+def check_values(document: object, label: str, largest: float | None = None) -> None:
+    """Checks number, depth and size of a document's values without recursion.
+
+    Raises:
+        DataError: There are too many, nested too deep, a whole number has more than 64 bits, or
+            another is not finite or beyond `largest`, if given.
+    """
     pending: list[tuple[str, object, int]] = [("", document, 1)]
+    count = 0
     while pending:
         path, value, depth = pending.pop()
-        if depth > _DEEPEST:
-            raise _too_deep(f"{label}: {path[:80]}")
-        if isinstance(value, dict):
+        count += 1
+        if count > MAX_VALUES:
+            raise too_many(label)
+        if depth > MAX_DEPTH:
+            raise too_deep(f"{label}: {path[:80]}")
+        if isinstance(value, Mapping):
             pending += [
                 (f"{path}.{key}".lstrip("."), item, depth + 1) for key, item in value.items()
             ]
@@ -273,16 +290,28 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
             pending += [(f"{path}[{index}]", item, depth + 1) for index, item in enumerate(value)]
         elif isinstance(value, int) and value.bit_length() > 63:
             raise DataError(
-                f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
+                f"{label}: {path} has more than the 64 bits of a whole number.",
                 culprits=[f"{label}: {path}"],
             )
-    return document
+        elif largest is not None and isinstance(value, float) and not abs(value) <= largest:
+            raise DataError(
+                f"{label}: {path} is {value}; a number that a cell has is needed.",
+                culprits=[f"{label}: {path}"],
+            )
 
 
-def _too_deep(where: str) -> DataError:
+def too_many(where: str) -> DataError:
+    """Builds the error for a document with too many values."""
     return DataError(
-        f"{where}: nested deeper than {_DEEPEST} levels, as no description is.", culprits=[where]
+        f"{where}: more than {MAX_VALUES:,} values; documents up to that size are read.",
+        culprits=[where],
+        next_step="Cut the recording into parts.",
     )
+
+
+def too_deep(where: str) -> DataError:
+    """Builds the error for a document that is nested too deep."""
+    return DataError(f"{where}: nested deeper than {MAX_DEPTH} levels.", culprits=[where])
 
 
 def one_line(text: str) -> str:

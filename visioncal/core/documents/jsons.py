@@ -17,16 +17,17 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.core.documents.values import (
+from visioncal.core.documents.values import read_plain_text, shown
+from visioncal.core.errors import DataError
+from visioncal.core.files import (
     MAX_VALUES,
-    check_bounds,
-    read_plain_text,
-    shown,
+    MOST_BYTES,
+    check_values,
+    decode_text,
+    read_bytes,
     too_deep,
     too_many,
 )
-from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 
 Array: TypeAlias = npt.NDArray[Any]
 
@@ -137,15 +138,6 @@ def _parse_npy(data: bytes, where: str) -> Array:
 
 # Longer integers are read as floats: Python parses them in quadratic time.
 _MAX_DIGITS = 18
-# Names of fields that hold numbers: quantities carry their unit.
-_UNITS = r"mm|m|deg|rad|mrad|px|s|c|nm|kg|a|n|k|m_s2|rad_s2|kg_m2|sigma"
-_NUMBERS = re.compile(
-    rf".+_({_UNITS})|.+_per_.+|mm|deg|px|sigma|matrix|quaternion_xyzw|covariance|edge_covariance"
-    "|view|corners|resolution|distortion|spectrum|inflation|likelihood_ratio|condition|unknowns"
-    "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect|shear"
-)
-# Tables with keys chosen by users.
-_NAMED = ("frames", "robots", "tree")
 # Suffixes of files of other kinds, and number of characters of them in a message.
 _OTHER_KINDS, _SHOWN = (".csv", ".toml", ".txt", ".png", ".urdf", ".xml", ".html", ".rrd"), 40
 # Squares and products of larger numbers may overflow.
@@ -161,8 +153,8 @@ def read_json(path: Path) -> object:
     return parse_json(read_plain_text(path), str(path))
 
 
-def parse_json(text: str, where: str) -> object:
-    """Parses JSON as `read_json` does; `where` names its origin in errors."""
+def parse_json(text: str, where: str, largest: float | None = None) -> object:
+    """Parses JSON as `read_json` does; `where` names its origin, `largest` bounds its floats."""
     # An upper bound of the number of values: every value follows a comma or a bracket.
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
         raise too_many(where)
@@ -179,7 +171,7 @@ def parse_json(text: str, where: str) -> object:
         ) from error
     except RecursionError as error:
         raise too_deep(where) from error
-    check_bounds(value, where)
+    check_values(value, where, largest)
     return value
 
 
@@ -193,27 +185,12 @@ def _unique(pairs: Sequence[tuple[str, Any]], where: str) -> dict[str, Any]:
     return content
 
 
-class StoredTable(dict[str, Any]):
-    """A table of a document whose missing fields raise errors with their paths."""
-
-    def __init__(self, content: dict[str, Any], path: str) -> None:
-        super().__init__(content)
-        self.path = path
-
-    def __missing__(self, key: str) -> object:
-        """Raises the error for a missing field."""
-        raise DataError(f"{self.path}{key} is missing.", culprits=[f"{self.path}{key}"])
-
-
-def parse_stored(text: bytes | str, label: str) -> StoredTable:
-    """Parses a document that visioncal wrote.
-
-    Returns:
-        Its content, which raises DataError on access to a missing field.
+def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
+    """Parses a document that visioncal wrote; the codec checks the types of its fields.
 
     Raises:
-        DataError: It is no JSON, no table, too large or too deep, or a field does not hold the
-            number that its name, such as `rms_mm`, announces; the message has its path.
+        DataError: It is no JSON, no table, too large or too deep, or a number in it is not finite
+            or too large for squares; the message has its path.
     """
     text = decode_text(text, label) if isinstance(text, bytes) else text
     begins = text.lstrip()[:_SHOWN].partition("\n")[0]
@@ -225,35 +202,7 @@ def parse_stored(text: bytes | str, label: str) -> StoredTable:
             next_step="Name its file, as calibration.json, or its folder. This one is of another "
             "kind; nothing need be changed in it.",
         )
-    table = _checked(parse_json(text, label), f"{label}: ", "")
-    if not isinstance(table, StoredTable):
-        raise DataError(f"{label} is {shown(table)}; a table is needed.", culprits=[label])
-    return table
-
-
-def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSON may hold
-    needed = _needed(value, key)
-    if needed:
-        place = path.rstrip(".")
-        raise DataError(f"{place} is {shown(value)}; {needed} is needed.", culprits=[place])
-    if isinstance(value, dict):
-        return StoredTable(
-            {
-                name: _checked(item, f"{path}{name}.", "" if key in _NAMED else name)
-                for name, item in value.items()
-            },
-            path,
-        )
-    if isinstance(value, list):
-        stem = path.rstrip(".")
-        return [_checked(item, f"{stem}[{index}].", key) for index, item in enumerate(value)]
-    return value
-
-
-def _needed(value: object, key: str) -> str:
-    """The needed content of a field, by its name, that it lacks; empty where it is right."""
-    if _NUMBERS.fullmatch(key) and isinstance(value, str | bool):
-        return "a number"
-    if isinstance(value, float) and not abs(value) <= _LARGEST:
-        return "a number that a cell has"
-    return ""
+    document = parse_json(text, label, _LARGEST)
+    if not isinstance(document, dict):
+        raise DataError(f"{label} is {shown(document)}; a table is needed.", culprits=[label])
+    return document

@@ -17,17 +17,9 @@ from defusedxml.ElementTree import DefusedXMLParser
 
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.tables import is_number
-from visioncal.core.documents.values import (
-    DECIMAL,
-    MAX_DEPTH,
-    MAX_VALUES,
-    matrix_from,
-    read_plain_text,
-    too_deep,
-    too_many,
-)
+from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_bytes
+from visioncal.core.files import MAX_DEPTH, MAX_VALUES, read_bytes, too_deep, too_many
 
 _STANDARD = "tag:yaml.org,2002:"
 _CONSTANTS: dict[str, object] = {"true": True, "yes": True, "on": True}

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from visioncal.core.documents.values import DECIMAL, MAX_VALUES, read_plain_text, too_many
+from visioncal.core.documents.values import DECIMAL, read_plain_text
 from visioncal.core.errors import DataError
+from visioncal.core.files import MAX_VALUES, too_many
 
 _NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")

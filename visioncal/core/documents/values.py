@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
+from visioncal.core.files import MAX_VALUES, UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
 
-# Each value costs about a hundred bytes in memory once it is read.
-MAX_VALUES = 1_000_000
-# Matrices in lists in tables need six.
-MAX_DEPTH = 40
 # A number as others write it; also `1.`, `.5` and `1e-3`.
 DECIMAL = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
 
@@ -45,40 +41,6 @@ def read_plain_text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("cp1252", "replace")
-
-
-def too_many(where: str) -> DataError:
-    """Builds the error for a document with too many values."""
-    return DataError(
-        f"{where}: more than {MAX_VALUES:,} values; documents of poses up to that size are read.",
-        culprits=[where],
-        next_step="Cut the recording into parts.",
-    )
-
-
-def too_deep(where: str) -> DataError:
-    """Builds the error for a document that is nested too deep."""
-    return DataError(
-        f"{where}: nested deeper than {MAX_DEPTH} levels, as no file of poses is.",
-        culprits=[where],
-    )
-
-
-def check_bounds(value: object, where: str) -> None:
-    """Checks depth and size of a document without recursion; raises DataError."""
-    pending: list[tuple[object, int]] = [(value, 1)]
-    count = 0
-    while pending:
-        item, depth = pending.pop()
-        count += 1
-        if count > MAX_VALUES:
-            raise too_many(where)
-        if depth > MAX_DEPTH:
-            raise too_deep(where)
-        if isinstance(item, Mapping):
-            pending += [(value, depth + 1) for value in item.values()]
-        elif isinstance(item, list):
-            pending += [(value, depth + 1) for value in item]
 
 
 def shown(value: object) -> str:
