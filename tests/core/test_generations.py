@@ -15,8 +15,7 @@ from support.samples import made_up, with_frames
 
 from visioncal.calibration.run import Run
 from visioncal.core.errors import DataError
-from visioncal.core.files import write_atomically
-from visioncal.core.output_generations import write_generation
+from visioncal.core.files import write_atomically, write_generation
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import rewrite_result
 from visioncal.present import recording

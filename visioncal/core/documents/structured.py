@@ -21,6 +21,7 @@ from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_tex
 from visioncal.core.errors import DataError
 from visioncal.core.files import MAX_DEPTH, MAX_VALUES, read_bytes, too_deep, too_many
 
+_BLANKS = (b" ", b"\n", b"\t", b"\r")
 _STANDARD = "tag:yaml.org,2002:"
 _CONSTANTS: dict[str, object] = {"true": True, "yes": True, "on": True}
 _CONSTANTS |= {"false": False, "no": False, "off": False, "": None, "~": None, "null": None}
@@ -148,50 +149,28 @@ def parse_xml(data: bytes, where: str) -> Element:
     Raises:
         DataError: It is no XML, declares a document type, or is too large or too deep.
     """
-    parser = DefusedXMLParser(target=_BoundedTree(where), forbid_dtd=True)
+    # An upper bound: words by blanks, and elements, each as large as five, by half their tags.
+    if 5 * data.count(b"<") // 2 + sum(map(data.count, _BLANKS)) > MAX_VALUES:
+        raise too_many(where)
+    parser = DefusedXMLParser(target=TreeBuilder(insert_comments=True), forbid_dtd=True)
     try:
         parser.feed(data)
-        return parser.close()
+        root: Element = parser.close()
     except DefusedXmlException as error:
         raise DataError(
             f"{where}: a document type is declared; plain XML without entities is needed.",
             culprits=[where],
             next_step="Remove the <!DOCTYPE ...>.",
         ) from error
-    except ParseError as error:
+    except (ParseError, ValueError, LookupError) as error:
         raise DataError(f"{where} is no XML: {error}.", culprits=[where]) from error
-    except (ValueError, LookupError) as error:
-        raise DataError(f"{where} is no XML: {error}.", culprits=[where]) from error
-
-
-class _BoundedTree(TreeBuilder):
-    """Builds a tree of at most MAX_VALUES elements and words, and of MAX_DEPTH levels."""
-
-    def __init__(self, where: str) -> None:
-        super().__init__(insert_comments=True)
-        self.where, self.count, self.depth = where, 0, 0
-
-    def start(self, tag: str, attrs: dict[str, str], /) -> Element:
-        # Memory in units of values.
-        self._count(5)
-        self.depth += 1
-        if self.depth > MAX_DEPTH:
-            raise too_deep(self.where)
-        return super().start(tag, attrs)
-
-    def end(self, tag: str, /) -> Element:
-        self.depth -= 1
-        return super().end(tag)
-
-    def data(self, data: str, /) -> None:
-        # Parts are a few kilobytes each, so that words are counted before memory grows.
-        self._count(len(data.split()))
-        super().data(data)
-
-    def _count(self, values: int) -> None:
-        self.count += values
-        if self.count > MAX_VALUES:
-            raise too_many(self.where)
+    pending = [(root, 1)]
+    while pending:
+        element, depth = pending.pop()
+        if depth > MAX_DEPTH:
+            raise too_deep(where)
+        pending += [(child, depth + 1) for child in element]
+    return root
 
 
 _MATRICES = ("opencv-matrix", "opencv-nd-matrix")

@@ -5,8 +5,13 @@ from pathlib import Path
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, named_errors, read_toml, write_atomically
-from visioncal.core.output_generations import write_generation
+from visioncal.core.files import (
+    check_free,
+    named_errors,
+    read_toml,
+    write_atomically,
+    write_generation,
+)
 from visioncal.core.types import Target
 from visioncal.vision.printing.page import Sheet
 from visioncal.vision.printing.request import OF_TAGS
