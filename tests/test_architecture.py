@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -56,8 +57,13 @@ def package_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
 def imports(path: Path):
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -188,7 +194,7 @@ def ends(node: ast.AST, path: Path = PACKAGE):
 
 def test_inner_names_of_frames_cancel():
     for path in modules():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             if isinstance(node, ast.BinOp):
                 ends(node, path)
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp | ast.Call):
@@ -220,8 +226,8 @@ GONE = {
 VAGUE = {"tell", "tells", "told", "untold", "telling", "worth", "lacking", "wishes"}
 
 
-def identifiers(tree: ast.AST):
-    for node in ast.walk(tree):
+def identifiers(found_nodes):
+    for node in found_nodes:
         for name in ("id", "attr", "arg", "name", "asname"):
             if isinstance(found := getattr(node, name, None), str):
                 yield found
@@ -230,13 +236,12 @@ def identifiers(tree: ast.AST):
 def test_names_have_the_terms_of_the_field():
     for path in modules():
         assert path.stem not in GONE, path
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef):
                 assert node.name not in GONE, path
         vague = {
             identifier
-            for identifier in identifiers(tree)
+            for identifier in identifiers(nodes(path))
             if identifier == "it" or VAGUE & set(identifier.lower().split("_"))
         }
         assert not vague, (path, vague)
@@ -244,4 +249,10 @@ def test_names_have_the_terms_of_the_field():
 
 def test_the_check_of_vague_names_can_fail():
     code = "def told_of(one, *, is_told): return [it.telling(why_untold=1) for it in one]"
-    assert set(identifiers(ast.parse(code))) > {"told_of", "is_told", "telling", "why_untold", "it"}
+    assert set(identifiers(ast.walk(ast.parse(code)))) > {
+        "told_of",
+        "is_told",
+        "telling",
+        "why_untold",
+        "it",
+    }

@@ -18,15 +18,20 @@ SIZE_SHARE = 0.15
 # A message's figures are such sizes, with two digits: rounded by up to 5 % more.
 FIGURE_SHARE = 0.2
 
-# Those of more than two seconds whose effect is in a quicker cell, too.
+# Those whose effect is in a quicker cell, too.
 SLOW = {
+    "2 wrong to hand, 1", "4 wrong to hand, 1", "cell, board moved", "lens 1 px off to hand, 1",
+    "to hand, lens estimated, 1", "two boards, 3 wrong, 1", "wrong arm to hand, 1",
+    "wrong arm, 2", "wrong arm, 3 wrong, 1", "wrong arm, two boards, 1", "4 wrong, 1",
+    "in hand, lens estimated, 2", "in hand, lens given, 2", "to hand, lens given, 2",
+    "wrong arm, poses to hand, 1",
     "cell, both", "cell, camera bumped", "cell, half seen", "cell, kinematics",
     "cell, lens estimated, one in hand", "cell, offsets", "cell, tracker", "cell, wrong arms",
     "cell, wrong arms as reported", "cell, wrong rows", "springs, 1",
     "sweep to hand", "tracker, places, wrong arm",
 }  # fmt: skip
 # Of each kind of message one.
-QUICK = {"columns rx, ry, rz", "two images missing", "two rows exchanged", "another dictionary"}
+QUICK = {"two images missing", "two rows exchanged", "another dictionary"}
 
 
 def slow(names, is_slow):

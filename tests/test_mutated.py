@@ -4,6 +4,8 @@ import pytest
 from support.fuzz.mutants import READINGS, missing_commands, unknown_inputs, walk
 from support.marks import slow
 
+# No figure is looked at.
+DRAWS = False
 # Inputs that are made within a second, and commands that end soon on them.
 QUICK = {
     "pairs", "pairs.rrd", "out", "touches.csv", "features.csv", "points.csv", "drawing.csv",

@@ -9,7 +9,6 @@ from threading import Barrier
 import cv2
 import pytest
 from support.kept import assert_same_evidence
-from support.marks import slow
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from visioncal.calibration.run import calibrate, run
@@ -31,8 +30,8 @@ def settings():
     return cv2.getNumThreads(), blas
 
 
-@pytest.mark.parametrize("threads", [2, slow(4)])
-def test_threads_write_what_one_alone_writes(tmp_path, threads):
+def test_threads_write_what_one_alone_writes(tmp_path):
+    threads = 2
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
     session = Session.load(tmp_path / "cell")
 

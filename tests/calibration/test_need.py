@@ -105,10 +105,9 @@ def without_arm_errors(known: RunState) -> RunState:
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick(mount: str) -> None:
+def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick() -> None:
     """By 0.2 %, which shows a thing that much nearer or farther."""
-    cell, rng, share = simulate(CellOptions(mount=mount)), np.random.default_rng(3), 2e-3
+    cell, rng, share = simulate(CellOptions()), np.random.default_rng(3), 2e-3
     centre = cell.options.camera.matrix[2:]
     zoomed = [
         replace(
@@ -122,10 +121,9 @@ def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick(mount: str) 
     assert picks.budget_mm["look"] == pytest.approx(1e3 * share * picks.distance_m, rel=0.5)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
+def test_what_an_arm_does_again_moves_no_pick() -> None:
     """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
-    known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))
+    known = without_arm_errors(calibrated(simulate(CellOptions()), joints=False))
     answer, solved = known.assessment, known.cell_fit
     ((robot, arm),) = solved.arms.items()
     poses = answer.problem.poses[robot]
@@ -189,11 +187,10 @@ def test_errors_that_last_are_others_at_a_pick(mount: str) -> None:
     assert grown == pytest.approx(1e6 * np.mean(np.sum(away**2, axis=1)), rel=0.05)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: str) -> None:
+def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm() -> None:
     """Its size is known to 0.1 %, and is off by 1.5 times that: the arm becomes as large."""
     size = 1.0015
-    cell = simulate(CellOptions(mount=mount, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, board_scale=size))
+    cell = simulate(CellOptions(dh_sigma_m=3e-4, dh_sigma_rad=3e-4, board_scale=size))
     known = calibrated(cell)
     assert all(arm.is_modelled for arm in known.cell_fit.arms.values())
     (picks,) = known.findings.picks

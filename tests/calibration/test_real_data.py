@@ -85,6 +85,7 @@ def test_two_cameras_of_one_arm_are_one_cell(real_data, tmp_path):
     assert any(move.frame == "cam_c4" for move in result.cell.moved)
 
 
+@pytest.mark.slow
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):
     result = visioncal.calibrate(real_data / "sessions/visp_franka_eye_in_hand")
     assert result.verdict.status != "good"

@@ -118,9 +118,7 @@ def one_image_a_stop():
     return calibrate(of_one_camera(1, stops=True)[1])
 
 
-@pytest.mark.parametrize(
-    ("stops", "trembling_m"), [(True, 2e-6), (False, 0.0), slow(False, 2e-6), (False, 1e-5)]
-)
+@pytest.mark.parametrize(("stops", "trembling_m"), [(True, 2e-6), (False, 1e-5)])
 def test_images_of_a_stop_share_the_robots_error(stops, trembling_m):
     cell, session = of_one_camera(6, stops=stops, trembling_m=trembling_m)
     found = calibrate(session)
@@ -133,9 +131,9 @@ def test_images_of_a_stop_share_the_robots_error(stops, trembling_m):
     assert misfit(edge.matrix, edge.covariance, cell.transforms[name]) < 22.5
 
 
-@pytest.mark.parametrize(("seed", "images"), [slow(0, 10), (2, 3)])
-def test_still_boards_seen_often_outvote_no_robot(seed, images):
+def test_still_boards_seen_often_outvote_no_robot():
     """Most rows are of still cameras and a still board, and agree best of all."""
+    seed, images = 2, 3
     cell, session = of_a_cell(images, stops=True, seed=seed)
     found, once = calibrate(session), calibrate(of_a_cell(1, stops=True, seed=seed)[1])
     assert sum(not view.used for view in found.views) <= 0.01 * len(found.views)
@@ -186,7 +184,7 @@ def count_once(seed, times, jitter_m, *, interleaved):
 
 @pytest.mark.parametrize(
     ("seed", "jitter_m"),
-    [(0, 1e-4), slow(2, 0.0), (3, 0.0), (18, 0.0), *((slow(seed, 1e-4)) for seed in (2, 3, 18))],
+    [(0, 1e-4), (3, 0.0), slow(18, 1e-4)],
 )
 def test_copies_of_rows_change_nothing(seed, jitter_m):
     """Poses with joints, poses alone, corners, points of a tracker."""

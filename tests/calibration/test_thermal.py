@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from support.commands import visioncal as run
 from support.drawn import column
-from support.marks import slow
 from support.pages import Page
 from support.warmed import CELL, drift_of, warmed
 
@@ -299,7 +298,13 @@ def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(lear
         DataError, match=r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"
     ):
         calibrate(session.with_streams({"heat": soon}), level="thermal")
-    # Where nobody asks for the drift, residuals that drift say why it was not found.
+
+
+@pytest.mark.slow
+def test_residuals_that_drift_say_why_the_drift_was_not_looked_for(learnt):
+    session = learnt["temperatures"].session
+    heat = session.streams["heat"]
+    soon = Stream(heat.columns, heat.values[heat.stamps_s < 3000.0])
     (drifts,) = (
         finding
         for finding in calibrate(session.with_streams({"heat": soon})).verdict.findings
@@ -379,11 +384,10 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
     assert "looks like kelvin" in refused.err
 
 
-@pytest.mark.parametrize("points", [THREE[:1], slow(THREE)])
-def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
+def test_an_instrument_that_reads_points_sees_the_drift(learnt):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth
-    shop = tracked(InstrumentOptions(points=points), truth.robot.joints)
+    shop = tracked(InstrumentOptions(points=THREE[:1]), truth.robot.joints)
     moved = truth.robot.true_base_from_flange @ invert(truth.robot.base_from_flange)
     base = shop.base_from_instrument
     read = [(stop, at, invert(base) @ moved[stop] @ base @ array) for stop, at, array in shop.rows]

@@ -47,6 +47,7 @@ def test_a_session_of_streams_alone_survives_the_disk(folder):
     assert again.digest() == session.digest()
 
 
+@pytest.mark.slow
 def test_the_end_of_a_motion_is_judged_by_the_torques_of_all_of_it(tmp_path, monkeypatch):
     # As the page types it, but for --validate-on: in the last 30 % joint 5 bears the same torque
     # all the time, and its error is 6 % of that.

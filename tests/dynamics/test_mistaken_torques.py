@@ -59,9 +59,7 @@ def stream():
     ("change", "words"),
     [
         (swapped(1, 2, TORQUE), "the torques of joints 1 and 2 are swapped"),
-        (swapped(5, 6, TORQUE), "the torques of joints 5 and 6 are swapped"),
         (swapped(3, 4, ANGLE, SPEED), "the angles of joints 3 and 4 are swapped"),
-        (swapped(2, 3, TORQUE, ANGLE, SPEED), "joints 2 and 3 are swapped, with angles"),
         (swapped(5, 6, TORQUE, ANGLE, SPEED), "joints 5 and 6 are swapped, with angles"),
         (scaled(-1.0, [2], TORQUE), "the torque of joint 2 has the other sign"),
         (scaled(-1.0, [3], ANGLE, SPEED), "the angle of joint 3 has the other sign"),
@@ -81,8 +79,6 @@ def test_mistakes_are_named(stream, change, words):
     ("change", "words"),
     [
         (swapped(5, 6, TORQUE), "the torques of joints 5 and 6 are swapped"),
-        (swapped(3, 4, ANGLE, SPEED), "the angles of joints 3 and 4 are swapped"),
-        (scaled(-1.0, [2], TORQUE), "the torque of joint 2 has the other sign"),
         (scaled(57.2958, ALL, ANGLE, SPEED), "angles are in degrees"),
     ],
 )
@@ -92,9 +88,15 @@ def test_mistakes_are_named_without_inertias(stream, change, words):
         check(changed(stream, change), with_inertias=False)
 
 
-@pytest.mark.parametrize("with_inertias", [True, False])
-@pytest.mark.parametrize("seed", [0, 1, *map(slow, range(2, 6))])
-@pytest.mark.parametrize("motion", [multi_sine, slow_sweep])
+@pytest.mark.parametrize(
+    ("seed", "motion", "with_inertias"),
+    [
+        (0, multi_sine, True),
+        (1, slow_sweep, True),
+        (1, multi_sine, False),
+        slow(2, slow_sweep, False),
+    ],
+)
 def test_right_recordings_pass(seed, motion, with_inertias):
     name = "ur10e" if seed % 2 else "ur5e"
     rng = np.random.default_rng(10 + seed)

@@ -47,8 +47,7 @@ def found(stream, name="ur5e"):
     return find_lag(robot_with_bodies(nominal_dynamics(name)), [condition(rows)], TERMS)
 
 
-@pytest.mark.parametrize("lag_s", [0.02, -0.03, 0.08, 0.2])
-@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize(("lag_s", "whole"), [(0.02, True), (-0.03, False), (0.2, True)])
 def test_lags_are_found_to_their_sigmas(lag_s, whole):
     away = []
     for seed in range(3):
@@ -60,8 +59,8 @@ def test_lags_are_found_to_their_sigmas(lag_s, whole):
         assert lag.sigma_s < 4e-4
         # Motions of 0.1 to 0.25 Hz turn by 0.6 to 1.6 rad a second; dry friction adds its jumps.
         assert 0.5 * abs(lag_s) < lag.share < 4.0 * abs(lag_s)
-    # Chance does it once in 150,000 draws; there are 24, whose sigmas know nothing of the noise
-    # that angles leave in the regressor.
+    # Chance does it once in 150,000 draws; sigmas know nothing of the noise that angles leave in
+    # the regressor.
     assert np.abs(away).max() < 4.5
 
 

@@ -63,7 +63,7 @@ def test_base_and_flange_move_the_flange_as_their_basis_says():
 @pytest.mark.parametrize("joints", [slow(True), False], ids=["joints", "poses only"])
 def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
     surprises = []
-    for seed in range(3):
+    for seed in range(2):
         cell = simulate(replace(WRONG, mount=mount, seed=seed))
         known = calibrated(cell, joints=joints)
         assert known.robot_arm.errors is not None
@@ -85,24 +85,20 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
 
 @pytest.mark.parametrize("dh", [0.0, 1e-3])
 def test_measured_poses_alone_tell_a_wrong_arm_too(dh, tmp_path):
-    for seed in range(3):
-        options = replace(WRONG, seed=seed, dh_sigma_m=0.5 * dh, dh_sigma_rad=dh)
-        folder = write_session(simulate(options), tmp_path / f"{seed}", images=False)
-        result = visioncal.calibrate(folder)
-        assert (result.arm_errors is not None) == (dh > 0.0)
+    options = replace(WRONG, dh_sigma_m=0.5 * dh, dh_sigma_rad=dh)
+    result = visioncal.calibrate(write_session(simulate(options), tmp_path / "cell", images=False))
+    assert (result.arm_errors is not None) == (dh > 0.0)
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 @pytest.mark.parametrize("sigma", [5e-5, slow(5e-4)])
 def test_white_noise_is_not_taken_for_a_wrong_arm(mount, sigma):
-    for seed in range(3):
-        options = CellOptions(
-            mount=mount,
-            camera=fine_camera(),
-            robot_sigma_rad=sigma,
-            robot_sigma_m=0.6 * sigma,
-            seed=seed,
-        )
-        for joints in (True, False):
-            errors = calibrated(simulate(options), joints=joints).robot_arm.errors
-            assert errors is None or not errors.is_likely
+    options = CellOptions(
+        mount=mount,
+        camera=fine_camera(),
+        robot_sigma_rad=sigma,
+        robot_sigma_m=0.6 * sigma,
+    )
+    for joints in (True, False):
+        errors = calibrated(simulate(options), joints=joints).robot_arm.errors
+        assert errors is None or not errors.is_likely

@@ -415,7 +415,7 @@ LINE = np.outer(np.arange(8), [50, 0, 0])
     ("changes", "words"),
     [
         ({"points_mm": MIRRORED}, "mirror image of the drawing"),
-        ({"points_mm": LINE}, "the points do not fit the drawing"),
+        ({"points_mm": LINE[:6], "names": NAMES[:6]}, "the points do not fit the drawing"),
         ({"points_mm": CAD_MM[:2], "names": NAMES[:2]}, "at least 3 are needed"),
         ({"scale": 1000.0}, "these look like millimetres. "),
         ({"scale": 0.001}, "metres read as millimetres"),

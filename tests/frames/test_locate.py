@@ -65,9 +65,8 @@ def agrees_with_differences(
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed, beyond):
-    cell, calibration = exact_cell
+def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, beyond):
+    (cell, calibration), seed = exact_cell, 0
     calibration = with_field(calibration) if beyond else calibration
     rng = np.random.default_rng(seed)
     at = stand(cell, rng)
@@ -93,9 +92,8 @@ def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, seed, beyo
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_what_moves_a_target_agrees_with_central_differences(exact_cell, seed, beyond):
-    cell, calibration = exact_cell
+def test_what_moves_a_target_agrees_with_central_differences(exact_cell, beyond):
+    (cell, calibration), seed = exact_cell, 0
     rng = np.random.default_rng(seed)
     at, point = stand(cell, rng), np.array([0.1, 0.05, 0.02])
     corners = seen_corners(cell, before_camera(cell, BOARD, rng), BOARD, rng)
@@ -241,7 +239,7 @@ def test_the_region_holds_the_true_place(options):
 
 def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
     point, surprises, shares = np.array([0.13, 0.09, 0.0]), [], []
-    for seed in range(3):
+    for seed in range(2):
         known = lot(replace(ANYHOW, seed=seed), 4)
         cell, calibration = known.cell, known.calibration
         base_from_target = cell.transforms["base_from_target"]
@@ -257,8 +255,8 @@ def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
             error = by_joints.p_base - truth
             surprises.append(error @ np.linalg.solve(by_joints.covariance, error))
     # Chi-square of three degrees of freedom a cell, whose picks share its calibration: the mean of
-    # three has a standard deviation of 1.4.
-    assert np.mean(surprises) == pytest.approx(3.0, abs=2.8)
+    # two has a standard deviation of 1.7.
+    assert np.mean(surprises) == pytest.approx(3.0, abs=3.4)
     assert np.median(shares) < 0.5
 
 

@@ -123,10 +123,9 @@ def test_poses_in_other_forms(tmp_path):
     assert off_mm(found(visioncal("tcp", path, "--robot-inverse", "--json"))) < NEAR_MM
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_inverse_poses_of_touches_along_axes_are_named(tmp_path, seed):
+def test_inverse_poses_of_touches_along_axes_are_named(tmp_path):
     """Touches of one point close both ways; those along the axes do not, and seem to be wrong."""
-    touches = touched(Job(axes=3), seed).touches
+    touches = touched(Job(axes=3), 0).touches
     assert readings_that_close(touches) == ()
     back = replace(touches, base_from_flange=invert(touches.base_from_flange))
     done = tcp(tmp_path, back)
