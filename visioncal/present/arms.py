@@ -5,13 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.core.number_format import decimals_for, fixed, signed, significant
-from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.present.facts import PLUS_MINUS
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results.arm import (
     NOMINAL,
     ArmErrorsResult,
-    ArmLevel,
     ArmParameter,
     ArmResult,
     ElasticResult,
@@ -40,13 +38,6 @@ _SYMBOLS = {
 _UNITS = {"_m": ("mm", 1e3), "_rad": ("\N{DEGREE SIGN}", float(np.rad2deg(1.0)))}
 # Decimals without a sigma: about a hundredth of an arm's repeatability.
 _DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
-
-
-_CONVENTIONS = {
-    "standard": "Denavit and Hartenberg's form, each joint's link behind it",
-    "modified": "Craig's modified form, each joint's link before it",
-    "hayati": "Hayati's form, which has no leap where axes are parallel",
-}
 # Number of most influential stops that are listed, beside the least influential one.
 _MOST_INFLUENTIAL = 5
 
@@ -59,38 +50,6 @@ def joint_words(name: str) -> str:
 def level_words(name: str) -> str:
     """What a level of the arm's model estimates."""
     return LEVELS.get(name, name.replace("_", " "))
-
-
-def level_reason(arm: ArmResult) -> str:
-    """One sentence: why this model level was chosen, or none."""
-    if not arm.is_calibrated:
-        return (
-            "No level was taken: none predicts stops that are left out of the fit better than "
-            "the arm as stated does, beyond chance."
-        )
-    return (
-        f"Taken: {level_words(arm.level)}. It predicts stops that are left out of the fit to "
-        f"{_held_out(arm.chosen)}, the arm as stated to {_held_out(arm.nominal)}."
-    )
-
-
-def _held_out(level: ArmLevel) -> str:
-    rotation = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
-    return f"{significant(level.held_out_mm)} mm{rotation}"
-
-
-def arm_sentences(arm: ArmResult) -> list[str]:
-    """Sentences: the model level with its reason, and the arm's accuracy."""
-    sentences, sigma = [level_reason(arm)], arm.workspace_sigma_mm
-    if sigma is not None:
-        median, p95 = significant(sigma.median), significant(sigma.p95)
-        sentences.append(
-            f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
-            f"(median; 95 % of the places: under {p95} mm)."
-        )
-    if arm.carries_over is not None:
-        sentences.append(arm.carries_over.words)
-    return sentences
 
 
 def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
@@ -141,16 +100,6 @@ def level_table(arm: ArmResult) -> Table | None:
     return Table.of(titles, rows)
 
 
-def level_note(observed: str) -> str:
-    """Legend of the level table; `observed` names what the residuals are of."""
-    return (
-        f"Residuals of the {observed}, root mean square: of all stops in the fit, and of "
-        "stops left out of it in turn. Likelihood ratio: twice the gain in log-likelihood over the "
-        f"arm as stated; chance stays under {SIGNIFICANT:.0f}. Levels that explain no more than "
-        "chance are not listed."
-    )
-
-
 def parameter_tables(arm: ArmResult, count: int = 1) -> list[Table]:
     """The parameters of the arm's model, joint by joint, in `count` tables."""
     joints: dict[str, list[TableRow]] = {}
@@ -182,19 +131,6 @@ def _parameter_row(parameter: ArmParameter) -> TableRow:
         unit,
     )
     return TableRow(cells, "sure" if parameter.is_sure else "")
-
-
-def parameter_note(arm: ArmResult) -> str:
-    """Convention of the parameters, and the number of significant changes."""
-    form = _CONVENTIONS.get(arm.convention or "", "")
-    words = f"In {form}. " if form else ""
-    if any(parameter.sigma is not None for parameter in arm.parameters):
-        sure = sum(parameter.is_sure for parameter in arm.parameters)
-        words += (
-            f"{sure} of {len(arm.parameters)} changes are beyond three sigma, in bold; "
-            f"{PLUS_MINUS} is one standard deviation."
-        )
-    return words
 
 
 def identifiability_facts(arm: ArmResult) -> Iterator[Fact]:
@@ -242,18 +178,6 @@ def stop_table(arm: ArmResult) -> Table | None:
         for stop, suffix in labelled
     ]
     return Table.of(("without", "grows by"), rows) if rows else None
-
-
-def drift_sentence(thermal: ThermalResult) -> str:
-    """Drift of the flange, and the residuals with and without the drift model."""
-    source = "measured temperatures" if thermal.heated_by == "temperatures" else "motor currents"
-    end, residual = thermal.course[-1], thermal.residual_mm
-    return (
-        f"By {source}, the flange had moved by {significant(end.drift_mm)} mm at the end, "
-        f"{significant(hours(thermal, end.stamp_s))} h after the start. Modelling this drift "
-        f"takes the views' residuals from {significant(residual.without)} to "
-        f"{significant(residual.with_drift)} mm."
-    )
 
 
 def hours(thermal: ThermalResult, stamp_s: float) -> float:

@@ -12,7 +12,7 @@ from visioncal.present import result_parts
 from visioncal.present.network_layout import pairs
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Edge, Rms
-from visioncal.results.sections import BoardResult, UncertaintyResult
+from visioncal.results.sections import BoardResult
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
 # Suffixes of names on disk, and the units shown.
@@ -35,23 +35,6 @@ SOURCES = {
 }
 # As a share of the total sigma: a hundredth of the variance.
 _LEAST_SHARE = 0.1
-# How to reduce each source's contribution.
-_REMEDIES = {
-    "pixels": "sharper images, or a board that fills more of them, would lower it",
-    "instrument": "a nearer or a better instrument would lower it",
-    "robot": "more stops would lower it",
-    "poses": "more poses would lower it",
-    "intrinsics": "views with the board near the image's edges would lower it",
-    "board": "squares measured over the whole board would lower it",
-    "arm": "what of it looks the same in all views stays, and a calibrated arm's poses make up "
-    "for it",
-    "temperature": "more views while the arm warms up would lower it",
-    "priors": "measuring more exactly by hand would lower it",
-    "held_values": "stating lens and board better, or letting them move, would lower it",
-    "noise_level": "more stops would lower it",
-    "lens_field": "a model that fits the lens would lower it, more views would not",
-    "misfit": "a cell that has warmed up and settled would lower it",
-}
 
 
 def readable_time(created: str) -> str:
@@ -202,26 +185,6 @@ def source_table(calibration: Calibration) -> Table | None:
         for edge, budget in budgets.items()
     ]
     return Table.of(("", *(SOURCES.get(name, name) for name in shown)), edge_rows)
-
-
-def summary(calibration: Calibration, budget: UncertaintyResult) -> tuple[str, ...]:
-    """Sentences: the sigma of a point where the views look, and its largest source."""
-    parent, _, sensor = next(iter(calibration.edges)).partition("_from_")
-    where = "the views look" if calibration.camera is not None else "it was measured"
-    sentences = [
-        f"A point where {where}, {significant(budget.distance_m)} m from {frame_words(sensor)}, is "
-        f"placed in the frame of {frame_words(parent)} with a sigma of "
-        f"{significant(budget.total_mm)} mm; 95 % of such results are right to within "
-        f"{significant(budget.radius95_mm)} mm."
-    ]
-    if budget.total_mm > 0.0:
-        largest = next(iter(budget.parts_mm))
-        remedy = f"; {_REMEDIES[largest]}" if largest in _REMEDIES else ""
-        sentences.append(
-            f"The largest part, {budget.percent(largest)} of the variance, comes from the "
-            f"{largest.replace('_', ' ')}{remedy}."
-        )
-    return tuple(sentences)
 
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:

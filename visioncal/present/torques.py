@@ -48,22 +48,6 @@ def torque_table(identified: "Identified") -> Table:
     return Table.of(("joint", *figures), list(rows))
 
 
-def torque_note(identified: "Identified") -> str:
-    """Legend of the columns of `torque_table`."""
-    validation = identified.validation
-    unseen = (
-        "There is no motion beside the fitted one."
-        if validation is None
-        else f"{validation.label}."
-    )
-    return (
-        "Torque: its standard deviation over the fitted motion. Errors are root mean squares. "
-        f"Unseen: {unseen} As bodies: with masses and inertias that real links can have. Known "
-        "before: with the inertias of the robot's description, and the friction that goes best "
-        "with them."
-    )
-
-
 def base_parameter_table(identified: "Identified") -> Table:
     """Value and sigma of each base parameter."""
     base, rows = identified.base, []

@@ -13,7 +13,8 @@ from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import markdown, plain, table_lines
 from visioncal.present.recording.scene import Scene, states_of
 from visioncal.present.recording.writer import recording
-from visioncal.present.torques import base_parameter_table, torque_note, torque_table
+from visioncal.present.torques import base_parameter_table, torque_table
+from visioncal.present.words import said
 
 # Size of the cell [m], by which axes are drawn.
 _SIZE_M = 0.7
@@ -70,7 +71,11 @@ def _log_static(
             line = rr.SeriesLines(names=[identified.robot.joint_names[joint]])
             stream.log(paths.of_joint(group, joint), line, static=True)
     lines = [f"## {plain(identified.robot.name)}: {identified.base.rank} base parameters"]
-    lines += [*table_lines(torque_table(identified)), "", plain(torque_note(identified))]
+    lines += [
+        *table_lines(torque_table(identified)),
+        "",
+        *map(plain, said("torque_note", identified)),
+    ]
     for motion in identified.streams:
         for note in motion.notes:
             lines += ["", plain(note)]

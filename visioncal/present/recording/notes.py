@@ -18,6 +18,7 @@ from visioncal.present import advice, arms, details, facts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.present.tables import Fact, Table
+from visioncal.present.words import said
 from visioncal.results import Calibration, ViewResult
 from visioncal.session import View
 
@@ -151,6 +152,7 @@ def _documents() -> Any:  # noqa: ANN401 - a module of macros
         finalize=lambda value: value if isinstance(value, Markup) else Markup(plain(str(value))),
     )
     environment.globals |= vars(facts) | vars(arms) | vars(details) | vars(advice)
+    environment.globals["said"] = said
     environment.globals |= {
         "facts": lambda them: Markup("\n".join(fact_lines(them))),
         "table": lambda table: Markup("\n".join(table_lines(table))),

@@ -42,11 +42,11 @@ def _environment(*, has_result: bool) -> Environment:
     if not has_result:
         return environment
     # Imported late: a page without figures does not wait for matplotlib.
-    from visioncal.present import advice, arms, details, facts, result_parts, torques
+    from visioncal.present import advice, arms, details, facts, result_parts, torques, words
     from visioncal.present.report import armplots, content, network, plots
 
     called = (
-        *(result_parts, facts, arms, details, torques, advice),
+        *(result_parts, facts, arms, details, torques, advice, words),
         *(content, network, plots, armplots),
     )
     environment.globals |= {
