@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from visioncal.session import Session
     from visioncal.session.shared_arm import join_sessions
     from visioncal.simulation import CellOptions, simulate, write_session
-    from visioncal.vision.finders.identify import identify
+    from visioncal.vision.boards.identify import identify
     from visioncal.vision.targets import load_target
 
 _HOMES = {
@@ -77,7 +77,7 @@ _HOMES = {
     "correct": "visioncal.results.compensation",
     "doctor": "visioncal.calibration.pipeline.checkup",
     "export": "visioncal.interchange.exports",
-    "identify": "visioncal.vision.finders.identify",
+    "identify": "visioncal.vision.boards.identify",
     "load_target": "visioncal.vision.targets",
     "join_sessions": "visioncal.session.shared_arm",
     "locate": "visioncal.frames.locate",

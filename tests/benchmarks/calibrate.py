@@ -30,7 +30,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.run import Run
 from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
-from visioncal.vision.targets import charuco_board
+from visioncal.vision.boards.charuco import charuco_board
 
 VIEWS, MANY = few((40, 1000), (5, 10))
 # As many as are wished on the command line.

@@ -25,9 +25,7 @@ from support.rendered import Shot, photograph
 from visioncal.calibration.stages.detect import image_of
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.session import Session
-from visioncal.vision.finders.board import FINDERS, find_board
-from visioncal.vision.finders.result import DetectedCorners
-from visioncal.vision.finders.template import refine
+from visioncal.vision.boards import DetectedCorners, find_target, kind_of
 from visioncal.vision.targets import corner_positions
 
 PICTURES, REPEATS = few((2, 7), (1, 1))
@@ -112,7 +110,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
         truth = truth[seen.ids]
         for name, px in peers(image, target, seen, shot.square_px):
             errors.setdefault(name, []).append(px - truth)
-        refined = refine(image, target, seen.ids, seen.px)
+        refined = kind_of(target).refine(image, target, seen.ids, seen.px)
         fitted = np.array([not reason for reason in refined.reasons])
         core.append(refined.px[fitted] - truth[fitted])
         scaled.append(core[-1] / refined.sigma_px[fitted, None])
@@ -135,7 +133,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
 
 def detected(image: Image, target: Target) -> DetectedCorners | None:
     """What OpenCV's detector gives."""
-    seen = FINDERS[target.kind](image, target)
+    seen = kind_of(target).search(image, target)
     return seen if isinstance(seen, DetectedCorners) else None
 
 
@@ -215,8 +213,8 @@ def speed() -> str:
         times = [
             took_ms(lambda: detected(image, target)),  # noqa: B023 - called at once
             took_ms(lambda: detected(small, target)),  # noqa: B023
-            took_ms(lambda: refine(image, target, seen.ids, seen.px)),  # noqa: B023
-            took_ms(lambda: find_board(image, target)),  # noqa: B023
+            took_ms(lambda: kind_of(target).refine(image, target, seen.ids, seen.px)),  # noqa: B023
+            took_ms(lambda: find_target(image, target)),  # noqa: B023
         ]
         name = f"{target.kind}, {len(seen.ids)} corners"
         lines.append(f"| {name} | " + " | ".join(f"{value:.0f} ms" for value in times) + " |")
@@ -240,7 +238,7 @@ def of_others() -> str:
         for view in session.views:
             image = image_of(session, view)
             for kind, seen in zip(
-                found, (detected(image, target), find_board(image, target)), strict=True
+                found, (detected(image, target), find_target(image, target)), strict=True
             ):
                 if isinstance(seen, DetectedCorners):
                     found[kind].append((places[seen.ids], seen.px.astype(np.float32)))

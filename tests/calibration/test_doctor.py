@@ -23,8 +23,8 @@ from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_for_rereading
 from visioncal.session import Session
 from visioncal.simulation import BOARDS
+from visioncal.vision.boards.checkerboard import CHECKERBOARD
 from visioncal.vision.camera import project
-from visioncal.vision.finders.board import FINDERS
 from visioncal.vision.targets import load_target
 
 # Where the finding comes from: poses, files, images, motion. All others are kept answers.
@@ -212,7 +212,9 @@ def test_squares_in_the_place_of_inner_corners_are_named_at_once(
     (folder / "board.toml").write_text(described)
     edit(folder, lambda text: text.replace("checkerboard_9x6_25mm", "board.toml"))
     # A thorough search for what is not there takes seconds an image.
-    monkeypatch.setitem(FINDERS, "checkerboard", None)
+    find = CHECKERBOARD.search
+    quickly = lambda _, *args, quick: find(*args, quick=quick)  # noqa: E731
+    monkeypatch.setattr(type(CHECKERBOARD), "search", quickly)
     (found,) = visioncal.doctor(folder).findings
     assert found.kind == "other_board"
     assert words in found.words

@@ -15,7 +15,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate, write_session
-from visioncal.vision.finders import NotFound, find_target
+from visioncal.vision.boards import NotFound, find_target
 from visioncal.vision.targets import (
     corner_positions,
     load_target,

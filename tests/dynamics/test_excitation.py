@@ -18,7 +18,7 @@ from visioncal.dynamics.excitation import ExcitationRequest, Harmonics, Objectiv
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_extremes, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.robot import Robot, joint_torques, load_robot
-from visioncal.robot.bodies import Body
+from visioncal.robot.collision import Body
 from visioncal.simulation.arms import ur_arm
 
 QUICK = ExcitationRequest(harmonics=4, starts=1, steps=20)

@@ -22,7 +22,7 @@ from visioncal.dynamics.limits import MotionMargins, motion_limits
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, Sweeps, plan_sweeps
 from visioncal.present.recording import paths
 from visioncal.robot import load_robot
-from visioncal.robot.bodies import Body
+from visioncal.robot.collision import Body
 from visioncal.simulation.arms import ur_arm
 
 TABLES = {"excitation.csv", "sweeps.csv", "plan.json", "plan.rrd"}

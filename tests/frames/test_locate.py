@@ -35,8 +35,8 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
+from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.camera import intrinsics
-from visioncal.vision.finders.imaging import decode_image
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 BOARD = BOARDS["charuco"]

@@ -9,8 +9,8 @@ from visioncal.live.drivers.protocols import CameraDevice
 from visioncal.live.simulated.cell import SimulatedCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.render import LiveView
-from visioncal.vision.finders.charuco import find_charuco
-from visioncal.vision.finders.result import DetectedCorners
+from visioncal.vision.boards.charuco import CHARUCO
+from visioncal.vision.boards.kind import DetectedCorners
 
 TARGET = CellOptions().target
 # How each joint shares in a motion, in no special direction.
@@ -25,7 +25,7 @@ def a_cell(**options):
 
 
 def errors_px(image, exact):
-    found = find_charuco(image, TARGET)
+    found = CHARUCO.search(image, TARGET)
     assert isinstance(found, DetectedCorners)
     ids, mine, theirs = np.intersect1d(found.ids, exact.ids, return_indices=True)
     assert len(ids) > 0.8 * len(exact.ids)

@@ -27,7 +27,7 @@ from visioncal.present.report.thumbnails import thumbnail
 from visioncal.results.views import worst_view
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from visioncal.present.recording.accuracy import SIGMAS_95, Uncertainty
 from visioncal.present.viewer import blueprint
 from visioncal.results import Edge
 from visioncal.results.evidence import ViewEvidence
-from visioncal.vision.finders import find_target
+from visioncal.vision.boards import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
 
 

@@ -13,7 +13,7 @@ from support.picks import calibration_of
 import visioncal
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.simulation import CellOptions, simulate, write_session
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 BOARD = "charuco_9x6_30mm"
 METHODS = {

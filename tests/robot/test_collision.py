@@ -7,8 +7,7 @@ from support.apart import UR5E_PAIRS, clearances, corners
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
 from visioncal.robot import Robot, load_robot, read_robot_document
-from visioncal.robot.bodies import Body, arm_bodies, capsule
-from visioncal.robot.collision import Collisions
+from visioncal.robot.collision import Body, Collisions, arm_bodies, capsule
 from visioncal.simulation.arms import ur_arm
 
 POST = compose(np.eye(3), np.array([0.45, 0.1, 0.3]))

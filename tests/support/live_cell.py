@@ -17,8 +17,8 @@ from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.camera import matrix_3x3
-from visioncal.vision.targets import charuco_board
 
 # Of the fakes: a controller's cycle, a camera's frame period and exposure [s].
 CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01

@@ -15,7 +15,7 @@ from visioncal.frames.target_pose import Sight
 from visioncal.results import Calibration, CameraResult
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import CellOptions, simulate
-from visioncal.vision.targets import aruco_dictionary
+from visioncal.vision.boards.kind import aruco_dictionary
 
 CLEAR = Camera("brown", (1280, 800), np.array([900.0, 900.0, 640.0, 400.0]), np.zeros(5))
 CENTRES = {0: (-0.12, -0.06), 7: (0.1, -0.05), 21: (0.11, 0.07), 30: (-0.1, 0.06)}

@@ -14,7 +14,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.types import Target
-from visioncal.vision.targets import corner_positions, marked_squares, marker_cells
+from visioncal.vision.boards.charuco import marked_squares
+from visioncal.vision.boards.kind import marker_cells
+from visioncal.vision.targets import corner_positions
 
 SAMPLES = 4
 FOCAL_PX = 1300.0

@@ -24,8 +24,9 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot, load_robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
+from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.camera import project
-from visioncal.vision.targets import charuco_board, corner_positions, load_target
+from visioncal.vision.targets import corner_positions, load_target
 
 TARGET = "charuco_9x6_30mm"
 RESOLUTION = (640, 400)

@@ -15,8 +15,8 @@ from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.intrinsics import read_target_description
 from visioncal.session import Session
 from visioncal.simulation import BOARDS, CellOptions, simulate, write_session
-from visioncal.vision.finders import DetectedCorners, NotFound, find_target
-from visioncal.vision.finders.identify import identify
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target
+from visioncal.vision.boards.identify import identify
 from visioncal.vision.targets import corner_positions, target_document, target_from_document
 
 GRID = aprilgrid(5, 3)

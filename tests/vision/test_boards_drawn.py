@@ -8,10 +8,11 @@ from support.boards import charuco
 from visioncal.core.types import Target
 from visioncal.present.recording.board import picture
 from visioncal.simulation.textures import draw_sheet
-from visioncal.vision.finders import NotFound
-from visioncal.vision.finders.charuco import find_charuco
+from visioncal.vision.boards import NotFound
+from visioncal.vision.boards.charuco import CHARUCO
+from visioncal.vision.boards.kind import marker_cells
 from visioncal.vision.printing.pattern import draw_pattern
-from visioncal.vision.targets import corner_positions, marker_cells, target_from_document
+from visioncal.vision.targets import corner_positions, target_from_document
 
 DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
 
@@ -29,7 +30,7 @@ def test_a_charuco_board_is_found_in_its_picture(target: Target) -> None:
     drawn, zoom, rim = picture(target), 2, 60
     page = cv2.resize(drawn, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
     page = np.pad(page, rim, constant_values=255)
-    seen = find_charuco(page, target)
+    seen = CHARUCO.search(page, target)
     square_px = zoom * drawn.shape[1] / target.columns
     expected = corner_positions(target)[:, :2] / target.square_m * square_px + rim - 0.5
     assert list(seen.ids) == list(range(len(expected)))
@@ -41,7 +42,7 @@ def test_two_copies_of_a_charuco_board_in_an_image_are_named() -> None:
     target = charuco(9, 6, square_m=0.025, marker_m=0.018)
     drawn = cv2.resize(picture(target), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     page = np.pad(drawn, 60, constant_values=255)
-    seen = find_charuco(np.hstack([page, page]), target)
+    seen = CHARUCO.search(np.hstack([page, page]), target)
     assert isinstance(seen, NotFound)
     assert (
         seen.reason == "markers are seen twice: another board with the same markers is in the image"

@@ -21,7 +21,7 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
-from visioncal.vision.finders import DetectedCorners, NotFound, find_target
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target
 from visioncal.vision.targets import (
     corner_positions,
     rotations,

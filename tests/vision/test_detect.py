@@ -16,9 +16,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
-from visioncal.vision.finders import DetectedCorners, NotFound, find_target
-from visioncal.vision.finders.imaging import blur_at_corners, claimed_size, decode_image
-from visioncal.vision.targets import charuco_board, corner_positions
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target
+from visioncal.vision.boards.charuco import charuco_board
+from visioncal.vision.boards.imaging import blur_at_corners, claimed_size, decode_image
+from visioncal.vision.targets import corner_positions
 
 
 def encoded(image, ending=".png"):

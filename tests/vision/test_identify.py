@@ -14,9 +14,8 @@ from support.marks import slow
 
 from visioncal.core.errors import DataError
 from visioncal.simulation import CellOptions, fisheye_camera, prepare_scene, render, simulate
-from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.identify_text import to_toml
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.identify import identify, to_toml
+from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.targets import load_target, target_from_document, target_names
 
 SHIPPED = {name: load_target(name) for name in target_names()}
@@ -38,16 +37,16 @@ def print_named(target):
 
 
 def assert_named(identity, target):
-    assert identity.kind == target.kind
+    assert identity.board.kind == target.kind
     assert identity.whole
     if target.kind == "marker":
         assert identity.marker_ids == (target.marker_id,)
     else:
-        assert (identity.columns, identity.rows) == (target.columns, target.rows)
+        assert (identity.board.columns, identity.board.rows) == (target.columns, target.rows)
         # With an odd number of rows there is one layout.
-        assert identity.legacy == (target.legacy and target.rows % 2 == 0)
+        assert identity.board.legacy == (target.legacy and target.rows % 2 == 0)
     if target.dictionary:
-        assert target.dictionary in (identity.dictionary, *identity.larger)
+        assert target.dictionary in (identity.board.dictionary, *identity.larger)
 
 
 def assert_share(identity, target):
@@ -96,8 +95,8 @@ def test_a_board_that_the_image_cuts_is_at_least_so_large():
     page = printed(SHIPPED["charuco_9x6_30mm"], 100)
     # Rows are 30 mm, 118 pixels, and start below 14 mm: two and a half of six are left.
     identity = identify(page[: 55 + 3 * 118 - 59])
-    assert (identity.columns, identity.whole) == (9, False)
-    assert 2 <= identity.rows <= 3
+    assert (identity.board.columns, identity.whole) == (9, False)
+    assert 2 <= identity.board.rows <= 3
     assert any("may go on" in note for note in identity.notes)
     sideways = identify(page[:, :-300])
     # Columns follow from the ids, the last ones unseen too.
@@ -177,9 +176,10 @@ def test_real_photographs_are_named(real_data, pattern, expected):
     # Neighbours in a recording look alike: every second one is named.
     files = files[::2]
     named = [identify(decode_image(file.read_bytes())) for file in files]
-    found = Counter((identity.kind, identity.columns, identity.rows) for identity in named)
+    boards = [identity.board for identity in named]
+    found = Counter((board.kind, board.columns, board.rows) for board in boards)
     assert found == {(kind, columns, rows): len(files)}
-    assert all(dictionary in (identity.dictionary, *identity.larger) for identity in named)
+    assert all(dictionary in (identity.board.dictionary, *identity.larger) for identity in named)
     # Two standard deviations: of 22 photographs one may be farther off.
     far = [
         identity

@@ -5,7 +5,7 @@ import pytest
 
 from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.simulation.optics import fisheye_camera, project, wide_camera
-from visioncal.vision.finders.maps import OpticalAxis, maps_about
+from visioncal.vision.boards.maps import OpticalAxis, maps_about
 
 TAGS = BOARDS["tags"]
 SIDE_M = 0.05

@@ -9,9 +9,9 @@ import pytest
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
+from visioncal.vision.boards.charuco import charuco_board
+from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
 from visioncal.vision.targets import (
-    DEFAULT_RELATIVE_SIGMA,
-    charuco_board,
     corner_positions,
     load_target,
     read_target,

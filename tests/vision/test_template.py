@@ -10,10 +10,8 @@ from support.marks import slow
 from support.rendered import Shot, photograph
 
 from visioncal.core.types import Target
-from visioncal.vision.finders import DetectedCorners, NotFound, blur_of, board, find_target
-from visioncal.vision.finders.charuco import find_charuco
-from visioncal.vision.finders.checkerboard import find_checkerboard
-from visioncal.vision.finders.template import refine, refine_tags
+from visioncal.vision.boards import DetectedCorners, NotFound, blur_of, find_target, kind_of
+from visioncal.vision.boards.template import Refined, refine_tags
 
 # Columns and rows differ by an odd number: the checkerboard has one numbering.
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
@@ -21,7 +19,12 @@ SMALL = Shot(square_px=20, noise=2)
 
 
 def detected(target, image):
-    return (find_charuco if target.kind == "charuco" else find_checkerboard)(image, target)
+    return kind_of(target).search(image, target)
+
+
+def refine(image, target, ids, px) -> Refined:
+    """Corners of a board, by its template."""
+    return kind_of(target).refine(image, target, ids, px)
 
 
 def rms(errors):
@@ -147,7 +150,7 @@ def test_a_corner_unlike_the_print_is_left_out_of_a_view():
 def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
     image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40), 1)
     seen = DetectedCorners(np.arange(30), truth + 0.1)
-    monkeypatch.setitem(board.FINDERS, "checkerboard", lambda *_: seen)
+    monkeypatch.setattr(type(kind_of(CHECKERBOARD)), "search", lambda *_, **__: seen)
     for covered, fits in ((0.3, True), (0.7, False), (1.0, False)):
         blank = image.copy()
         blank[:, : int(covered * image.shape[1])] = 120
@@ -183,10 +186,15 @@ def large():
 
 def searched(monkeypatch):
     """The sizes of the images that the quick search is given."""
-    sizes, plain = [], board.QUICK["charuco"]
-    monkeypatch.setitem(
-        board.QUICK, "charuco", lambda im, value: sizes.append(im.shape) or plain(im, value)
-    )
+    sizes, kind = [], type(kind_of(CHARUCO))
+    plain = kind.search
+
+    def search(self, image, target, *, quick=False):
+        if quick:
+            sizes.append(image.shape)
+        return plain(self, image, target, quick=quick)
+
+    monkeypatch.setattr(kind, "search", search)
     return sizes
 
 
@@ -212,8 +220,9 @@ def test_what_the_small_copy_misses_is_searched_in_the_image_itself(large, monke
 @pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
 def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
     image, truth = photograph(target, replace(SMALL, square_px=40), 1)
-    plain, quick = board.FINDERS[target.kind], board.QUICK[target.kind]
-    seen = quick(image, target)
+    kind = type(kind_of(target))
+    plain = kind.search
+    seen = kind_of(target).search(image, target, quick=True)
     assert len(seen.ids) == len(truth)
     assert rms(seen.px - truth) < 0.3
     parts = (
@@ -224,10 +233,11 @@ def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
     )
     for part in parts:
         asked = []
-        monkeypatch.setitem(board.QUICK, target.kind, lambda *_, part=part: part)
-        monkeypatch.setitem(
-            board.FINDERS, target.kind, lambda *args, asked=asked: asked.append(1) or plain(*args)
-        )
+
+        def search(*args, quick=False, part=part, asked=asked):
+            return part if quick else (asked.append(1) or plain(*args))
+
+        monkeypatch.setattr(kind, "search", search)
         found = find_target(image, target)
         assert asked == [1]
         assert found.ids.tolist() == seen.ids.tolist()

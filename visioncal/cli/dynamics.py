@@ -70,7 +70,7 @@ from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrMotion
 from visioncal.live.planning.messages import plan_warnings, plan_words
 from visioncal.robot import Inertias, load_robot, symmetric_matrices
-from visioncal.robot.bodies import Body, capsule
+from visioncal.robot.collision import Body, capsule
 from visioncal.session import STREAMS, Session, check_stream, save_stream
 
 

@@ -27,7 +27,7 @@ from visioncal.results.picking import check_mount
 from visioncal.results.selecting import targets_fixed_to_base
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice, has_several, select
-from visioncal.vision.finders.imaging import read_image
+from visioncal.vision.boards.imaging import read_image
 from visioncal.vision.targets import target_from_document
 
 # Rounding to four digits keeps a unit quaternion's norm within this of 1.

@@ -198,7 +198,7 @@ def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> R
 
 def _findable(target: Target) -> Target:
     """Refuses a rig of points that cannot be detected in images."""
-    if target.kind == "points" and not target.point_tags:
+    if target.is_rig and not target.point_tags:
         raise DataError(
             f"record: target {target.name} is a rig of points, which no image is searched for.",
             culprits=["--target"],

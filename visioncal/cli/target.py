@@ -14,12 +14,12 @@ from visioncal.cli.session_options import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
-from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.identify_text import describe, to_document, to_toml
-from visioncal.vision.finders.imaging import read_image
+from visioncal.vision.boards.identify import describe, identify, to_document, to_toml
+from visioncal.vision.boards.imaging import read_image
+from visioncal.vision.boards.kind import BoardRequest, side_metres
 from visioncal.vision.printing.files import write_board
 from visioncal.vision.printing.page import arrange, pages_named
-from visioncal.vision.printing.request import BoardRequest, requested_target, side_metres
+from visioncal.vision.printing.request import requested_target
 from visioncal.vision.targets import (
     load_target,
     target_document,

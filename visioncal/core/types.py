@@ -80,6 +80,11 @@ class Target:
     # the upper left; else empty.
     point_tags: tuple[tuple[int, int], ...] = ()
 
+    @property
+    def is_rig(self) -> bool:
+        """Whether it is a rig of known points, without a size of its own."""
+        return bool(self.points_m)
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:

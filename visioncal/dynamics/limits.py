@@ -11,8 +11,7 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
 from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
-from visioncal.robot.bodies import Body, arm_bodies
-from visioncal.robot.collision import Collisions
+from visioncal.robot.collision import Body, Collisions, arm_bodies
 
 CHECK_HZ = 1000.0
 # Tolerance for rounding, since motions are scaled to reach their limits exactly.

@@ -80,7 +80,7 @@ def shape_basis(target: Target) -> FloatArray:
     points, or nothing if the rig is exact.
     """
     positions = corner_positions(target)
-    if target.kind != "points":
+    if not target.is_rig:
         return board_basis(positions)
     size = len(stated_board_sigma(target))
     return np.eye(3 * len(positions), size).reshape(len(positions), 3, size)
@@ -101,7 +101,7 @@ def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]
 
 def stated_board_sigma(target: Target) -> FloatArray:
     """(s,) stated standard deviations of the target's shape; zero where nothing is stated."""
-    if target.kind == "points":
+    if target.is_rig:
         sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
         return np.repeat(sigmas, 3).astype(float)
     shape = np.zeros(len(BOARD_NAMES))

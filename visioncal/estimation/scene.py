@@ -176,7 +176,7 @@ class CornerProblem:
     @property
     def printed(self) -> list[int]:
         """Indices of the printed targets: those with a scale, and possibly a bend."""
-        return [at for at, target in enumerate(self.scene.targets) if target.kind != "points"]
+        return [at for at, target in enumerate(self.scene.targets) if not target.is_rig]
 
     @property
     def scale(self) -> IntArray:

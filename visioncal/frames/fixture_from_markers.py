@@ -33,9 +33,9 @@ from visioncal.frames.target_pose import (
 from visioncal.frames.touches import MeasuredPoints, NominalPoints
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
-from visioncal.vision.finders import NotFound, find_target
-from visioncal.vision.finders.imaging import blur_at_corners
-from visioncal.vision.finders.marker import marker_ids
+from visioncal.vision.boards import NotFound, find_target, kind_of
+from visioncal.vision.boards.imaging import blur_at_corners
+from visioncal.vision.boards.marker import MarkerKind, marker_ids
 from visioncal.vision.targets import target_from_document
 
 _WORDS = Words(
@@ -212,7 +212,7 @@ def fixture_from_marker_images(
             )
     ids = {int(name): name for name in drawing.names}
     shown = session_images(session, calibration, among=fit_views(session))
-    if shown.target.kind != "marker":
+    if not isinstance(kind_of(shown.target), MarkerKind):
         raise DataError(
             f"session {session.name!r} has the target {shown.target.name}, a {shown.target.kind}; "
             "beside a drawing (--cad) it has to be one of the drawn markers.",

@@ -18,8 +18,8 @@ from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import determines_pose
 from visioncal.frames.camera_chain import CalibratedCamera
-from visioncal.vision.finders import NotFound, find_target
-from visioncal.vision.finders.imaging import GREY, blur_at_corners, poor_image_reason
+from visioncal.vision.boards import NotFound, find_target
+from visioncal.vision.boards.imaging import GREY, blur_at_corners, poor_image_reason
 from visioncal.vision.targets import corner_positions, rotations
 
 # Significance of corners that scatter more than the noise.
@@ -106,7 +106,7 @@ def target_pose_candidates(
         # A rig's size is exact.
         np.array(
             [
-                np.zeros(6) if target.kind == "points" else compressed.by_shared[0, :, lens + SCALE]
+                np.zeros(6) if target.is_rig else compressed.by_shared[0, :, lens + SCALE]
                 for compressed, _ in fits
             ]
         ),

@@ -20,7 +20,7 @@ from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.touches import Tool
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.results.sections import TouchedPoint, TouchTest
-from visioncal.robot.bodies import camera_body
+from visioncal.robot.collision import camera_body
 from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 

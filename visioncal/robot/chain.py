@@ -195,7 +195,7 @@ def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
     return np.array(
         [
             [
-                number_list(DocumentTable({"harmonics": pair}, row.label), "harmonics", 2)
+                DocumentTable({"harmonics": pair}, row.label).numbers("harmonics", 2)
                 for pair in pairs
             ]
             for row, pairs in zip(rows, given, strict=True)
@@ -248,13 +248,8 @@ def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
     ]
 
 
-def number_list(row: DocumentTable, key: str, size: int) -> FloatArray:
-    """Reads a list of `size` finite numbers, or raises DataError."""
-    return np.array(row.numbers(key, size))
-
-
 def _axis(row: DocumentTable) -> FloatArray:
-    axis = number_list(row, "axis", 3)
+    axis = np.array(row.numbers("axis", 3))
     if abs(np.linalg.norm(axis) - 1.0) > _ROTATION_TOLERANCE:
         raise row.refuse("axis", axis.tolist(), "a vector of length 1")
     return axis
@@ -266,7 +261,7 @@ def _placement(row: DocumentTable) -> FloatArray:
     if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
         raise row.refuse("placement", rows, needed)
     tables = [DocumentTable({"placement": value}, row.label) for value in rows]
-    matrix = np.array([number_list(table, "placement", 4) for table in tables])
+    matrix = np.array([table.numbers("placement", 4) for table in tables])
     rotation = matrix[:3, :3]
     if (
         # Squares of the largest numbers overflow.

@@ -16,7 +16,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
-from visioncal.robot.chain import number_list
 from visioncal.robot.loads import MASS_KEYS, Masses
 
 # Key of a link's inertia in a joint's table.
@@ -148,8 +147,8 @@ def inertias_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) 
     if not all(any(key in row.content for row in rows) for key in (INERTIA_KEY, MASS_KEYS[0])):
         return None
     kg = np.array([row.number(MASS_KEYS[0]) for row in rows])
-    centres = np.array([number_list(row, MASS_KEYS[1], 3) for row in rows])
-    about = symmetric_matrices(np.array([number_list(row, INERTIA_KEY, 6) for row in rows]))
+    centres = np.array([row.numbers(MASS_KEYS[1], 3) for row in rows])
+    about = symmetric_matrices(np.array([row.numbers(INERTIA_KEY, 6) for row in rows]))
     rotation, position = joint_from_row[:, :3, :3], joint_from_row[:, :3, 3]
     return Inertias.of_bodies(
         kg,

@@ -1,14 +1,13 @@
-"""Kinematics and statics by Pinocchio, which is imported when needed."""
+"""The arm of a URDF, by Pinocchio, which is imported when needed."""
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from visioncal.core.documents.structured import parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.loads import DriveLimits, Masses
@@ -18,134 +17,6 @@ if TYPE_CHECKING:
 
 # Usual names of the frame of the reported poses, in order of preference.
 _USUAL_TIPS = ("tool0", "flange")
-
-
-def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None) -> "pin.Model":
-    """Builds Pinocchio's model of a chain, whose positions are the joints' effective ones."""
-    import pinocchio as pin
-
-    along = {(1.0, 0.0, 0.0): "X", (0.0, 1.0, 0.0): "Y", (0.0, 0.0, 1.0): "Z"}
-    model, last = pin.Model(), 0
-    model.name = name
-    for place, joint in enumerate(chain.joint_names):
-        kind = "Prismatic" if chain.prismatic[place] else "Revolute"
-        letter = along.get(tuple(chain.axes[place].tolist()))
-        if letter is None:
-            motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
-        else:
-            motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
-        last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
-        if masses is not None:
-            # The rotational inertia does not matter to an arm at rest.
-            body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
-            model.appendBodyToJoint(last, body, pin.SE3.Identity())
-    tip_placement = pin.SE3(chain.placements[-1])
-    model.addFrame(pin.Frame(tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
-    return model
-
-
-def flange_poses(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
-    """Forward kinematics: (m, 4, 4) `base_from_tip` [m] at (m, n) effective positions."""
-    import pinocchio as pin
-
-    data, frame = model.createData(), model.getFrameId(tip)
-    poses = np.empty((len(positions), 4, 4))
-    for row, configuration in enumerate(positions):
-        pin.forwardKinematics(model, data, configuration)
-        poses[row] = pin.updateFramePlacement(model, data, frame).homogeneous
-    return poses
-
-
-def joint_frames(model: "pin.Model", positions: FloatArray) -> FloatArray:
-    """Joint frames (n, 4, 4) in the base, after their motion, at (n,) effective positions."""
-    import pinocchio as pin
-
-    data = model.createData()
-    pin.forwardKinematics(model, data, positions)
-    return np.array([joint.homogeneous for joint in data.oMi[1:]])
-
-
-def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
-    """Jacobian of the tip over the joints' placements: Pinocchio's kinematic regressor.
-
-    Returns:
-        (m, 6, 6 n) right perturbations of `base_from_tip` for right perturbations of the
-        placements, both (rotation, translation), at (m, n) effective positions [rad or m].
-    """
-    import pinocchio as pin
-
-    data, frame = model.createData(), model.getFrameId(tip)
-    count = model.njoints - 1
-    derivatives = np.empty((len(positions), 6, 6 * count))
-    for row, configuration in enumerate(positions):
-        pin.forwardKinematics(model, data, configuration)
-        pin.updateFramePlacement(model, data, frame)
-        derivatives[row] = pin.computeFrameKinematicRegressor(model, data, frame, pin.LOCAL)
-    # Pinocchio puts translations first.
-    halves = derivatives.reshape(-1, 2, 3, count, 2, 3)[:, ::-1, :, :, ::-1]
-    return halves.reshape(-1, 6, 6 * count)
-
-
-def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Joint torques (m, n) that hold the weight of the model's links [N m, or N if prismatic].
-
-    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
-    """
-    import pinocchio as pin
-
-    model.gravity.linear = gravity
-    data = model.createData()
-    torques = [
-        pin.computeGeneralizedGravity(model, data, position).copy() for position in positions
-    ]
-    return np.array(torques).reshape(positions.shape)
-
-
-def weight_jacobian(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Derivatives of the joint torques by weight over masses and first moments.
-
-    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
-
-    Returns:
-        (m, n, 4 n) for the mass [kg] and first moments [kg m] of each joint's body.
-    """
-    import pinocchio as pin
-
-    model.gravity.linear = gravity
-    data, count = model.createData(), model.nv
-    still = np.zeros(count)
-    rows = np.empty((len(positions), count, count, 4))
-    for row, configuration in enumerate(positions):
-        regressor = pin.computeJointTorqueRegressor(model, data, configuration, still, still)
-        # Ten parameters a body: mass, first moments, and inertias, which do not matter at rest.
-        rows[row] = -regressor.reshape(count, count, 10)[:, :, :4]
-    return rows.reshape(len(positions), count, 4 * count)
-
-
-def regressors(
-    model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
-) -> Iterator[FloatArray]:
-    """Iterates over the torque regressors of states, for the bodies' inertial parameters.
-
-    Args:
-        model: Of `build_model`.
-        gravity: (3,) in the base's frame [m/s^2].
-        states: (m, n) effective positions, speeds and accelerations.
-
-    Yields:
-        (10 n, n) for each state, in memory that the next state overwrites.
-    """
-    import pinocchio as pin
-
-    model.gravity.linear = gravity
-    data, compute = model.createData(), pin.computeJointTorqueRegressor
-    # The function's return value is a copy of this array.
-    regressor = data.jointTorqueRegressor.T
-    for q, dq, ddq in zip(*states, strict=True):
-        compute(model, data, q, dq, ddq)
-        yield regressor
-
-
 # A plant with its conveyors has hundreds; the recursive parser crashes the process at some ten
 # thousand.
 _MOST_JOINTS = 2000
@@ -178,8 +49,6 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
             culprits=[table.label],
             next_step="Leave the robot alone in it.",
         )
-    from visioncal.core.documents.structured import parse_xml
-
     # Pinocchio's reader forgives what the readers of bodies and inertias do not.
     parse_xml(text.encode("utf-8"), f"{table.label}: the URDF")
     try:

@@ -14,7 +14,6 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.robot.chain import number_list
 
 if TYPE_CHECKING:
     from visioncal.robot.model import Robot
@@ -137,7 +136,7 @@ def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) ->
         if mass < 0.0:
             raise row.refuse("mass_kg", mass, "a mass of 0 kg or more")
         kg.append(mass)
-        centres.append(frame[:3, :3] @ number_list(row, "com_m", 3) + frame[:3, 3])
+        centres.append(frame[:3, :3] @ np.array(row.numbers("com_m", 3)) + frame[:3, 3])
     return Masses(np.array(kg), np.array(centres))
 
 
@@ -150,7 +149,7 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
     if "gravity_m_s2" not in document:
         return np.array(STANDARD_GRAVITY)
     row = DocumentTable(document, label)
-    gravity = number_list(row, "gravity_m_s2", 3)
+    gravity = np.array(row.numbers("gravity_m_s2", 3))
     if not 9.5 < float(np.linalg.norm(gravity)) < 10.1:
         raise row.refuse(
             "gravity_m_s2",

@@ -16,15 +16,7 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
-from visioncal.robot.kinematics import (
-    arm_of_urdf,
-    build_model,
-    flange_poses,
-    gravity_torques,
-    joint_frames,
-    placement_derivatives,
-    weight_jacobian,
-)
+from visioncal.robot.kinematics import arm_of_urdf
 from visioncal.robot.loads import (
     MASS_KEYS,
     RATE_KEYS,
@@ -102,7 +94,7 @@ class Robot:
             masses = masses_of_rows(joints, frames)
             inertias = inertias_of_rows(joints, frames)
             rates = DriveLimits.of_rows(joints)
-        model = build_model(name, tip, chain, masses)
+        model = _pinocchio_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
         return cls(name, tip, dict(document), chain, masses, inertias, rates, gravity, model)
 
@@ -148,11 +140,23 @@ class Robot:
 
     def base_from_flange(self, q: FloatArray) -> FloatArray:
         """Forward kinematics: (m, 4, 4) `base_from_flange` [m] at (m, n) joint angles [rad]."""
-        return flange_poses(self._model, self.tip, self._effective(q))
+        import pinocchio as pin
+
+        positions = self._effective(q)
+        data, frame = self._model.createData(), self._model.getFrameId(self.tip)
+        poses = np.empty((len(positions), 4, 4))
+        for row, configuration in enumerate(positions):
+            pin.forwardKinematics(self._model, data, configuration)
+            poses[row] = pin.updateFramePlacement(self._model, data, frame).homogeneous
+        return poses
 
     def link_frames(self, q: FloatArray) -> FloatArray:
         """Frames (n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
-        joints = joint_frames(self._model, self._effective(np.asarray(q)[None])[0])
+        import pinocchio as pin
+
+        data = self._model.createData()
+        pin.forwardKinematics(self._model, data, self._effective(np.asarray(q)[None])[0])
+        joints = [joint.homogeneous for joint in data.oMi[1:]]
         return np.array([*joints, joints[-1] @ self.chain.placements[-1]])
 
     def placement_jacobian(self, q: FloatArray) -> FloatArray:
@@ -167,9 +171,21 @@ class Robot:
         Returns:
             (m, 6, 6 (n + 1)) derivatives of `log(base_from_flange^-1 base_from_flange(step))`.
         """
-        links = placement_derivatives(self._model, self.tip, self._effective(q))
-        own = np.broadcast_to(np.eye(6), (len(links), 6, 6))
-        return np.concatenate([links, own], axis=2)
+        import pinocchio as pin
+
+        positions, count = self._effective(q), self.joint_count
+        data, frame = self._model.createData(), self._model.getFrameId(self.tip)
+        derivatives = np.empty((len(positions), 6, 6 * count))
+        for row, configuration in enumerate(positions):
+            pin.forwardKinematics(self._model, data, configuration)
+            pin.updateFramePlacement(self._model, data, frame)
+            derivatives[row] = pin.computeFrameKinematicRegressor(
+                self._model, data, frame, pin.LOCAL
+            )
+        # Pinocchio puts translations first.
+        halves = derivatives.reshape(-1, 2, 3, count, 2, 3)[:, ::-1, :, :, ::-1]
+        own = np.broadcast_to(np.eye(6), (len(positions), 6, 6))
+        return np.concatenate([halves.reshape(-1, 6, 6 * count), own], axis=2)
 
     def joint_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian (m, 6, n) of the flange over the joint angles, in the flange's frame.
@@ -202,13 +218,22 @@ class Robot:
 
         A joint's motion commutes with a rotation of its placement about the same axis.
         """
-        links = placement_derivatives(self._model, self.tip, self._effective(q))
+        links = self.placement_jacobian(q)[:, :, :-6]
         columns = links.reshape(-1, 6, self.joint_count, 6)
         return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
 
     def gravity_torques(self, q: FloatArray) -> FloatArray:
         """Joint torques (m, n) that hold the links' weight [N m]; zero where masses are unknown."""
-        return gravity_torques(self._model, self._effective(q), self.gravity)
+        import pinocchio as pin
+
+        positions = self._effective(q)
+        self._model.gravity.linear = self.gravity
+        data = self._model.createData()
+        torques = [
+            pin.computeGeneralizedGravity(self._model, data, position).copy()
+            for position in positions
+        ]
+        return np.array(torques).reshape(positions.shape)
 
     def weight_jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives of the joint torques by weight over masses and first moments.
@@ -216,7 +241,19 @@ class Robot:
         Returns:
             (m, n, 4 n) for mass [kg] and first moments [kg m] of all that moves with each joint.
         """
-        return weight_jacobian(self._model, self._effective(q), self.gravity)
+        import pinocchio as pin
+
+        positions, count = self._effective(q), self.joint_count
+        self._model.gravity.linear = self.gravity
+        data, still = self._model.createData(), np.zeros(count)
+        rows = np.empty((len(positions), count, count, 4))
+        for row, configuration in enumerate(positions):
+            regressor = pin.computeJointTorqueRegressor(
+                self._model, data, configuration, still, still
+            )
+            # Ten parameters a body: mass, first moments, and inertias, which do not matter at rest.
+            rows[row] = -regressor.reshape(count, count, 10)[:, :, :4]
+        return rows.reshape(len(positions), count, 4 * count)
 
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Torques of weight, payload and force on the joints; see `loads.load_torques`."""
@@ -322,3 +359,27 @@ class Robot:
                 culprits=[self.name],
             )
         return values
+
+
+def _pinocchio_model(name: str, tip: str, chain: Chain, masses: Masses | None) -> "pin.Model":
+    """Builds Pinocchio's model of a chain, whose positions are the joints' effective ones."""
+    import pinocchio as pin
+
+    along = {(1.0, 0.0, 0.0): "X", (0.0, 1.0, 0.0): "Y", (0.0, 0.0, 1.0): "Z"}
+    model, last = pin.Model(), 0
+    model.name = name
+    for place, joint in enumerate(chain.joint_names):
+        kind = "Prismatic" if chain.prismatic[place] else "Revolute"
+        letter = along.get(tuple(chain.axes[place].tolist()))
+        if letter is None:
+            motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
+        else:
+            motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
+        last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
+        if masses is not None:
+            # The rotational inertia does not matter to an arm at rest.
+            body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
+            model.appendBodyToJoint(last, body, pin.SE3.Identity())
+    tip_placement = pin.SE3(chain.placements[-1])
+    model.addFrame(pin.Frame(tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
+    return model

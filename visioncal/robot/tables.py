@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask
-from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
+from visioncal.robot.chain import Chain, joint_function, joint_tables, subtable
 
 # Keys of a joint function; the offset is in theta_offset_rad or d_m.
 _FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
@@ -289,7 +289,7 @@ def _pose(row: DocumentTable) -> FloatArray:
     """A constant transform (4, 4) [m]; the identity where the table is empty."""
     if not row.content:
         return np.eye(4)
-    xyz, rpy = (number_list(row, key, 3) for key in _POSE_KEYS)
+    xyz, rpy = (np.array(row.numbers(key, 3)) for key in _POSE_KEYS)
     return compose(ROTATION_FORMS[POSE_FORMS["rpy"].rotation].read(rpy[None])[0], xyz)
 
 

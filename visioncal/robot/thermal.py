@@ -17,16 +17,6 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot import Robot
 
-_MINUTES = 60.0
-# Horizon and step of the predicted drift rate [s].
-_AHEAD_S, _EVERY_S = 10 * 3600.0, 30.0
-# Time span over which rates of noisy measured temperatures are taken [s].
-_SPAN_S = 600.0
-# Greatest time constant of the warm-up [s], for rates that do not decrease visibly, and least
-# factor of the rate from one span to the next.
-_SLOWEST_S, _LEAST_SHARE = 3600.0, 1e-3
-
-
 Kind: TypeAlias = Literal["temperatures", "currents"]
 
 
@@ -260,30 +250,6 @@ class ThermalModel:
         return np.asarray(np.einsum("kji,kj->ki", rotations, self.lengths[1:]))
 
 
-@dataclass(frozen=True)
-class Advice:
-    """Current drift rate of the flange, and time until it is below a limit."""
-
-    rate_um_min: float | None  # Drift rate of the flange now [um/min]; None after too few samples.
-    limit_um_min: float  # Its limit [um/min].
-    # Time until it is below the limit if work continues [s]; zero where it is already, None where
-    # it takes more than ten hours or after too few samples.
-    wait_s: float | None
-
-    @property
-    def words(self) -> str:
-        """The advice in a sentence."""
-        if self.rate_um_min is None:
-            return "Too few temperatures were given to say how fast the arm drifts."
-        now = f"The flange drifts by {self.rate_um_min:.2g} um/min"
-        if self.wait_s is None:
-            return f"{now} and does not come under {self.limit_um_min:g} within ten hours."
-        if self.wait_s <= 0.0:
-            return f"{now}, under the limit of {self.limit_um_min:g}: the arm is warm."
-        minutes = self.wait_s / _MINUTES
-        return f"{now}: go on warming up for {minutes:.0f} min to come under {self.limit_um_min:g}."
-
-
 class OnlineCompensator:
     """Tracks the link temperatures of an arm, and gives its current model.
 
@@ -294,8 +260,8 @@ class OnlineCompensator:
     def __init__(self, model: ThermalModel) -> None:
         """Prepares a compensator without samples."""
         self._model = model
-        self._stamps_s: list[float] = []
-        self._links: list[FloatArray] = []
+        self._stamp_s: float | None = None
+        self._links: FloatArray | None = None
         none = np.zeros(model.joint_count)
         # Steady state (n,) [deg C] at the last sample, its part by motor currents [K], and the
         # derivatives (n, s) of the links' temperatures over the heating's parameters.
@@ -329,10 +295,10 @@ class OnlineCompensator:
                 f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
                 f"sample, not {signal.tolist()}."
             )
-        if self._stamps_s and stamp_s <= self._stamps_s[-1]:
+        if self._stamp_s is not None and stamp_s <= self._stamp_s:
             raise DataError(
                 f"thermal: a sample at {stamp_s:g} s does not come after the one before, at "
-                f"{self._stamps_s[-1]:g} s."
+                f"{self._stamp_s:g} s."
             )
         signal = signal if heating.kind == "temperatures" else signal**2
         air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
@@ -340,21 +306,16 @@ class OnlineCompensator:
         rest = heating.rest(signal[None], ambient)[0]
         driven = rest - air if heating.kind == "currents" else np.zeros(count)
         links = heating.cold(signal[None], ambient)
-        if self._stamps_s:
+        if self._links is not None and self._stamp_s is not None:
             links, self._jacobian = heating.after(
-                self._links[-1],
+                self._links,
                 self._jacobian,
                 0.5 * (rest + self._rest),
                 0.5 * (driven + self._driven),
-                stamp_s - self._stamps_s[-1],
+                stamp_s - self._stamp_s,
             )
         self._rest, self._driven = rest, driven
-        self._stamps_s.append(stamp_s)
-        self._links.append(links)
-        # Samples that are too old for the rates.
-        while len(self._stamps_s) > 2 and self._stamps_s[1] < stamp_s - 2.1 * _SPAN_S:
-            self._stamps_s.pop(0)
-            self._links.pop(0)
+        self._stamp_s, self._links = stamp_s, links
 
     @property
     def links_c(self) -> FloatArray:
@@ -363,9 +324,9 @@ class OnlineCompensator:
         Raises:
             DataError: There is no sample yet.
         """
-        if not self._links:
+        if self._links is None:
             raise DataError("thermal: the compensator was fed with no sample yet.")
-        return self._links[-1]
+        return self._links
 
     @property
     def robot(self) -> Robot:
@@ -384,51 +345,3 @@ class OnlineCompensator:
         """
         jacobian = np.broadcast_to(self._jacobian, (len(q), *self._jacobian.shape))
         return self._model.sigma_m(q, self.links_c, jacobian)
-
-    def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
-        """Tells whether the arm is warm enough for work, and otherwise how long to wait.
-
-        Args:
-            q: (n,) the posture at work [rad].
-            limit_um_min: Acceptable drift rate of the flange [um/min].
-
-        Raises:
-            DataError: The limit is not positive.
-        """
-        if not limit_um_min > 0.0:
-            raise DataError(f"thermal: a limit of {limit_um_min:g} um/min is not above zero.")
-        settling = self._settling()
-        if settling is None:
-            return Advice(None, limit_um_min, None)
-        speeds, tau_s = settling
-        jacobian = 1e6 * _MINUTES * self._model.jacobian(q[None])[0, 3:]
-        ahead = np.arange(0.0, _AHEAD_S, _EVERY_S)
-        speeds = speeds * np.exp(-ahead[:, None] / tau_s)
-        rates = np.linalg.norm(speeds @ jacobian.T, axis=1)
-        over = np.flatnonzero(rates >= limit_um_min)
-        if not len(over):
-            wait = 0.0
-        elif over[-1] + 1 < len(ahead):
-            wait = float(ahead[over[-1] + 1])
-        else:
-            wait = None
-        return Advice(float(rates[0]), limit_um_min, wait)
-
-    def _settling(self) -> tuple[FloatArray, FloatArray] | None:
-        """Warm-up rates (n,) [K/s] and time constants (n,) [s]; None after too few samples."""
-        heating = self._model.heating
-        if heating.kind == "currents":
-            if not self._links:
-                return None
-            return (self._rest - self._links[-1]) / heating.tau_s, heating.tau_s
-        stamps = np.array(self._stamps_s)
-        if not len(stamps) or stamps[-1] - stamps[0] < 2.0 * _SPAN_S:
-            return None
-        then = stamps[-1] - _SPAN_S * np.arange(3)
-        links = [np.interp(then, stamps, column) for column in np.array(self._links).T]
-        latest, earlier = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
-        # One factor for all joints: those of single joints would follow each work cycle.
-        decay = float(latest @ earlier) / max(float(earlier @ earlier), 1e-12)
-        decay = min(max(decay, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
-        tau_s = np.full_like(latest, -_SPAN_S / np.log(decay))
-        return latest, np.maximum(tau_s, heating.tau_s)

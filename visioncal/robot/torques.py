@@ -3,6 +3,7 @@
 Joint angles are those of the encoders, torques are about the joints' axes, without friction.
 """
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot.inertia import Inertias, parameter_transform
-from visioncal.robot.kinematics import regressors
 from visioncal.robot.model import Robot
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def torque_regressor(
     wanted = np.arange(count) if columns is None else columns
     rows = np.empty((len(q), len(wanted), robot.joint_count)) if out is None else out
     rows = rows[:, : len(wanted)]
-    matrices = regressors(robot.pinocchio_model, robot.gravity, states)
+    matrices = _regressors(robot.pinocchio_model, robot.gravity, states)
     for row, values in zip(rows, matrices, strict=True):
         # For every sample: a copy with bounds checking would take as long as the dynamics.
         values.take(wanted, 0, row, "clip")
@@ -65,7 +65,7 @@ def joint_torques(
     """
     states = effective_states(robot, q, dq, ddq)
     parameters = inertias.values.ravel()
-    matrices = regressors(robot.pinocchio_model, robot.gravity, states)
+    matrices = _regressors(robot.pinocchio_model, robot.gravity, states)
     return np.array([parameters @ array for array in matrices]).reshape(np.shape(q))
 
 
@@ -134,3 +134,27 @@ def model_with_inertias(robot: Robot, inertias: Inertias) -> "pin.Model":
     for joint, (kg, centre, about) in enumerate(bodies, start=1):
         model.inertias[joint] = pin.Inertia(kg, centre, about)
     return model
+
+
+def _regressors(
+    model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
+) -> Iterator[FloatArray]:
+    """Iterates over the torque regressors of states, for the bodies' inertial parameters.
+
+    Args:
+        model: Of the arm.
+        gravity: (3,) in the base's frame [m/s^2].
+        states: (m, n) effective positions, speeds and accelerations.
+
+    Yields:
+        (10 n, n) for each state, in memory that the next state overwrites.
+    """
+    import pinocchio as pin
+
+    model.gravity.linear = gravity
+    data, compute = model.createData(), pin.computeJointTorqueRegressor
+    # The function's return value is a copy of this array.
+    regressor = data.jointTorqueRegressor.T
+    for q, dq, ddq in zip(*states, strict=True):
+        compute(model, data, q, dq, ddq)
+        yield regressor

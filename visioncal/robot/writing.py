@@ -4,8 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
-from xml.etree.ElementTree import Comment, Element, SubElement, fromstring, indent, tostring
-from xml.sax.saxutils import quoteattr
+from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 import numpy as np
 import tomli_w
@@ -73,63 +72,51 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     comment lists those that are missing.
     """
     chain = robot.chain.with_offsets_placed()
-    links = ["base", *(f"link_{index}" for index in range(1, len(chain) + 1))]
-    lines = [
-        '<?xml version="1.0"?>',
-        f"<robot name={quoteattr(robot.name)}>",
-        *(f"  <!-- {text} -->" for text in comment_texts(robot, notes)),
-    ]
-    lines.append(f"  <link name={quoteattr(links[0])}/>")
-    for link, inertial in zip(links[1:], _inertials(robot), strict=True):
-        lines += [f"  <link name={quoteattr(link)}>", *inertial, "  </link>"]
-    lines.append(f"  <link name={quoteattr(robot.tip)}/>")
-    rates = np.column_stack([robot.torque_nm, robot.velocity_rad_s])
+    links = ["base", *(f"link_{index}" for index in range(1, len(chain) + 1)), robot.tip]
+    root = Element("robot", name=robot.name)
+    elements = [SubElement(root, "link", name=link) for link in links]
+    if robot.inertias is not None:
+        _add_inertials(elements[1:-1], robot.inertias)
     # A URDF needs both; zero means unknown.
-    rates = np.where(np.isfinite(rates), rates, 0.0)
-    for index, joint in enumerate(chain.joint_names):
+    rates = np.nan_to_num(np.stack([robot.torque_nm, robot.velocity_rad_s], axis=1), posinf=0.0)
+    for index, name in enumerate(chain.joint_names):
         limits = (chain.lower[index], chain.upper[index])
         bounded = bool(np.isfinite(limits).all())
         rotary = "revolute" if bounded else "continuous"
         kind = "prismatic" if chain.prismatic[index] else rotary
-        lines.append(f'  <joint name={quoteattr(joint)} type="{kind}">')
-        lines += _joint_lines(links[index], links[index + 1], chain.placements[index])
-        axis = " ".join(repr(axis) for axis in chain.axes[index].tolist())
-        lines.append(f'    <axis xyz="{axis}"/>')
+        joint = _joint(name, kind, links[index], links[index + 1], chain.placements[index])
+        SubElement(joint, "axis", xyz=" ".join(map(repr, chain.axes[index].tolist())))
         if bounded:
-            lower, upper = map(float, limits)
-            effort, velocity = rates[index].tolist()
-            lines.append(
-                f'    <limit lower="{lower!r}" upper="{upper!r}" effort="{effort:g}" '
-                f'velocity="{velocity!r}"/>'
-            )
-        lines.append("  </joint>")
-    lines.append(f'  <joint name={quoteattr(f"{links[-1]}-{robot.tip}")} type="fixed">')
-    lines += _joint_lines(links[-1], robot.tip, chain.placements[-1])
-    return "\n".join([*lines, "  </joint>", "</robot>", ""])
+            names = ("lower", "upper", "effort", "velocity")
+            values = map(repr, [*map(float, limits), *rates[index].tolist()])
+            SubElement(joint, "limit", dict(zip(names, values, strict=True)))
+        root.append(joint)
+    fixed = f"{links[-2]}-{robot.tip}"
+    root.append(_joint(fixed, "fixed", links[-2], robot.tip, chain.placements[-1]))
+    return _with_comments(root, comment_texts(robot, notes))
 
 
-def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[str]:
-    """Writes an `<inertial>`: mass, centre (3,), and inertia (3, 3) about the centre."""
-    xyz = " ".join(repr(value) for value in (centre_m + 0.0).tolist())
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    numbers = about[np.triu_indices(3)].tolist()
-    values = " ".join(f'{name}="{number!r}"' for name, number in zip(names, numbers, strict=True))
-    return [
-        "    <inertial>",
-        f'      <origin xyz="{xyz}" rpy="0.0 0.0 0.0"/>',
-        f'      <mass value="{kg!r}"/>',
-        f"      <inertia {values}/>",
-        "    </inertial>",
-    ]
+def _add_inertials(links: Sequence[Element], inertias: Inertias) -> None:
+    """Adds an `<inertial>` to links: mass, centre, and inertia about the centre."""
+    masses = inertias.masses
+    bodies = zip(links, masses.kg.tolist(), masses.centres_m, inertias.about_centres, strict=True)
+    for link, kg, centre_m, about in bodies:
+        inertial = SubElement(link, "inertial")
+        xyz = " ".join(map(repr, (centre_m + 0.0).tolist()))
+        SubElement(inertial, "origin", xyz=xyz, rpy="0.0 0.0 0.0")
+        SubElement(inertial, "mass", value=repr(kg))
+        numbers = map(repr, about[np.triu_indices(3)].tolist())
+        names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        SubElement(inertial, "inertia", dict(zip(names, numbers, strict=True)))
 
 
-def _inertials(robot: Robot) -> list[list[str]]:
-    """Lines of each link's `<inertial>`; none where the robot states no inertias."""
-    if robot.inertias is None:
-        return [[] for _ in robot.joint_names]
-    masses = robot.inertias.masses
-    bodies = zip(masses.kg.tolist(), masses.centres_m, robot.inertias.about_centres, strict=True)
-    return [inertial_lines(*body) for body in bodies]
+def _joint(name: str, kind: str, parent: str, child: str, placement: FloatArray) -> Element:
+    """A joint whose origin is at (4, 4) [m] in its parent link."""
+    joint = Element("joint", name=name, type=kind)
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    _set_origin(joint, placement)
+    return joint
 
 
 def comment_texts(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
@@ -138,15 +125,6 @@ def comment_texts(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
     said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
     return [re.sub("-(?=-)", "- ", one_line(note)) for note in (*notes, *[said][: len(missing)])]
-
-
-def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
-    xyz, rpy = numbers_text(placement)
-    return [
-        f"    <parent link={quoteattr(parent)}/>",
-        f"    <child link={quoteattr(child)}/>",
-        f'    <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>',
-    ]
 
 
 def ur_kinematics_yaml(
@@ -358,11 +336,8 @@ def _corrected_tip_link(
 ) -> tuple[Element, Element]:
     """A link with a fixed joint for the corrected tip, where no fixed joint places the tip."""
     corrected = f"{tip}_corrected"
-    joint = Element("joint", name=f"{tip}_correction", type="fixed")
     parent = end_of(joints[tip], "child") if tip in joints else tip
-    SubElement(joint, "parent", link=parent)
-    SubElement(joint, "child", link=corrected)
-    _set_origin(joint, step)
+    joint = _joint(f"{tip}_correction", "fixed", parent, corrected, step)
     return Element("link", name=corrected), joint
 
 
@@ -415,14 +390,12 @@ def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = 
         )
     root, joints = joints_of(text)
     links = {link.get("name", ""): link for link in root.iterfind("link")}
-    masses = inertias.masses
-    bodies = zip(masses.kg.tolist(), masses.centres_m, inertias.about_centres, strict=True)
-    for joint, body in zip(robot.joint_names, bodies, strict=True):
-        own = end_of(joints[joint], "child")
+    moving = [end_of(joints[joint], "child") for joint in robot.joint_names]
+    for own in moving:
         for name in _moving_with(own, joints, robot.joint_names):
             for former in links[name].findall("inertial"):
                 links[name].remove(former)
-        links[own].append(fromstring("".join(inertial_lines(*body))))
+    _add_inertials([links[own] for own in moving], inertias)
     return _with_comments(root, comment_texts(robot, notes))
 
 

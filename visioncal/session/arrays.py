@@ -14,7 +14,7 @@ from visioncal.core.types import Camera, FloatArray, Image, Image16, IntArray, M
 from visioncal.session.columns import POSE
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import MemoryImages
-from visioncal.vision.finders.imaging import encode_png
+from visioncal.vision.boards.imaging import encode_png
 from visioncal.vision.targets import target_document
 
 Poses: TypeAlias = RigidTransform | FloatArray | Sequence[RigidTransform]

@@ -18,7 +18,7 @@ from visioncal.session.images import inside_path
 from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import write_stream
 from visioncal.session.table import write_csv
-from visioncal.vision.targets import rig_csv
+from visioncal.vision.boards.points import rig_csv
 
 if TYPE_CHECKING:
     from visioncal.session.session import Session

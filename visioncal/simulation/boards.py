@@ -7,8 +7,6 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.targets import (
-    APRILGRID_DICTIONARY,
-    DETECTABLE_IN_PART,
     corner_positions,
     extent_m,
     load_target,
@@ -34,7 +32,7 @@ def _tags() -> Target:
         rows=1,
         square_m=0.245,
         square_sigma_m=0.0,
-        dictionary=APRILGRID_DICTIONARY,
+        dictionary="DICT_APRILTAG_36h11",
         points_m=tuple(points),
         point_numbers=tuple(range(len(points))),
         point_tags=tuple((tag[0], corner) for tag in tags for corner in range(4)),
@@ -70,15 +68,10 @@ def corners_m(sheet: Sheet) -> FloatArray:
 
 def unit_m(target: Target) -> float:
     """Side of a square, or of the first of free tags, as the unit of a sheet's texture [m]."""
-    if target.kind != "points":
+    if not target.is_rig:
         return target.square_m
     first, second = target.points_m[:2]
     return float(np.linalg.norm(np.subtract(second, first)))
-
-
-def detectable_in_part(target: Target) -> bool:
-    """Whether detectors accept a part of a board."""
-    return target.kind in DETECTABLE_IN_PART or target.kind == "points"
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:

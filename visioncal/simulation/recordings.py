@@ -30,7 +30,7 @@ from visioncal.simulation.arms import (
     inverse,
     warm_up,
 )
-from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
+from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.simulation.cell import (
     InstrumentReading,
     SimulatedCell,
@@ -49,6 +49,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.optics import inaccurate_camera, project, sees
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX, Viewpoints, filling_m
 from visioncal.simulation.postures import mounted, mounted_single, postures_of, postures_single
+from visioncal.vision.targets import is_seen_in_part, rotation_transforms
 
 # Corners closer to the image's edge are not detected [px].
 EDGE_PX = 2.0
@@ -74,7 +75,7 @@ def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> 
     if not visible.any():
         return np.asarray(visible)
     share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
-    visible[visible] = share >= (LEAST_SHARE if detectable_in_part(sheet.target) else 1.0)
+    visible[visible] = share >= (LEAST_SHARE if is_seen_in_part(sheet.target) else 1.0)
     return np.asarray(visible)
 
 
@@ -94,9 +95,7 @@ def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Gen
 
 def is_symmetric(target: Target) -> bool:
     """Whether a board is invariant under a half turn."""
-    if target.kind == "circles":
-        return not target.asymmetric or target.rows % 2 == 0
-    return target.kind == "checkerboard" and (target.columns + target.rows) % 2 == 0
+    return len(rotation_transforms(target)) > 1
 
 
 def moved_cell(
@@ -456,7 +455,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    min_corners = _FEWEST_OF_CELL if detectable_in_part(board.target) else len(corners_m(board))
+    min_corners = _FEWEST_OF_CELL if is_seen_in_part(board.target) else len(corners_m(board))
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
     used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
     first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)

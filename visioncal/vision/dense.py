@@ -26,12 +26,9 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
-from visioncal.vision.finders import find_target
-from visioncal.vision.finders.result import DetectedCorners
-from visioncal.vision.printing.pattern import dark_cells
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.boards import DetectedCorners, find_target, kind_of
+from visioncal.vision.targets import corner_positions, extent_m
 
-KINDS = ("charuco", "checkerboard")
 # Side of a square that images are reduced to [px], and texels per square: a texel is half a pixel.
 _SQUARE_PX, _TEXELS = 16.0, 32
 # Blur of the print before it is sampled once a pixel; narrower edges would alias [px].
@@ -94,8 +91,8 @@ def _starts(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray
     if isinstance(seen, DetectedCorners) and len(seen.ids) >= _FEWEST:
         yield seen.ids, seen.px
         return
-    ids = np.arange(len(corner_positions(target)))
-    columns = target.columns - (target.kind == "charuco")
+    places = corner_positions(target)
+    ids, columns = np.arange(len(places)), len(np.unique(places[:, 0]))
     for side_px, sigma_px in _SEARCHES:
         factor = max(1, round(max(image.shape) / side_px))
         small = cv2.resize(image, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
@@ -227,8 +224,7 @@ class _Fit:
     def used(self, values: FloatArray) -> Mask:
         """(h, w) mask of pixels of the board and a rim around it."""
         at = self.on_board(values)[0]
-        low = np.full(2, -1.0 if self.target.kind == "checkerboard" else 0.0)
-        high = low + _squares(self.target)
+        low, high = (end / self.target.square_m for end in extent_m(self.target))
         on_board = np.all((at > low - _RIM) & (at < high + _RIM), axis=-1)
         return np.asarray(on_board & np.isfinite(self.image))
 
@@ -337,17 +333,13 @@ class _Fit:
         return np.asarray(self.unit_px[:2] + self.unit_px[2] * bent)
 
 
-def _squares(target: Target) -> tuple[int, int]:
-    """Squares along x and y of a print."""
-    more = target.kind == "checkerboard"
-    return target.columns + more, target.rows + more
-
-
 def _texture(target: Target, blur: float) -> FloatArray:
     """The print with paper around it, light being 1; blurred by a share of a square."""
-    columns, rows = (_TEXELS * (count + 2 * (1 + _PAPER)) for count in _squares(target))
+    low, high = extent_m(target)
+    counts = np.rint((high - low) / target.square_m).astype(int).tolist()
+    columns, rows = (_TEXELS * (count + 2 * (1 + _PAPER)) for count in counts)
     texture = np.ones((rows, columns))
-    for cells in dark_cells(target):
+    for cells in kind_of(target).cells(target):
         shares = []
         for axis, size in ((0, columns), (1, rows)):
             cell = _TEXELS * cells.cell_m / target.square_m

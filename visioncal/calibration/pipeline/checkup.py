@@ -30,7 +30,8 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_paths
 from visioncal.session import Session
-from visioncal.vision.finders.board import hidden_corners
+from visioncal.vision.boards import kind_of
+from visioncal.vision.boards.board import hidden_corners
 
 # The image is divided into this many parts per axis; the estimation of a lens needs corners in at
 # least this many of all parts.
@@ -336,7 +337,12 @@ def _unseen_rows(session: Session, look: CameraObservations) -> Iterator[str]:
     # A board with fewer rows has the same marker numbers: nothing else shows that too many rows are
     # declared.
     target = session.target
-    if target is None or session.targets or target.kind != "charuco" or look.resolution is None:
+    if (
+        target is None
+        or session.targets
+        or not kind_of(target).marks_squares
+        or look.resolution is None
+    ):
         return
     columns, rows = target.columns - 1, target.rows - 1
     numbers = [int(corners.ids.max()) // columns + 1 for corners in look.corners.values()]
@@ -344,8 +350,9 @@ def _unseen_rows(session: Session, look: CameraObservations) -> Iterator[str]:
     last, shape = np.arange(seen * columns, rows * columns), look.resolution[::-1]
     # With most of its corners seen, the board's place in the image is known well.
     clear = (item for item in look.corners.values() if 2 * len(item.ids) > seen * columns)
+    squares = kind_of(target).corners(target) / target.square_m
     without = [
-        corners for corners in clear if np.isin(last, hidden_corners(corners, shape, target)).all()
+        corners for corners in clear if np.isin(last, hidden_corners(corners, shape, squares)).all()
     ]
     if len(last) and len(without) >= _LEAST_WITHOUT:
         yield (

@@ -126,7 +126,7 @@ def session_is_mirrored(session: Session) -> bool:
     boards, corners = session.boards, session.corners
     if any(view.image for view in session.views) or not corners:
         return False
-    if any(board.kind == "points" for board in boards.values()):
+    if any(board.is_rig for board in boards.values()):
         # The z axis of points may have either sign.
         return False
     seen = [view for view in session.views if view.number in corners]

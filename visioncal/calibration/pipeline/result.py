@@ -525,7 +525,7 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
             all_sigmas[shape],
             _relative_indices(seen.free, shape),
         )
-        if target.kind != "points":
+        if not target.is_rig:
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
                 sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},

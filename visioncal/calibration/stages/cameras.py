@@ -23,7 +23,7 @@ from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
-from visioncal.vision.finders.template import refine
+from visioncal.vision.boards import kind_of
 from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
@@ -84,7 +84,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
 
 def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple[T, Detections]:
     """Brings in views whose images the template refuses, by all pixels of their boards."""
-    from visioncal.vision.dense import KINDS, DenseCorners, find_densely
+    from visioncal.vision.dense import DenseCorners, find_densely
 
     session, rows = seen.session, {view.number: view for view in views}
     refused = [
@@ -92,7 +92,7 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         for view in (rows[rejection.view] for rejection in detections.rejections)
         if not view.has_corners
         and view.number not in detections.other_sizes
-        and session.boards[session.board_of(view)].kind in KINDS
+        and kind_of(session.boards[session.board_of(view)]).is_dense
     ]
 
     found: dict[int, DenseCorners] = {}
@@ -141,7 +141,8 @@ def _template_sigma_px(session: Session, view: View, corners: Corners) -> FloatA
     image = image_of(session, view)
     if isinstance(image, Rejection):
         return np.zeros(0)
-    return refine(image, session.boards[session.board_of(view)], corners.ids, corners.px).sigma_px
+    board = session.boards[session.board_of(view)]
+    return kind_of(board).refine(image, board, corners.ids, corners.px).sigma_px
 
 
 def estimate_lenses(seen: T) -> T:
@@ -294,7 +295,7 @@ def _refuse_mirrored(
         return
     has_images = any(view.image for view in seen.session.views if view.number in corners)
     # A rig whose table is left-handed appears mirrored, too.
-    rig = any(target.kind == "points" for target in targets)
+    rig = any(target.is_rig for target in targets)
     left_handed = " Or one axis of the rig's table has the wrong sign." if rig else ""
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "

@@ -101,7 +101,7 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
     )
     columns, sides = "the columns u_px and v_px", "width and height in resolution"
     # The z axis of a rig may point either way.
-    boards = [(corners, target) for corners, target in views if target.kind != "points"]
+    boards = [(corners, target) for corners, target in views if not target.is_rig]
     if not boards:
         raise DataError(
             f"Either {columns} of corners.csv or {sides} of session.toml are exchanged: {seen}, "
@@ -181,7 +181,7 @@ def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") 
         name: Name of the target in the session, where it has several.
     """
     # The z axis of a rig may point either way.
-    if target.kind == "points" or not views:
+    if target.is_rig or not views:
         return None
     if share_from_behind([(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
         return None
@@ -198,7 +198,7 @@ def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") 
         # Column by column, the corners of other boards do not lie as drawn.
         by_column = f"; where column by column, {columns} * (p % {rows}) + p // {rows}"
         step = f"{step}{by_column if columns == rows else ''})"
-    elif target.kind != "marker":
+    elif target.columns * target.rows > 1:
         order, step = "", "Number them as they are printed"
     whose = f"target {name}" if name else "the board"
     return Finding(

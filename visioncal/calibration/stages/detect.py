@@ -27,12 +27,10 @@ from visioncal.core.types import Corners, Image, IntArray, Progress, Rejection, 
 from visioncal.estimation.poses import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
-from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fitting_layouts
-from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
-from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
-from visioncal.vision.finders.checkerboard import miscounted
-from visioncal.vision.finders.identify import identify
-from visioncal.vision.finders.imaging import (
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
+from visioncal.vision.boards.aprilgrid import LACKS_SQUARES, free_tags_step
+from visioncal.vision.boards.identify import identify
+from visioncal.vision.boards.imaging import (
     MOST_PIXELS,
     blur_at_corners,
     claimed_size,
@@ -174,7 +172,7 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
     # A thorough search for an absent board takes seconds an image, and is skipped where all images
     # of a sample show another board.
     target = session.boards[name]
-    if target.kind != "checkerboard":
+    if kind_of(target).symmetric != "squares":
         return False
     mine = [view for view in views if session.board_of(view) == name]
     sample = mine[:: max(len(mine) // _LAYOUT_SAMPLE, 1)][:_LAYOUT_SAMPLE]
@@ -184,7 +182,8 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
             return False
         if isinstance(find_target(image, target, quick=True), DetectedCorners):
             return False
-        if miscounted(image, target) is None and not _shows_markers_alone(image, target):
+        miscounted = kind_of(target).miscounted(image, target)
+        if miscounted is None and not _shows_markers_alone(image, target):
             return False
     return bool(sample)
 
@@ -195,7 +194,7 @@ def _shows_markers_alone(image: Image, target: Target) -> bool:
         identity = identify(image)
     except DataError:
         return False
-    is_marked = identity.kind in ("charuco", "aprilgrid") and identity.corners_seen > 0
+    is_marked = not identity.is_single and identity.corners_seen > 0
     return is_marked and isinstance(find_target(image, target), NotFound)
 
 
@@ -250,8 +249,7 @@ def _search(
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # It is refused in any case, and need not be searched.
         return Searched(Rejection(view.number, f"{view.image} is of another size"), size)
-    most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
-    with budget.taken(pixels / most):
+    with budget.taken(pixels / kind_of(target).most_pixels):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return Searched(image, None)
@@ -315,7 +313,7 @@ def _imported(session: Session, view: View, resolution: tuple[int, int]) -> Corn
 
 def _why_unusable(target: Target, ids: IntArray, blur_px: float) -> str:
     positions = corner_positions(target)
-    needed = 4 if target.kind in ("marker", "points") else min(_FEWEST_FOUND, len(positions))
+    needed = min(kind_of(target).fewest, len(positions))
     if len(ids) < needed:
         return f"too few corners: {len(ids)} of {len(positions)}, needs {needed}"
     if not determines_pose(positions[ids]):
@@ -458,7 +456,7 @@ def _check_layout(
     if not misfits or len(misfits) <= shown:
         return
     culprits = [f"view {misfit.number}" for misfit in misfits]
-    if target.kind != "charuco":
+    if not kind_of(target).marks_squares:
         wrong = _rejections([search for _, search in mine if search.misfit])
         reasons = [rejection.reason for rejection in wrong]
         usual = max(set(reasons), key=reasons.count)
@@ -474,7 +472,8 @@ def _check_layout(
     images = [
         decode_image(session.images.read(misfit.image)) for misfit in misfits[:_LAYOUT_SAMPLE]
     ]
-    fitting = [fitting_layouts(image, target) for image in images if not isinstance(image, str)]
+    layouts = kind_of(target).variants
+    fitting = [layouts(image, target) for image in images if not isinstance(image, str)]
     common = [layout for layout in fitting[0] if all(layout in others for others in fitting)]
     seen = (
         f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views the markers do "

@@ -30,6 +30,7 @@ from visioncal.estimation.solve import (
     held_shift,
 )
 from visioncal.session.frames import frame_name
+from visioncal.vision.boards import kind_of
 from visioncal.vision.camera import normalise, project
 
 # False-alarm probability of the test of a rig's points.
@@ -109,14 +110,6 @@ def _noise_findings(stack: CornerStack, residuals: FloatArray, unknowns: int) ->
     )
 
 
-# Meaning of square_m for targets without squares, and its key in the target's file.
-_SIDES = {
-    "aprilgrid": ("tags", "size_m"),
-    "marker": ("a side", "size_m"),
-    "circles": ("a distance of rows", "square_m"),
-}
-
-
 def scale_finding(
     board: str, target: Target, measured: MeasuredScale, written: MeasuredScale
 ) -> Finding:
@@ -126,7 +119,7 @@ def scale_finding(
     sigma.
     """
     side, share = 1e3 * target.square_m, f"{figure(100 * measured.stated_sigma)} %"
-    what, key = _SIDES.get(target.kind, ("squares", "square_m"))
+    what, key = kind_of(target).sides, kind_of(target).size_key
     size = (
         f"By the robot's motion the {board} is {figure(100 * abs(written.scale))} % "
         f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "

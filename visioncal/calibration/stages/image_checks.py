@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,13 @@ from visioncal.session import Session, View
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
-from visioncal.vision.finders import DetectedCorners
-from visioncal.vision.finders.checkerboard import find_checkerboard, miscounted
-from visioncal.vision.finders.identify import DESCRIBE_IT, Identity, identify
-from visioncal.vision.finders.identify_text import SIDES, describe
-from visioncal.vision.finders.imaging import blur_of_edges, decode_image, poor_image_reason
-from visioncal.vision.targets import board_words, load_target, marker_cells, target_names
+from visioncal.vision.boards import DetectedCorners, kind_of
+from visioncal.vision.boards.checkerboard import CHECKERBOARD
+from visioncal.vision.boards.identify import DESCRIBE_IT, describe, identify
+from visioncal.vision.boards.identity import Identity
+from visioncal.vision.boards.imaging import blur_of_edges, decode_image, poor_image_reason
+from visioncal.vision.boards.kind import marker_cells
+from visioncal.vision.targets import board_words, load_target, target_names
 
 # Names that are listed, and images that are searched for any board.
 _LISTED, _LOOKED_AT = 6, 3
@@ -223,7 +223,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         return unreadable
     view, identity = best
     # A single tag of a grid or a rig identifies no board: the finder states what it lacks.
-    is_own_tag = declared.kind in ("aprilgrid", "points") and _is_its_tag(identity, declared)
+    is_own_tag = declared.kind != identity.board.kind and _is_its_tag(identity, declared)
     if is_own_tag or _matches(identity, declared):
         return None
     return _other_board_finding(view, identity, declared)
@@ -237,21 +237,21 @@ def _identified(image: Image, declared: Target) -> Identity | None:
     try:
         identity = identify(image)
     except DataError:
-        board = miscounted(image, declared) if declared.kind == "checkerboard" else None
+        board = kind_of(declared).miscounted(image, declared)
         if board is None:
             return None
         corners = board.columns * board.rows
-        return Identity(board.kind, board.columns, board.rows, True, corners, corners)
+        return Identity(board, True, corners, corners)
     # A single marker is no evidence against a declared ChArUco board.
-    if declared.kind == "charuco" and _is_its_tag(identity, declared):
+    if kind_of(declared).marks_squares and _is_its_tag(identity, declared):
         return None
     return identity if identity.corners_seen >= _LEAST_CORNERS * identity.corners else None
 
 
 def _is_its_tag(identity: Identity, declared: Target) -> bool:
     """Whether a single marker is of the declared board's dictionary."""
-    dictionaries = (identity.dictionary, *identity.larger)
-    return identity.kind == "marker" and declared.dictionary in dictionaries
+    dictionaries = (identity.board.dictionary, *identity.larger)
+    return identity.is_single and declared.dictionary in dictionaries
 
 
 def _is_better(new: Identity, best: Identity) -> bool:
@@ -260,9 +260,8 @@ def _is_better(new: Identity, best: Identity) -> bool:
 
 def _matches(identity: Identity, target: Target) -> bool:
     """Whether the seen board is the target, except for its size."""
-    as_target = identity.target(target.name, target.square_m)
-    is_same = all(getattr(as_target, name) == getattr(target, name) for name in _COMPARED)
-    return is_same and target.dictionary in ("", identity.dictionary, *identity.larger)
+    is_same = all(getattr(identity.board, name) == getattr(target, name) for name in _COMPARED)
+    return is_same and target.dictionary in ("", identity.board.dictionary, *identity.larger)
 
 
 def _other_board_finding(view: View, identity: Identity, declared: Target) -> Finding:
@@ -270,7 +269,7 @@ def _other_board_finding(view: View, identity: Identity, declared: Target) -> Fi
     matching = [target for target in shipped if _matches(identity, target)]
     # The declared size is that of another board; only a print of the same squares confirms it.
     matching.sort(key=lambda target: abs(target.square_m - declared.square_m))
-    side = SIDES[identity.kind]
+    side = kind_of(identity.board).side
     if matching:
         same = abs(matching[0].square_m / declared.square_m - 1.0) < _SAME_SIZE
         size = f", if the {side} is {1e3 * matching[0].square_m:g} mm: measure it"
@@ -297,9 +296,9 @@ def _article(words: str) -> str:
 
 def _counting_mistake(identity: Identity, declared: Target) -> str:
     """The likely mistake in counting inner corners, in words; empty for another difference."""
-    if identity.kind != "checkerboard" or declared.kind != "checkerboard":
+    if any(kind_of(target).symmetric != "squares" for target in (identity.board, declared)):
         return ""
-    counts = (sorted((target.columns, target.rows)) for target in (declared, identity))
+    counts = (sorted((target.columns, target.rows)) for target in (declared, identity.board))
     differences = {stated - seen for stated, seen in zip(*counts, strict=True)}
     if differences == {1}:
         return " The squares were counted: columns and rows are of inner corners, one less each."
@@ -312,15 +311,17 @@ def _unread(view: View, image: Image, declared: Target) -> Finding | None:
     """Finding for an image without a readable board, or with the declared one's squares alone."""
     mirrored = _identified(np.ascontiguousarray(image[:, ::-1]), declared)
     # Squares look alike mirrored: only readable markers show it.
-    readable = ("charuco",) if declared.kind == "charuco" else ("charuco", "aprilgrid", "marker")
-    if mirrored is not None and mirrored.kind in readable:
+    marks_squares = kind_of(declared).marks_squares
+    if (
+        mirrored is not None
+        and kind_of(mirrored.board).has_markers
+        and (mirrored.board.kind == declared.kind or not marks_squares)
+    ):
         return _mirrored_finding(view)
-    if declared.kind != "charuco":
+    if not marks_squares:
         return None
-    plain = replace(
-        declared, kind="checkerboard", columns=declared.columns - 1, rows=declared.rows - 1
-    )
-    squares = find_checkerboard(image, plain)
+    plain = CHECKERBOARD.inside(declared)
+    squares = CHECKERBOARD.search(image, plain)
     blur_px = blur_of_edges(image)
     if isinstance(squares, DetectedCorners):
         grid = squares.px.reshape(plain.rows, plain.columns, 2)

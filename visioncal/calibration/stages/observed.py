@@ -21,7 +21,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
 from visioncal.session.images import FolderImages
-from visioncal.vision.finders.identify import DESCRIBE_IT
+from visioncal.vision.boards.identify import DESCRIBE_IT
 
 if TYPE_CHECKING:
     from visioncal.vision.dense import DenseCorners

@@ -63,7 +63,7 @@ def leave_out_wrong_points(observed: T) -> T:
     for first, (name, target) in zip(
         first_corners(targets).tolist(), observed.session.boards.items(), strict=True
     ):
-        if target.kind != "points":
+        if not target.is_rig:
             continue
         positions = _wrong_points(observed, target, first)
         if not positions:

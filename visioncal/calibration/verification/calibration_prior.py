@@ -175,7 +175,7 @@ def _looks(
         return fit.looks
     is_shear = [False] * len(intrinsics(camera.camera))
     for target in targets.values():
-        is_shear += [False] * (len(stated_board_sigma(target)) - 1) + [target.kind != "points"]
+        is_shear += [False] * (len(stated_board_sigma(target)) - 1) + [not target.is_rig]
     return tuple(np.flatnonzero(~np.array(is_shear))[list(fit.looks)].tolist())
 
 

@@ -30,7 +30,7 @@ from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
 from visioncal.session import columns as session_columns
 from visioncal.session.corners import CornerTable
-from visioncal.vision.finders.imaging import decode_image, looks_like_image
+from visioncal.vision.boards.imaging import decode_image, looks_like_image
 
 
 @dataclass(frozen=True, eq=False)

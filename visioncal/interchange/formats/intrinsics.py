@@ -14,7 +14,8 @@ from visioncal.core.documents.structured import read_opencv, read_xml, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Target
-from visioncal.vision.targets import metres, read_target, target_from_document, target_names
+from visioncal.vision.boards.kind import metres
+from visioncal.vision.targets import read_target, target_from_document, target_names
 
 
 def _millimetres(text: str) -> float:

@@ -38,7 +38,7 @@ from visioncal.session.columns import (
 )
 from visioncal.session.corners import CornerTable
 from visioncal.session.table import parse_csv
-from visioncal.vision.targets import LARGEST_M
+from visioncal.vision.boards.kind import LARGEST_M
 
 # Least number and correlation of pose steps by which joints and poses are of one log.
 _FEWEST_STEPS, _LEAST_CORRELATION = 4, 0.9

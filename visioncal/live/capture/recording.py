@@ -22,7 +22,7 @@ from visioncal.live.drivers.protocols import Arm, ArmState
 from visioncal.live.planning.design import Accuracy
 from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.robot import Robot
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 # Typical duration of a stop besides the motion to it [s].
 _STOP_S = 1.5

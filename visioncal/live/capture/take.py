@@ -14,7 +14,7 @@ from visioncal.core.types import Corners, FloatArray, Image, Rejection, Target
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.drivers.protocols import ArmState, Frame
-from visioncal.vision.finders import blur_of
+from visioncal.vision.boards import blur_of
 
 # Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02

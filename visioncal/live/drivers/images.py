@@ -10,7 +10,7 @@ from visioncal.core.files import natural
 from visioncal.core.types import Camera
 from visioncal.live.drivers.protocols import Frame
 from visioncal.session.images import IMAGE_ENDINGS
-from visioncal.vision.finders.imaging import read_image
+from visioncal.vision.boards.imaging import read_image
 
 
 class FolderCamera:

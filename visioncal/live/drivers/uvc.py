@@ -16,7 +16,7 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 # Timeout of the first picture [s]; of opening a stream, and of a picture of it [ms].
 _OPENING_S, _OPEN_MS, _READ_MS = 5.0, 5000, 1500

@@ -11,8 +11,7 @@ from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
 from visioncal.results import Calibration, Edge
 from visioncal.robot import Robot
-from visioncal.robot.bodies import Body, arm_bodies, camera_body, capsule
-from visioncal.robot.collision import Collisions
+from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body, capsule
 from visioncal.vision.targets import corner_positions, extent_m
 
 # Greatest angle between the line of sight and a board's normal [rad].

@@ -37,7 +37,7 @@ from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
-from visioncal.vision.targets import DETECTABLE_IN_PART, corner_positions
+from visioncal.vision.targets import corner_positions, is_seen_in_part
 
 # Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
 WORLDS = 4
@@ -224,7 +224,7 @@ def stated(cell: PlanCell) -> LensBoardParameters:
     shape = stated_board_sigma(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
     # The positions of a rig's points are taken as exact.
-    sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)
+    sized = np.array([] if cell.target.is_rig else [SCALE], dtype=np.int64)
     return LensBoardParameters(
         look,
         shape_basis(cell.target),
@@ -370,7 +370,7 @@ def _predicted_corners(
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
-    in_part = cell.target.kind in DETECTABLE_IN_PART or cell.target.point_tags
+    in_part = is_seen_in_part(cell.target)
     fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
     shows = visible.sum(axis=1) >= fewest
     view, corner = np.nonzero(visible[shows])

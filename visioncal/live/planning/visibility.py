@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
-from visioncal.robot.bodies import arm_bodies
+from visioncal.robot.collision import arm_bodies
 from visioncal.robot.inverse import chain_frames
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m

@@ -40,7 +40,7 @@ def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:
 
 def closed_outline(target: Target) -> FloatArray:
     """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box."""
-    if target.kind == "points":
+    if target.is_rig:
         low, high = _bounds(target)
         return np.asarray(low + _BOX * (high - low))
     corners = outline(target)
@@ -49,7 +49,7 @@ def closed_outline(target: Target) -> FloatArray:
 
 def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
     """The pattern as a textured sheet in the target's frame; for a rig, its points."""
-    if target.kind == "points":
+    if target.is_rig:
         return rr.Points3D(
             corner_positions(target),
             colors=colours.DETECTED,
@@ -70,7 +70,9 @@ def picture(target: Target) -> Image:
     """The printed pattern as a grey image, x to the right and y down."""
     low, high = extent_m(target)
     side_px = _LARGEST_PX * target.square_m / float(np.max(high - low))
-    side_px = max(int(min(4 * _SQUARE_PX if target.kind == "marker" else _SQUARE_PX, side_px)), 1)
+    side_px = max(
+        int(min(_SQUARE_PX if target.columns * target.rows > 1 else 4 * _SQUARE_PX, side_px)), 1
+    )
     scale = side_px / target.square_m
     width, height = np.rint(scale * (high - low)).astype(int).tolist()
     page = np.full((height, width), 255, dtype=np.uint8)

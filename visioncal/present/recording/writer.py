@@ -22,7 +22,7 @@ from visioncal.present.recording.scene import Scene
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
-from visioncal.vision.finders.imaging import decode_image, faint_jpeg
+from visioncal.vision.boards.imaging import decode_image, faint_jpeg
 
 _MEDIA_TYPES = {
     ".png": "image/png",

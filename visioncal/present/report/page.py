@@ -18,7 +18,7 @@ from visioncal.present.report.thumbnails import Thumbnail, thumbnail
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 _MAX_REJECTED_PICTURES = 4
 # Grey level in place of a missing image.

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image
 from visioncal.results.evidence import ViewEvidence
-from visioncal.vision.finders.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image
 
 _WIDTH_PX, _SMALL_PX = 720, 240
 _JPEG_QUALITY, _JPEG_SIDE_PX = 78, 65_500

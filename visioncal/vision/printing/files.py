@@ -13,8 +13,8 @@ from visioncal.core.files import (
     write_generation,
 )
 from visioncal.core.types import Target
+from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import Sheet
-from visioncal.vision.printing.request import OF_TAGS
 from visioncal.vision.targets import target_document, target_from_document
 
 # Larger pages take gigabytes of memory to draw.
@@ -109,7 +109,7 @@ def _description(sheet: Sheet) -> str:
     left, top, right, bottom = sheet.pattern.box
     page = sheet.page
     lying = "landscape" if page.width_mm > page.height_mm else "portrait"
-    size = "size_m" if sheet.target.kind in OF_TAGS else "square_m"
+    size = kind_of(sheet.target).size_key
     return (
         f"# {1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, for {page.name}, {lying}.\n"
         f"# {size} is what was meant to be printed: replace it by what you measure on paper,\n"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
+from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
 
 # Width and height in portrait [mm] (ISO 216; ANSI Y14.1).
@@ -34,8 +35,6 @@ ARROW_MM = 8.0
 
 FONT_PT = 7.0
 LINE_MM = 3.1
-# Kinds that are measured over whole squares.
-_OF_SQUARES = ("charuco", "checkerboard")
 # Gap of the text to the quiet zone.
 _GAP_MM = 0.5
 # Width per letter of a line, rounded up.
@@ -137,10 +136,10 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
             return _centred(target, pattern, page, room)
     left, top, right, bottom = pattern.box
     needed = _room(target, pattern, pages[0])
-    sides = {"charuco": "square", "checkerboard": "square", "circles": "distance"}
-    side_name = sides.get(target.kind, "side")
     largest = largest_side_mm(target, pages)
-    smaller = f", or a {side_name} of {largest} mm, the largest that fits" if largest else ""
+    smaller = (
+        f", or a {kind_of(target).unit} of {largest} mm, the largest that fits" if largest else ""
+    )
     raise DataError(
         f"{target.name} does not fit on {', '.join(map(str, pages))}: the print measures "
         f"{1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, and with the white around it, "
@@ -233,62 +232,10 @@ def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
 
 def _sentences(target: Target) -> tuple[str, str, str]:
     """Description of the board, its frame, and instructions to print and measure it."""
-    side_mm = f"{1e3 * target.square_m:g} mm"
-    printed = "Print at 100 %, not fitted to the page, and check both rulers."
-    match target.kind:
-        case "marker":
-            description = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
-            origin = "the marker's centre"
-            measure = "Measure the dark square's side and write it into size_m, in metres."
-        case "checkerboard":
-            description = (
-                f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
-                f"{side_mm}"
-            )
-            origin = "the inner corner at the top left"
-        case "charuco":
-            layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
-            description = (
-                f"ChArUco, {target.columns} x {target.rows} squares of {side_mm}, markers of "
-                f"{1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}"
-            )
-            origin = "the print's top left corner"
-        case "aprilgrid":
-            description = (
-                f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm}, "
-                f"{1e3 * target.spacing * target.square_m:g} mm apart, {target.dictionary} from id "
-                f"{target.marker_id} at the lower left"
-            )
-            origin = "the upper left corner of the tag at the top left"
-            sides = target.columns + (target.columns - 1) * target.spacing
-            measure = (
-                f"Measure over all {target.columns} columns of tags, meant to be "
-                f"{1e3 * sides * target.square_m:g} mm; divide by {sides:g} and write the result "
-                "into size_m, in metres."
-            )
-        case "points":
-            description = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
-            origin = "the origin of the table of their corners"
-            measure = "Measure the tags' corners and write them into that table, in metres."
-        case "circles":
-            description = (
-                f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "
-                f"{target.rows} circles of {1e3 * target.diameter_m:g} mm, rows {side_mm} apart"
-            )
-            origin = "the centre of the circle at the top left"
-            measure = (
-                f"Measure from the first row's centres to the last one's, meant to be "
-                f"{1e3 * (target.rows - 1) * target.square_m:g} mm; divide by {target.rows - 1} "
-                "and write the result into square_m, in metres."
-            )
-    if target.kind in _OF_SQUARES:
-        count = target.columns + (target.kind == "checkerboard")
-        measure = (
-            f"Measure over all {count} columns, meant to be {1e3 * count * target.square_m:g} mm; "
-            f"divide by {count} and write the result into square_m, in metres."
-        )
-    frame = (
-        f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y down, "
-        "z into the page."
+    says = kind_of(target).on_sheet(target)
+    return (
+        f"{target.name}: {says.words}",
+        f"Frame: origin at {says.origin}, level with the zeros of both rulers; x to the right, y "
+        "down, z into the page.",
+        "Print at 100 %, not fitted to the page, and check both rulers. " + says.measure,
     )
-    return f"{target.name}: {description}", frame, f"{printed} {measure}"

@@ -1,18 +1,36 @@
-"""Detection of grids of circles: blobs on a lattice."""
+"""Grids of circles: blobs on a lattice."""
 
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Self
+from typing import Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from visioncal.core.types import FloatArray, Image, IntArray, Target
-from visioncal.vision.finders.result import DetectedCorners, NotFound
-from visioncal.vision.targets import circle_places
+from visioncal.core.files import DocumentTable
+from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.vision.boards.board import Board
+from visioncal.vision.boards.imaging import shrunk
+from visioncal.vision.boards.kind import (
+    BoardRequest,
+    Cells,
+    DetectedCorners,
+    NotFound,
+    OnSheet,
+    counts_of,
+    side_metres,
+    sigma_of,
+    size_of,
+)
+from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined
 
+# Largest diameter over spacing of circles, so that their edges remain separate; that of requested
+# ones, as much dark as white between them.
+_WIDEST, _USUAL_DIAMETER = 0.85, 0.5
+# Circles of a larger radius are fitted at half the image size [px].
+_MOST_RADIUS_PX = 20.0
 # Threshold: window as a share of the image's shorter side, and grey levels below its mean. Blobs
 # have a minimum area [px] and fill the ellipse of their moments: squares fill 0.955, circles of few
 # pixels a little less than all of it; the median separates them.
@@ -52,37 +70,147 @@ class Circles:
     diameter_px: float  # Median diameter [px].
 
 
-def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Centres of a grid of circles in a (h, w) grey image, to about a pixel, or why there are none.
+class CircleGrid(Board):
+    """A grid of circles. Its origin is the first one's centre; it has no markers."""
 
-    Circles are dark on light or, where no such grid is seen, light on dark. For a symmetric grid,
-    the numbering with the least rotation in the image is used.
-    """
-    seen = _seen_grids(image) or _seen_grids(255 - image)
-    for circles in seen:
-        if (circles.columns, circles.rows, circles.asymmetric) == (
-            target.columns,
-            target.rows,
-            target.asymmetric,
-        ):
-            share = target.diameter_m / target.square_m
-            if abs(circles.share / share - 1.0) > _DIAMETER + _SPREAD_PX / circles.diameter_px:
-                return NotFound(
-                    f"the circles' diameter is {circles.share:.2f} of square_m, and the target "
-                    f"says {share:.2f}",
-                    misfit=True,
-                )
-            return DetectedCorners(np.arange(len(circles.px)), circles.px)
-    layout = "asymmetric" if target.asymmetric else "symmetric"
-    requested = f"{layout} grid of {target.columns} x {target.rows} circles"
-    if not seen:
-        return NotFound(f"no board: no {requested} is seen")
-    best = seen[0]
-    return NotFound(
-        f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
-        f"and the target is {_article(target.asymmetric)} one of {target.columns} x {target.rows}",
-        misfit=True,
-    )
+    name: ClassVar[TargetKind] = "circles"
+    keys = f"{Board.keys} diameter_m asymmetric"
+    sides, unit = "a distance of rows", "distance"
+    symmetric: ClassVar[Literal["", "squares", "places"]] = "places"
+
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads columns, rows, square_m, square_sigma_m, diameter_m and asymmetric."""
+        columns, rows = counts_of(table)
+        square_m = size_of(table, "square_m")
+        asymmetric = table.flag("asymmetric", default=False)
+        diameter_m = table.number("diameter_m", positive=True)
+        # Distance of the nearest circles.
+        spacing_m = square_m * np.sqrt(2.0) if asymmetric else square_m
+        if diameter_m >= _WIDEST * spacing_m:
+            needed = f"less than {_WIDEST:g} of the distance of neighbours, {spacing_m:g} m,"
+            raise table.refuse("diameter_m", diameter_m, needed)
+        return Target(
+            name,
+            self.name,
+            columns,
+            rows,
+            square_m,
+            sigma_of(table, square_m),
+            diameter_m=diameter_m,
+            asymmetric=asymmetric,
+        )
+
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) centres [m], row by row."""
+        places = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
+        return np.asarray(target.square_m * np.pad(places, ((0, 0), (0, 1))), dtype=float)
+
+    def words(self, target: Target, size: str) -> str:
+        """The board in a few words."""
+        return f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {size} circles"
+
+    def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
+        """Low and high x, y of the print [m]."""
+        low, high = super().extent_m(target)
+        return low - target.diameter_m / 2, high + target.diameter_m / 2
+
+    def cells(self, target: Target) -> tuple[Cells, ...]:
+        """None: its print is discs."""
+        del target
+        return ()
+
+    def discs(self, target: Target) -> FloatArray:
+        """(n, 2) centres of its circles [m]."""
+        return self.corners(target)[:, :2]
+
+    def on_sheet(self, target: Target) -> OnSheet:
+        """What a printed sheet says of it."""
+        side_mm, steps = 1e3 * target.square_m, target.rows - 1
+        words = self.words(target, f"{target.columns} x {target.rows}")
+        return OnSheet(
+            f"{words} of {1e3 * target.diameter_m:g} mm, rows {side_mm:g} mm apart",
+            "the centre of the circle at the top left",
+            "Measure from the first row's centres to the last one's, meant to be "
+            f"{steps * side_mm:g} mm; divide by {steps} and write the result into square_m, in "
+            "metres.",
+        )
+
+    def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
+        """The description of a requested board."""
+        document = super().requested(request, square_mm)
+        diameter_mm = request.diameter_mm
+        if diameter_mm is None:
+            spacing = 1.4 if request.asymmetric else 1.0
+            diameter_mm = round(_USUAL_DIAMETER * spacing * square_mm, 6)
+        return document | {
+            "diameter_m": side_metres("--diameter-mm", diameter_mm),
+            "asymmetric": request.asymmetric,
+        }
+
+    def file_name(self, target: Target, side: str) -> str:
+        """Name of a target with sides of `side`."""
+        return super().file_name(target, side) + ("_asymmetric" if target.asymmetric else "")
+
+    def around(self, target: Target, ids: IntArray, squares: FloatArray) -> Print:
+        """The print around centres, half way to the next circle."""
+        del squares
+        half = float(np.sqrt(0.5)) if target.asymmetric else 0.5
+        return Print(np.ones(len(ids)), np.inf, half, target.diameter_m / target.square_m / 2)
+
+    def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
+        """Refines (n, 2) detected centres [px] with these (n,) ids by the template."""
+        if len(px) >= MIN_CORNERS:
+            places = self.corners(target)[ids]
+            scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(
+                places - places.mean(axis=0)
+            )
+            if scale * target.diameter_m > 2 * _MOST_RADIUS_PX:
+                # Half of the size has edges of enough pixels.
+                half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
+                return Refined(2 * half.px + 0.5, 2 * half.sigma_px, half.reasons, 2 * half.blur_px)
+        return super().refine(image, target, ids, px)
+
+    def search(
+        self, image: Image, target: Target, *, quick: bool = False
+    ) -> DetectedCorners | NotFound:
+        """Centres in a (h, w) grey image, to about a pixel, or why there are none.
+
+        Circles are dark on light or, where no such grid is seen, light on dark. For a symmetric
+        grid, the numbering with the least rotation in the image is used.
+        """
+        del quick
+        seen = _seen_grids(image) or _seen_grids(255 - image)
+        for circles in seen:
+            if (circles.columns, circles.rows, circles.asymmetric) == (
+                target.columns,
+                target.rows,
+                target.asymmetric,
+            ):
+                share = target.diameter_m / target.square_m
+                if abs(circles.share / share - 1.0) > _DIAMETER + _SPREAD_PX / circles.diameter_px:
+                    return NotFound(
+                        f"the circles' diameter is {circles.share:.2f} of square_m, and the target "
+                        f"says {share:.2f}",
+                        misfit=True,
+                    )
+                return DetectedCorners(np.arange(len(circles.px)), circles.px)
+        layout = "asymmetric" if target.asymmetric else "symmetric"
+        requested = f"{layout} grid of {target.columns} x {target.rows} circles"
+        if not seen:
+            return NotFound(f"no board: no {requested} is seen")
+        best = seen[0]
+        return NotFound(
+            f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
+            "and the target is "
+            f" {_article(target.asymmetric)} one of {target.columns} x {target.rows}",
+            misfit=True,
+        )
+
+
+def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
+    """(n, 2) columns and rows of circles, row by row; for an asymmetric grid in half columns."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    return np.stack([2 * column + row % 2 if asymmetric else column, row], axis=1)
 
 
 def _article(asymmetric: bool) -> str:

@@ -47,10 +47,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
-from visioncal.vision.finders.imaging import shrunk
-from visioncal.vision.finders.maps import OpticalAxis, maps_about
-from visioncal.vision.targets import corner_positions, marked_squares, marker_cells
+from visioncal.core.types import FloatArray, Image, IntArray, Mask
+from visioncal.vision.boards.maps import OpticalAxis, maps_about
 
 _Float32Array: TypeAlias = npt.NDArray[np.float32]
 
@@ -61,7 +59,7 @@ _NOISE_LEFT = float(np.sum(_KERNEL**2)) ** 2
 # Half-width of the patch around a corner in squares, and its bounds [px].
 _HALF, _LEAST_PX, _MOST_PX = 0.42, 3.0, 20.0
 # Minimum number of corners for a homography.
-_MIN_CORNERS = 4
+MIN_CORNERS = 4
 # Margin around the outermost corners [px].
 _RIM_PX = 32
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
@@ -79,8 +77,6 @@ _TAG_CLEAR = (2.5, 1.5)
 _BENT_PX = 115.0
 # Margin around a circle as a share of its radius, and at least [px]; text may be near.
 _AROUND_CIRCLE, _AROUND_PX = 0.35, 4.0
-# Larger circles are fitted at half the image size.
-_MOST_RADIUS_PX = 20.0
 # Nodes per axis of the polynomial that interpolates a map over a window. With cubics, a fisheye's
 # slanted circles would err by up to 0.35 px.
 _NODES = 6
@@ -133,8 +129,8 @@ class Refined:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pattern:
-    """Print around n corners."""
+class Print:
+    """The print around n corners."""
 
     # (n,) colour of the squares where x y > 0: one sign for light. On a checkerboard, which may be
     # described rotated, either sign may be light; on an AprilGrid one sign stands for dark.
@@ -154,25 +150,8 @@ class _Pattern:
     # (n, 2, 2) from the board to each corner's own axes and units; None if these are the board's.
     axes: FloatArray | None = None
 
-    @classmethod
-    def of(cls, target: Target, ids: IntArray, board: FloatArray) -> Self:
-        if target.kind == "aprilgrid":
-            modules = len(marker_cells(target.dictionary, target.marker_id, target.border))
-            # A tag lies in turn below right, below left, ... of its corners.
-            return cls(np.where(ids % 2, -1.0, 1.0), target.border / (modules * target.spacing))
-        if target.kind == "circles":
-            radius = target.diameter_m / target.square_m / 2
-            # Half way to the next circle.
-            half = np.sqrt(0.5) if target.asymmetric else 0.5
-            return cls(np.ones(len(ids)), np.inf, float(half), radius)
-        odd = np.rint(board).astype(int).sum(axis=1) % 2
-        if target.kind == "checkerboard":
-            return cls(1.0 - 2.0 * odd, np.inf)
-        light = marked_squares(target)[0].sum() % 2
-        inset = (1.0 - target.marker_m / target.square_m) / 2
-        return cls(np.where(odd == light, 1.0, -1.0), inset)
-
     def at(self, chosen: IntArray) -> Self:
+        """The print around some of the corners."""
         lone, axes = (None if array is None else array[chosen] for array in (self.lone, self.axes))
         return replace(self, signs=self.signs[chosen], lone=lone, axes=axes)
 
@@ -201,7 +180,7 @@ class _Windows:
         px: FloatArray,
         good: Mask,
         chosen: IntArray,
-        pattern: _Pattern,
+        pattern: Print,
         axis: OpticalAxis,
     ) -> Self:
         """Cuts the windows of the chosen corners; the good corners determine the maps."""
@@ -330,29 +309,6 @@ class _GaussNewtonStep:
             getattr(self, field.name)[chosen] = getattr(others, field.name)
 
 
-def refine(image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
-    """Refines corners of a board; see the module's documentation.
-
-    Args:
-        image: (h, w) grey image.
-        target: Board.
-        ids: (n,) corner ids.
-        px: (n, 2) detected corners, to about a pixel [px].
-
-    Returns:
-        The corners, in the same order.
-    """
-    share = target.spacing if target.kind == "aprilgrid" else 1.0
-    board = corner_positions(target)[ids, :2] / (share * target.square_m)
-    if target.kind == "circles" and len(px) >= _MIN_CORNERS:
-        scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(board - board.mean(axis=0))
-        if scale * target.diameter_m / target.square_m > 2 * _MOST_RADIUS_PX:
-            # Half of the size has edges of enough pixels.
-            half = refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
-            return Refined(2 * half.px + 0.5, 2 * half.sigma_px, half.reasons, 2 * half.blur_px)
-    return _refine_part(image, _Pattern.of(target, ids, board), board, px)
-
-
 def refine_tags(
     image: Image, modules: int, px: FloatArray, board: FloatArray | None = None
 ) -> Refined:
@@ -377,7 +333,7 @@ def refine_tags(
     unit = float(np.mean(np.linalg.norm(sides, axis=2)))
     lengths = np.sum(sides**2, axis=2, keepdims=True)
     module = 1.0 / modules
-    pattern = _Pattern(
+    pattern = Print(
         inward.prod(axis=1),
         module,
         # Neighbouring corners determine lens distortion; a single tag does not.
@@ -390,15 +346,25 @@ def refine_tags(
     for clear in _TAG_CLEAR:
         for white in _TAG_WHITE:
             printed = replace(pattern, outside=white * module, clear=clear)
-            fits.append(_refine_part(image, printed, positions, start))
+            fits.append(refine(image, printed, positions, start))
         best = min(fits, key=lambda fit: (sum(map(bool, fit.reasons)), np.nansum(fit.sigma_px**2)))
         if not any(best.reasons):
             break
     return best
 
 
-def _refine_part(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) -> Refined:
-    """Refines (n, 2) corners in the part of the image that contains them."""
+def refine(image: Image, pattern: Print, board: FloatArray, px: FloatArray) -> Refined:
+    """Refines corners of a print; see the module's documentation.
+
+    Args:
+        image: (h, w) grey image.
+        pattern: The print around the corners.
+        board: (n, 2) their positions on the board [squares].
+        px: (n, 2) detected corners, to about a pixel [px].
+
+    Returns:
+        The corners, in the same order.
+    """
     low = np.maximum(np.floor(px.min(axis=0)).astype(int) - _RIM_PX, 0)
     high = np.ceil(px.max(axis=0)).astype(int) + _RIM_PX + 1
     axis = OpticalAxis.of(image.shape, low)
@@ -409,16 +375,19 @@ def _refine_part(image: Image, pattern: _Pattern, board: FloatArray, px: FloatAr
     # Failed corners may cause any numerical error; they are rejected afterwards.
     lock = _ONE_IMAGE if len(px) <= _FEW else nullcontext()
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"), lock:
-        if len(px) >= _MIN_CORNERS and spans_plane and part.size:
+        if len(px) >= MIN_CORNERS and spans_plane and part.size:
             refined = _refine_corners(part, pattern, board, px - low, axis)
             return replace(refined, px=refined.px + low)
-    unknown = np.full(len(px), np.nan)
-    reason = "the corners found are too few, or lie as no board's do"
-    return Refined(px, unknown, (reason,) * len(px), np.full(2, np.nan))
+    return unrefined(px, "the corners found are too few, or lie as no board's do")
+
+
+def unrefined(px: FloatArray, reason: str) -> Refined:
+    """The detector's corners, where none was fitted, and why."""
+    return Refined(px, np.full(len(px), np.nan), (reason,) * len(px), np.full(2, np.nan))
 
 
 def _refine_corners(
-    image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray, axis: OpticalAxis
+    image: Image, pattern: Print, board: FloatArray, px: FloatArray, axis: OpticalAxis
 ) -> Refined:
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
@@ -468,7 +437,7 @@ def _refine_corners(
     )
 
 
-def _estimate_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, float]:
+def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float]:
     """(2,) median edge widths of the smoothed image [px], and the circles' radius."""
     side_px = 1.0 / np.median(windows.widths)
     # A larger start would exclude all white around a lone corner.
@@ -494,7 +463,7 @@ def _estimate_blur(windows: _Windows, pattern: _Pattern) -> tuple[FloatArray, fl
 
 def _fit_positions(
     windows: _Windows,
-    pattern: _Pattern,
+    pattern: Print,
     blur_px: FloatArray,
     slopes: FloatArray | None,
     first: _GaussNewtonStep,
@@ -524,7 +493,7 @@ def _limited(shift: FloatArray) -> FloatArray:
 
 def _step(
     windows: _Windows,
-    pattern: _Pattern,
+    pattern: Print,
     shift: FloatArray,
     blur_px: FloatArray,
     slopes: FloatArray | None = None,
@@ -537,7 +506,7 @@ def _step(
 
 def _steps(
     windows: _Windows,
-    pattern: _Pattern,
+    pattern: Print,
     shift: FloatArray,
     blur_px: FloatArray,
     lights: Sequence[FloatArray | None],
@@ -581,7 +550,7 @@ def _steps(
         columns += [(1 - product / 4) * array for array in (x, y)]
         # The corners of a single tag do not determine how lens distortion bends its sides.
         if (
-            windows.neighbours.shape[1] == _MIN_CORNERS
+            windows.neighbours.shape[1] == MIN_CORNERS
             and np.median(windows.widths) * _BENT_PX < 1.0
         ):
             columns += [y * derivatives[0], x * derivatives[1]]
@@ -614,7 +583,7 @@ def _steps(
 
 
 def _crossing(
-    pattern: _Pattern,
+    pattern: Print,
     x: _Float32Array,
     y: _Float32Array,
     sx: _Float32Array,
@@ -642,7 +611,7 @@ def _crossing(
 
 
 def _circle(
-    pattern: _Pattern, x: _Float32Array, y: _Float32Array, sx: _Float32Array, sy: _Float32Array
+    pattern: Print, x: _Float32Array, y: _Float32Array, sx: _Float32Array, sy: _Float32Array
 ) -> tuple[_Float32Array, ...]:
     """A disc, likewise; its last derivative is with respect to the radius."""
     distance = np.hypot(x, y) + np.float32(1e-6)

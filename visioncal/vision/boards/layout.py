@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image
-from visioncal.vision.targets import aruco_dictionary
+from visioncal.vision.boards.kind import aruco_dictionary
 
 # Largest rms distance of markers from a homography, in marker sides. Lens distortion and noise stay
 # under 0.1; another layout moves every second row by more than a side.

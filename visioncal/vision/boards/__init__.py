@@ -1,0 +1,53 @@
+"""Kinds of targets: one class in one file for each, and their detection in images."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.vision.boards.aprilgrid import APRILGRID
+from visioncal.vision.boards.charuco import CHARUCO
+from visioncal.vision.boards.checkerboard import CHECKERBOARD
+from visioncal.vision.boards.circles import CircleGrid
+from visioncal.vision.boards.imaging import blur_at_corners
+from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
+from visioncal.vision.boards.marker import MarkerKind
+from visioncal.vision.boards.points import Rig
+
+__all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "kind_of"]
+
+KINDS: Mapping[TargetKind, BoardKind] = {
+    kind.name: kind
+    for kind in (CHARUCO, CHECKERBOARD, APRILGRID, CircleGrid(), MarkerKind(), Rig())
+}
+
+
+def kind_of(target: Target) -> BoardKind:
+    """The kind of a target."""
+    return KINDS[target.kind]
+
+
+def find_target(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
+    """Detects a target's corners in a (h, w) grey image, to sub-pixel accuracy.
+
+    Returns the corners, or why there are none. With `quick`, detection of a board stops if a first,
+    quick search fails.
+    """
+    return kind_of(target).find(image, target, quick=quick)
+
+
+def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> float:
+    """Edge width at detected corners, in the same image or another one of them.
+
+    Args:
+        image: (h, w) grey image.
+        target: Detected target.
+        ids: (n,) corner ids, n >= 1.
+        px: (n, 2) corners, to about a pixel [px].
+
+    Returns:
+        The width as a Gaussian's sigma; on a board, in the direction of the wider edges, as motion
+        smears one direction only [px].
+    """
+    blur_px = float(kind_of(target).refine(image, target, ids, px).blur_px.max())
+    return blur_px if np.isfinite(blur_px) else blur_at_corners(image, px)

@@ -1,0 +1,106 @@
+"""Boards whose corners a template refines, found by quick searches where these suffice."""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import ClassVar
+
+import cv2
+import numpy as np
+
+from visioncal.core.types import Corners, FloatArray, Image, IntArray, Target
+from visioncal.vision.boards.imaging import shrunk
+from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
+from visioncal.vision.boards.template import Print, Refined, refine
+
+# Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
+# fewer than these fit, all corners of the detector are used, with a tenth of the weight: their
+# accuracy relative to the template's in the median.
+_FEWEST_FITTED, _LEAST_FITTED, DETECTED_WEIGHT = 6, 0.5, 0.1
+
+
+class Board(BoardKind):
+    """A kind of board, refined by the template."""
+
+    # Images with longer sides are searched at half size first, and above twice that at a quarter:
+    # detection time is proportional to pixels [px].
+    long_side_px: ClassVar[int] = 2000
+    # Whether there is a search that takes a third of the time and detects less.
+    has_quick_search: ClassVar[bool] = False
+
+    @abstractmethod
+    def search(
+        self, image: Image, target: Target, *, quick: bool = False
+    ) -> DetectedCorners | NotFound:
+        """Detects corners in a (h, w) grey image, to about a pixel, or says why there are none."""
+
+    @abstractmethod
+    def around(self, target: Target, ids: IntArray, squares: FloatArray) -> Print:
+        """The print around corners at (n, 2) `squares`, in units of `unit_m`."""
+
+    def unit_m(self, target: Target) -> float:
+        """Length that is one in the template [m]."""
+        return target.square_m
+
+    def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
+        """Refines (n, 2) detected corners [px] with these (n,) ids by the template."""
+        squares = self.corners(target)[ids, :2] / self.unit_m(target)
+        return refine(image, self.around(target, ids, squares), squares, px)
+
+    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+        """Corners by a quick search, or in a reduced copy if that finds the whole board."""
+        for factor in self._factors(image):
+            small = image if factor == 1 else shrunk(image, factor)
+            seen = self.search(small, target, quick=self.has_quick_search)
+            if isinstance(seen, DetectedCorners) and not len(
+                hidden_corners(seen, small.shape, self.corners(target) / target.square_m)
+            ):
+                # From pixel centres of the small image to those of the large one.
+                px = factor * seen.px + (factor - 1) / 2
+                refined = self._refined(image, target, DetectedCorners(seen.ids, px))
+                if refined.weights is None:
+                    return refined
+            if quick and isinstance(seen, NotFound):
+                return seen
+        seen = self.search(image, target)
+        return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
+
+    def _factors(self, image: Image) -> Iterator[int]:
+        """Factors by which the image is reduced for quick searches."""
+        for factor in (4, 2):
+            if max(image.shape) > factor // 2 * self.long_side_px and min(image.shape) >= factor:
+                yield factor
+        if self.has_quick_search:
+            yield 1
+
+    def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
+        refined = self.refine(image, target, seen.ids, seen.px)
+        fitted = np.array([not reason for reason in refined.reasons])
+        if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
+            return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
+        return DetectedCorners(
+            seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
+        )
+
+
+def hidden_corners(
+    seen: DetectedCorners | Corners, shape: tuple[int, ...], squares: FloatArray
+) -> IntArray:
+    """Ids (n,) of undetected corners that the image should contain with the squares around them.
+
+    `squares` are the positions of all corners [squares]. If the detected corners are too few to
+    locate the board, these are all others.
+    """
+    places = squares[:, :2]
+    missing = np.setdiff1d(np.arange(len(places)), seen.ids)
+    if not len(missing):
+        return missing
+    homography = cv2.findHomography(places[seen.ids], seen.px)[0] if len(seen.ids) > 3 else None
+    if homography is None:
+        return missing
+    # Detecting a corner requires both markers beside it.
+    around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    depth = around @ homography[2, :2] + homography[2, 2]
+    px = (around @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None]
+    inside = (depth > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
+    return np.asarray(missing[inside.all(axis=1)])

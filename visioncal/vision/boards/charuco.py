@@ -1,0 +1,487 @@
+"""ChArUco boards: a checkerboard with markers in its light squares."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from typing import Any, ClassVar, TypeAlias
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import DocumentTable
+from visioncal.core.number_format import listed
+from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.vision.boards.board import Board
+from visioncal.vision.boards.checkerboard import measure_squares, square_corners
+from visioncal.vision.boards.identity import LEAST_MARKERS, Identity, Marker, holding
+from visioncal.vision.boards.kind import (
+    DEFAULT_RELATIVE_SIGMA,
+    BoardRequest,
+    Cells,
+    DetectedCorners,
+    NotFound,
+    OnSheet,
+    aruco_dictionary,
+    counts_of,
+    dictionary_size,
+    marker_cells,
+    side_metres,
+    sigma_of,
+    size_of,
+)
+from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit
+from visioncal.vision.boards.template import Print
+
+# A homography has eight unknowns and a marker gives eight equations: three are a check.
+_LAYOUT_MARKERS = 3
+
+# Points on a marker's side to which distances are measured.
+_ALONG = 7
+# Distance of a window from a marker's side: its blur, and a pixel for gradients.
+_CLEAR_PX = 2.0
+# Half-widths of the windows of corner refinement: smaller ones have too few gradients, and in
+# larger ones lens distortion bends the squares' sides.
+_WINDOWS_PX = (2, 10)
+_ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+# Thresholding window of a quick search: of 7 to 31, it detected most markers at squares of 20 to 70
+# px.
+_QUICK_PX = 7
+
+# (4, 2) corners [px] by marker id.
+_Markers: TypeAlias = Mapping[int, FloatArray]
+# Usual range of marker side over square side; ratio at which markers cannot be read; smallest
+# square with such markers [m]; other units [m].
+_MARKERS, _UNREADABLE, _SMALLEST_SQUARE_M = (0.4, 0.95), 0.1, 5e-3
+_UNITS = {"mm": 1e-3, "inches": 0.0254, "cm": 1e-2}
+# Marker side over square side: at least one module of white on every side; squares from which it is
+# whole millimetres [mm]; usual dictionaries.
+_MARKER_SHARE, _COARSE_MM = 0.75, 10
+_USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
+# Printable boards have fewer columns than the last.
+_LEAST_COLUMNS, _MOST_COLUMNS = 3, 40
+# Steps between markers up to this length, and this close to whole squares, are counted [squares].
+_NEAR, _OFF = 2.5, 0.3
+_SHARES, _SHARE_STEPS = (0.25, 0.98), 3
+# A marker's corners around its centre [sides].
+_AROUND = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+# Largest number of rows; share of the squares below a row that are to be seen, and of the contrast
+# above it.
+_MOST_ROWS, _HALF = 100, 0.5
+# Number of markers in place that prove a board without its corners; number of layouts listed.
+_SURE_MARKERS, _MOST_TIED = 8, 4
+# Error of a marker's side over a square's by lens and paper; sum of the shifts of two opposite
+# corners by blur, over-exposure and ink [px].
+_SHARE_SIGMA, _OUTLINE_PX = 0.03, 1.0
+
+
+class Charuco(Board):
+    """A ChArUco board. Its origin is the outer corner of square 0."""
+
+    name: ClassVar[TargetKind] = "charuco"
+    keys = "columns rows square_m square_sigma_m marker_m dictionary legacy"
+    has_markers = marks_squares = is_seen_in_part = is_dense = has_quick_search = True
+
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary and legacy."""
+        columns, rows = counts_of(table)
+        _check_one_unit(table)
+        square_m = size_of(table, "square_m")
+        sigma_m = sigma_of(table, square_m)
+        marker_m = table.number("marker_m", positive=True)
+        # OpenCV compares the sides in single precision.
+        if marker_m >= square_m or not 0.0 < np.float32(marker_m) < np.float32(square_m):
+            raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
+        dictionary = table.text("dictionary")
+        markers, needed = dictionary_size(table, dictionary), columns * rows // 2
+        if markers < needed:
+            raise DataError(
+                f"{table.label}: dictionary {dictionary} has {markers} markers; a board of "
+                f"{columns} x {rows} squares needs {needed}.",
+                culprits=[f"{table.label}: dictionary"],
+            )
+        legacy = table.flag("legacy", default=False)
+        return Target(
+            name, self.name, columns, rows, square_m, sigma_m, marker_m, dictionary, legacy
+        )
+
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) inner corners [m], row by row."""
+        return square_corners(target, 1)
+
+    def words(self, target: Target, size: str) -> str:
+        """The board in a few words."""
+        layout = ", legacy layout" if target.legacy else ""
+        return f"ChArUco board of {size} squares, {target.dictionary}{layout}"
+
+    def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
+        """Low and high x, y of the print [m]."""
+        return np.zeros(2), target.square_m * np.array([target.columns, target.rows], dtype=float)
+
+    def cells(self, target: Target) -> tuple[Cells, ...]:
+        """Its dark squares, and the markers in the light ones."""
+        light = marked_squares(target)
+        dark = np.ones((target.rows, target.columns), dtype=bool)
+        dark[light[:, 1], light[:, 0]] = False
+        grids = [Cells(np.zeros(2), target.square_m, dark)]
+        inset = (target.square_m - target.marker_m) / 2
+        for marker_id, square in enumerate(light):
+            cells = marker_cells(target.dictionary, marker_id)
+            corner_m = target.square_m * square + inset
+            grids.append(Cells(corner_m, target.marker_m / len(cells), cells))
+        return tuple(grids)
+
+    def on_sheet(self, target: Target) -> OnSheet:
+        """What a printed sheet says of it."""
+        layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
+        return OnSheet(
+            f"ChArUco, {target.columns} x {target.rows} squares of {1e3 * target.square_m:g} mm, "
+            f"markers of {1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}",
+            "the print's top left corner",
+            measure_squares(target, target.columns),
+        )
+
+    def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
+        """The description of a requested board; markers of three quarters of a square."""
+        # Refuses sides out of range first.
+        document = super().requested(request, square_mm)
+        marker_mm = request.marker_mm
+        if marker_mm is None:
+            # Below ten millimetres whole numbers are too coarse; rounded to a nanometre.
+            marker_mm = round(_MARKER_SHARE * square_mm, 6)
+            marker_mm = float(int(marker_mm)) if square_mm >= _COARSE_MM else marker_mm
+        needed = (request.columns or 0) * (request.rows or 0) // 2
+        large = (name for name in _USUAL if len(aruco_dictionary(name).bytesList) >= needed)
+        return document | {
+            "marker_m": side_metres("--marker-mm", marker_mm),
+            "dictionary": request.dictionary or next(large, _USUAL[-1]),
+            "legacy": request.legacy,
+        }
+
+    def file_name(self, target: Target, side: str) -> str:
+        """Name of a target with sides of `side`."""
+        return super().file_name(target, side) + ("_legacy" if target.legacy else "")
+
+    def around(self, target: Target, ids: IntArray, squares: FloatArray) -> Print:
+        """The print around corners, without the markers."""
+        del ids
+        odd = np.rint(squares).astype(int).sum(axis=1) % 2
+        light = marked_squares(target)[0].sum() % 2
+        inset = (1.0 - target.marker_m / target.square_m) / 2
+        return Print(np.where(odd == light, 1.0, -1.0), inset)
+
+    def search(
+        self, image: Image, target: Target, *, quick: bool = False
+    ) -> DetectedCorners | NotFound:
+        """Chessboard corners, or why there are none (Garrido-Jurado et al. 2014; OpenCV).
+
+        OpenCV's check of interpolated corners against neighbouring markers is off, as it drops
+        whole boards at steep tilts; the residual of the pose replaces it later. With `quick`, one
+        window size of thresholding, which finds most markers, takes the place of OpenCV's three.
+        """
+        board = charuco_board(target)
+        parameters = cv2.aruco.CharucoParameters()
+        parameters.checkMarkers = False
+        marker_parameters = cv2.aruco.DetectorParameters()
+        if quick:
+            marker_parameters.adaptiveThreshWinSizeMin = (
+                marker_parameters.adaptiveThreshWinSizeMax
+            ) = _QUICK_PX
+        detector = cv2.aruco.CharucoDetector(board, parameters, marker_parameters)
+        px, ids, marker_px, marker_ids = detector.detectBoard(image)
+        if not marker_px:
+            return NotFound(f"no board: no marker of {target.dictionary} is seen")
+        if len(marker_px) - len(np.unique(marker_ids)) >= _LAYOUT_MARKERS:
+            # The corners could be of either board, or of both.
+            return NotFound(
+                "markers are seen twice: another board with the same markers is in the image"
+            )
+        if _misfit(_by_id(marker_px, marker_ids), target) > LAYOUT_MISFIT:
+            return NotFound("the markers do not lie as the target describes them", misfit=True)
+        if np.size(ids) == 0 or px is None:
+            return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
+        order = np.argsort(ids.ravel())
+        detected = px.reshape(-1, 2)[order].astype(np.float64)
+        return DetectedCorners(
+            ids.ravel()[order].astype(np.int64), _refined(image, detected, marker_px)
+        )
+
+    def variants(self, image: Image, target: Target) -> tuple[Target, ...]:
+        """Targets with the other corner layout, columns and rows exchanged, or both."""
+        transposed = replace(target, columns=target.rows, rows=target.columns)
+        variants = [
+            replace(target, legacy=not target.legacy),
+            transposed,
+            replace(transposed, legacy=not target.legacy),
+        ]
+        dictionary = charuco_board(target).getDictionary()
+        marker_px, marker_ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+        if not marker_px:
+            return ()
+        markers = _by_id(marker_px, marker_ids)
+        candidates = [
+            variant
+            for variant in variants
+            if len(_matches(markers, variant)[0]) >= 4 * _LAYOUT_MARKERS
+        ]
+        return tuple(
+            variant for variant in candidates if _misfit(markers, variant) <= LAYOUT_MISFIT
+        )
+
+    def identify(self, image: Image, markers: Sequence[Marker]) -> list[Identity]:
+        """Boards by the markers of each family."""
+        families = sorted({marker.family for marker in markers})
+        boards = (
+            _identified(image, [marker for marker in markers if marker.family == family])
+            for family in families
+        )
+        return [board for board in boards if board is not None]
+
+
+CHARUCO = Charuco()
+
+
+def marked_squares(target: Target) -> IntArray:
+    """(m, 2) light squares of a ChArUco board as column and row, by marker id."""
+    # Markers are on the light squares.
+    places = np.asarray(charuco_board(target).getObjPoints(), dtype=float)[..., :2]
+    return np.asarray(np.floor(places.mean(axis=1) / target.square_m), dtype=np.int64)
+
+
+# Cached, as OpenCV warns of a narrow rim around the markers whenever it builds the board.
+@lru_cache(maxsize=64)
+def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+    """OpenCV's board for a ChArUco target."""
+    board = cv2.aruco.CharucoBoard(
+        (target.columns, target.rows),
+        target.square_m,
+        target.marker_m,
+        aruco_dictionary(target.dictionary),
+    )
+    board.setLegacyPattern(target.legacy)
+    return board
+
+
+def _check_one_unit(table: DocumentTable) -> None:
+    """Raises an error if squares and markers have different units, judged by their ratio."""
+    square, marker = (table.number(name, positive=True) for name in ("square_m", "marker_m"))
+    if _UNREADABLE * square < marker < square:
+        return
+    low, high = _MARKERS
+    for unit, size_m in _UNITS.items():
+        for key, marker_m, square_m in (
+            ("square_m", marker, square * size_m),
+            ("marker_m", marker * size_m, square),
+        ):
+            corrected = square_m if key == "square_m" else marker_m
+            if low * square_m < marker_m < high * square_m and square_m > _SMALLEST_SQUARE_M:
+                raise DataError(
+                    f"{table.label}: square_m is {square:g} and marker_m is {marker:g}; one is in "
+                    f"another unit: with {key} in {unit}, and not in metres, a marker is "
+                    f"{marker_m / square_m:.2f} of a square, as usual.",
+                    culprits=[f"{table.label}: {key}"],
+                    next_step=f"In the target's .toml, write {key} = {corrected:.6g}.",
+                )
+
+
+def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:
+    """Refines (n, 2) corners [px] in windows that exclude the markers."""
+    # OpenCV's windows depend on the distance of a marker's corner only: in small, slanted or bent
+    # squares they include a marker's sides, which bias the corner by up to half a pixel.
+    corners = np.reshape(np.array(marker_px, dtype=float), (-1, 4, 2))
+    sides = np.roll(corners, -1, axis=1) - corners
+    side_points = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]
+    distances, _ = KDTree(side_points.reshape(-1, 2)).query(px, p=np.inf)
+    windows = np.clip(distances - _CLEAR_PX, *_WINDOWS_PX).astype(int)
+    refined = px.astype(np.float32)
+    for window in np.unique(windows).tolist():
+        mask = windows == window
+        start = refined[mask].reshape(-1, 1, 2).copy()
+        refined_px = cv2.cornerSubPix(image, start, (window, window), (-1, -1), _ENDS)
+        refined[mask] = refined_px.reshape(-1, 2)
+    return refined.astype(np.float64)
+
+
+def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
+    return {
+        int(marker): np.asarray(px, dtype=float).reshape(4, 2)
+        for marker, px in zip(np.ravel(marker_ids), marker_px, strict=True)
+    }
+
+
+def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]:
+    """Corners of the detected markers on the board [m], and in the image [px]."""
+    board = charuco_board(target)
+    ids = np.ravel(np.asarray(board.getIds()))
+    places = dict(zip(ids.tolist(), board.getObjPoints(), strict=True))
+    on_target = [marker for marker in markers if marker in places]
+    if not on_target:
+        return np.empty((0, 2)), np.empty((0, 2))
+    on_board = np.concatenate([places[marker][:, :2] for marker in on_target])
+    return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in on_target])
+
+
+def _misfit(markers: _Markers, target: Target) -> float:
+    on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(markers, target))
+    return layout_misfit(on_board, in_image) if len(on_board) >= _LAYOUT_MARKERS else 0.0
+
+
+def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
+    """Identifies a ChArUco board from the markers of one family, with false positives.
+
+    The ids count the white squares row by row: columns and layout predict the step from each marker
+    to its neighbours. Steps are measured in the frame of the marker itself, where perspective and
+    lens hardly count. Where too few rows are seen to determine the columns, several layouts predict
+    them; corners decide, or a note names the others.
+    """
+    if len(markers) < LEAST_MARKERS:
+        return None
+    ids = np.array([marker.number for marker in markers])
+    px = np.array([marker.px for marker in markers])
+    centres = np.array([marker.centre for marker in markers])
+    sides = np.stack(
+        [px[:, 1] + px[:, 2] - px[:, 0] - px[:, 3], px[:, 2:].sum(1) - px[:, :2].sum(1)]
+    )
+    own_from_px = 2.0 * np.linalg.pinv(np.moveaxis(sides, 0, -1))
+    # (n, n, 2) steps [marker sides].
+    steps = np.einsum("iab,ijb->ija", own_from_px, centres - centres[:, None])
+    lengths = np.abs(steps).max(axis=2) + np.diag(np.full(len(ids), np.inf))
+    sides_away = max(float(np.median(lengths.min(axis=1))), 1e-9)
+    agreeing = {}
+    # The nearest marker is one square away along both axes, or two where some are not read.
+    for share in (1.0 / sides_away, 2.0 / sides_away):
+        whole = np.rint(share * steps)
+        near = whole.any(axis=2) & (share * lengths < _NEAR)
+        near &= (np.abs(share * steps - whole) < _OFF).all(axis=2)
+        for columns, legacy in product(range(_LEAST_COLUMNS, _MOST_COLUMNS + 1), (False, True)):
+            places = _places(ids, columns, legacy=legacy)
+            pairs = near & (places - places[:, None] == whole).all(axis=2)
+            agreeing[share, columns, legacy] = pairs
+    most = max(int(pairs.sum()) for pairs in agreeing.values())
+    tied = [layout for layout, pairs in agreeing.items() if pairs.sum() == most]
+    boards = []
+    for share, columns, legacy in tied[:_MOST_TIED]:
+        fits = agreeing[share, columns, legacy].any(axis=1)
+        # At most half of the markers may be false positives.
+        if fits.sum() >= max(LEAST_MARKERS, len(ids) / 2):
+            fitting = [markers[index] for index in np.flatnonzero(fits).tolist()]
+            boards.append(_charuco_of(image, fitting, columns, share, legacy=legacy))
+    found = sorted(filter(None, boards), key=lambda board: -board.corners_seen)
+    rivals = [board for board in found[1:] if board.corners_seen == found[0].corners_seen]
+    if not rivals:
+        return next(iter(found), None)
+    layouts = ", ".join(
+        f"{rival.columns} x {rival.rows}{' in the legacy layout' if rival.legacy else ''}"
+        for rival in (identity.board for identity in rivals)
+    )
+    note = f"What is seen of it fits {layouts} as well: show more of the board."
+    return replace(found[0], whole=False, notes=(note, *found[0].notes))
+
+
+def _places(ids: IntArray, columns: int, *, legacy: bool) -> FloatArray:
+    """Squares (x, y) of the markers with these ids, (n, 2)."""
+    # Two rows together have one marker per column, the first row the smaller half unless legacy.
+    first = (columns + legacy) // 2
+    pair, within = np.divmod(ids, columns)
+    lower = within >= first
+    place = np.where(lower, within - first, within)
+    # In the upper row of a pair the markers are in the odd columns, or the even ones if legacy.
+    start = np.where(lower == legacy, 1, 0)
+    return np.stack([2 * place + start, 2 * pair + lower], axis=1).astype(float)
+
+
+def _charuco_of(
+    image: Image, markers: Sequence[Marker], columns: int, share: float, *, legacy: bool
+) -> Identity | None:
+    """The board of a layout that markers fit, with the corners of its detector; None without.
+
+    Args:
+        image: (h, w) grey image.
+        markers: The markers.
+        columns: Number of squares along x.
+        share: Marker side over square side, approximately.
+        legacy: Whether square 0 holds a marker.
+    """
+    ids = np.array([marker.number for marker in markers])
+    squares = _places(ids, columns, legacy=legacy)
+    rows = int(squares[:, 1].max()) + 1
+    quads = np.array([marker.px for marker in markers])
+    for _ in range(_SHARE_STEPS):
+        places = (squares + 0.5)[:, None] + share * _AROUND
+        fit = cv2.findHomography(places.reshape(-1, 2), quads.reshape(-1, 2))[0]
+        px_from_board = np.asarray(fit, dtype=float)
+        if px_from_board.shape != (3, 3) or np.linalg.matrix_rank(px_from_board) < 3:
+            return None
+        seen_places = cv2.perspectiveTransform(quads, np.linalg.inv(px_from_board))
+        areas = [cv2.contourArea(quad.astype(np.float32)) for quad in seen_places]
+        share = float(np.sqrt(np.median(areas)))
+    rows, whole = _rows(image, px_from_board, columns, rows, share)
+    if legacy and rows % 2:
+        # A legacy board with an odd number of rows does not start with a marker.
+        rows, whole = rows + 1, False
+    names = holding(markers[0].family, max(columns * rows // 2, int(ids.max()) + 1))
+    if not _SHARES[0] < share < _SHARES[1] or not names:
+        return None
+    notes = []
+    if not whole:
+        notes.append(f"The board may go on below row {rows}: its end there is not in the image.")
+    if len(names) > 1:
+        notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this board.")
+    if rows % 2 and whole:
+        notes.append("With an odd number of rows the legacy layout is the same as the present one.")
+    square_px = float(np.median([marker.side_px for marker in markers])) / share
+    board = Target(
+        "board",
+        "charuco",
+        columns,
+        rows,
+        1.0,
+        DEFAULT_RELATIVE_SIGMA,
+        share,
+        names[0],
+        legacy,
+    )
+    identity = Identity(
+        board,
+        whole,
+        0,
+        (columns - 1) * (rows - 1),
+        names[1:],
+        float(np.hypot(_SHARE_SIGMA * share, _OUTLINE_PX / square_px)),
+        tuple(sorted(set(ids.tolist()))),
+        tuple(notes),
+    )
+    seen = CHARUCO.search(image, replace(board, marker_m=round(share, 5)))
+    if isinstance(seen, DetectedCorners):
+        return replace(identity, corners_seen=len(seen.ids))
+    if len(markers) < _SURE_MARKERS:
+        return None
+    return replace(
+        identity, notes=(f"Its corners are not found in this image: {seen.reason}.", *notes)
+    )
+
+
+def _rows(
+    image: Image, px_from_board: FloatArray, columns: int, least: int, share: float
+) -> tuple[int, bool]:
+    """Counts rows beyond the decoded markers, and whether the image shows the board's end.
+
+    Below the last row the squares do not alternate. Their rims are compared, beside any markers.
+    """
+    squares, rim = np.arange(columns), (1.0 - share) / 4
+    for rows in range(least, _MOST_ROWS):
+        sides = np.array([rows - rim, rows + rim])
+        places = np.stack(np.meshgrid(squares + 0.5, sides), axis=-1)
+        px = cv2.perspectiveTransform(places, px_from_board).astype(np.float32)
+        inside = np.asarray((px > 0) & (px < np.array(image.shape[::-1]) - 1))
+        shown = np.all(inside, axis=(0, 2))
+        if shown[::2].mean() < _HALF or shown[1::2].mean() < _HALF:
+            return rows, False
+        levels = cv2.remap(image, px[:, shown, 0], px[:, shown, 1], cv2.INTER_LINEAR)
+        even = squares[shown] % 2 == 0
+        above, below = np.median(levels[:, even], axis=1) - np.median(levels[:, ~even], axis=1)
+        if -np.sign(above) * below < _HALF * abs(above):
+            return rows, True
+    return _MOST_ROWS, False

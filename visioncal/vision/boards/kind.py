@@ -1,0 +1,282 @@
+"""A kind of target: one class in one file, which reads, places, draws, finds and identifies it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import DocumentTable
+from visioncal.core.number_format import did_you_mean
+from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target, TargetKind
+from visioncal.vision.boards.imaging import MOST_PIXELS
+from visioncal.vision.boards.template import Refined, unrefined
+
+if TYPE_CHECKING:
+    from visioncal.vision.boards.identity import Identity, Marker
+
+# Relative sigma of a square by default: the scale error of office printers.
+DEFAULT_RELATIVE_SIGMA = 1e-3
+# Smallest sigma, even for squares etched in glass.
+LEAST_SIGMA_M = 1e-8
+# Largest printed square [m]. Larger numbers are in millimetres, those up to the second limit in
+# centimetres or inches, as no square of so few millimetres is printed.
+LARGEST_M, _LARGEST_IN_CM = 1.0, 4.0
+# Smallest side that can be measured to 0.1 % [mm].
+_SMALLEST_MM = 0.1
+# Fewer squares do not determine a pose robustly; more do not fit a printable board.
+FEWEST_SQUARES, MOST_SQUARES = 3, 100
+# Quiet zone that detectors need around squares; markers need one module [m].
+_QUIET_M = 0.0025
+# Fields of targets with other names than their keys.
+_FIELDS = {"id": "marker_id", "size_m": "square_m"}
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedCorners:
+    """Detected corners."""
+
+    ids: IntArray  # (n,) corner ids, ascending.
+    px: FloatArray  # (n, 2) positions [px].
+    # (n,) accuracy relative to the usual one, as the ratio of standard deviations; None if all are
+    # usual.
+    weights: FloatArray | None = None
+    # Edge width as a Gaussian's sigma, in the direction of the wider edges [px]; None if not
+    # measured.
+    blur_px: float | None = None
+
+
+@dataclass(frozen=True)
+class NotFound:
+    """Why the target was not found, in words; `misfit` if another layout was seen instead."""
+
+    reason: str
+    misfit: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A grid of dark and light cells."""
+
+    corner_m: FloatArray  # (2,) outer corner of the first cell in the target's frame [m].
+    cell_m: float  # Side of a cell [m].
+    dark: Mask  # (rows, columns) mask of dark cells.
+    # (2, 2) rotation, with the directions of the grid's columns and rows as columns.
+    turn: FloatArray = field(default_factory=lambda: np.eye(2))
+
+
+@dataclass(frozen=True)
+class BoardRequest:
+    """Requirements of a board; None and empty texts are chosen automatically."""
+
+    kind: TargetKind  # Kind of target.
+    # Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
+    # x.
+    columns: int | None = None
+    rows: int | None = None  # Likewise along y.
+    # Side of a square, or of the marker for a single marker and an AprilGrid [mm].
+    square_mm: float | None = None
+    marker_mm: float | None = None  # Side of the markers in a ChArUco board [mm].
+    dictionary: str = ""  # ArUco dictionary by OpenCV's name.
+    legacy: bool = False  # Whether a ChArUco board has OpenCV's layout before 4.6.
+    marker_id: int | None = None  # Id of a single marker; the smallest one of an AprilGrid.
+    name: str = ""  # Name of the target.
+    spacing: float | None = None  # Gap between the tags of an AprilGrid, as a share of their side.
+    border: int | None = None  # Number of dark modules around their bits.
+    diameter_mm: float | None = None  # Diameter of circles [mm].
+    asymmetric: bool = False  # Whether every second row of circles is shifted.
+
+
+@dataclass(frozen=True)
+class OnSheet:
+    """What a printed sheet says of a board."""
+
+    words: str  # Description of the board.
+    origin: str  # Where the origin of its frame is.
+    measure: str  # How to measure its size.
+
+
+class BoardKind(ABC):
+    """A kind of target. Its instance has no state: everything is in the `Target`."""
+
+    name: ClassVar[TargetKind]
+    # Keys of its description besides `kind`; the one of its size, what that is, and what has it.
+    keys: ClassVar[str] = "columns rows square_m square_sigma_m"
+    size_key: ClassVar[str] = "square_m"
+    side: ClassVar[str] = "side of a square"
+    sides: ClassVar[str] = "squares"
+    unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
+    # Whether it has markers, whose bits are told apart from their mirror image.
+    has_markers: ClassVar[bool] = False
+    # Whether some of its corners can be detected without the others.
+    is_seen_in_part: ClassVar[bool] = False
+    # Whether its markers are in the light squares of a checkerboard.
+    marks_squares: ClassVar[bool] = False
+    fewest: ClassVar[int] = 6  # Corners that a view needs, or all of fewer.
+    # Whether its squares alternate over the whole board, for the fit to all pixels.
+    is_dense: ClassVar[bool] = False
+    # What a turn has to map to itself to leave the print as it was; empty where no turn does.
+    symmetric: ClassVar[Literal["", "squares", "places"]] = ""
+    most_pixels: ClassVar[int] = MOST_PIXELS  # Largest image that is searched.
+
+    @abstractmethod
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads its description.
+
+        Raises:
+            DataError: A field is missing, of another type, or out of range.
+        """
+
+    @abstractmethod
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) corners in the target's frame [m], by id."""
+
+    @abstractmethod
+    def words(self, target: Target, size: str) -> str:
+        """The target in a few words, with its columns and rows as `size`."""
+
+    @abstractmethod
+    def cells(self, target: Target) -> tuple[Cells, ...]:
+        """Dark areas; those of two grids share at most a point.
+
+        Raises:
+            DataError: It cannot be printed.
+        """
+
+    @abstractmethod
+    def on_sheet(self, target: Target) -> OnSheet:
+        """What a printed sheet says of it."""
+
+    @abstractmethod
+    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+        """Its corners in a (h, w) grey image; see `find_target`."""
+
+    def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
+        """Refines (n, 2) detected corners [px] with these (n,) ids by the template."""
+        del image, target, ids
+        return unrefined(px, "no template fits corners of this kind")
+
+    def document(self, target: Target) -> dict[str, Any]:
+        """The target as the content of a `.toml` that `read` can read."""
+        return {key: getattr(target, _FIELDS.get(key, key)) for key in self.keys.split()}
+
+    def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
+        """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
+        places = self.corners(target)[:, :2]
+        return places.min(axis=0), places.max(axis=0)
+
+    def discs(self, target: Target) -> FloatArray:
+        """(n, 2) centres of dark discs [m], of the target's diameter."""
+        del target
+        return np.zeros((0, 2))
+
+    def quiet_m(self, cells: Sequence[Cells]) -> float:
+        """Width of the white that it needs around its cells [m]."""
+        del cells
+        return _QUIET_M
+
+    def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
+        """The description of a requested board with sides of `square_mm`."""
+        counts = {"columns": request.columns, "rows": request.rows}
+        return {
+            self.size_key: side_metres(f"--{self.size_key[:-2]}-mm", square_mm),
+            **{key: count for key, count in counts.items() if count is not None},
+        }
+
+    def file_name(self, target: Target, side: str) -> str:
+        """Name of a target with sides of `side`."""
+        return f"{self.name}_{target.columns}x{target.rows}_{side}"
+
+    def identify(self, image: Image, markers: Sequence["Marker"]) -> list["Identity"]:
+        """Boards of this kind in an image with these markers, without their size."""
+        del image, markers
+        return []
+
+    def variants(self, image: Image, target: Target) -> tuple[Target, ...]:
+        """Other layouts of a declared target that fit the markers in a (h, w) grey image."""
+        del image, target
+        return ()
+
+    def miscounted(self, image: Image, target: Target) -> Target | None:
+        """The board whose squares were counted wrongly, where it is seen in an image."""
+        del image, target
+        return None
+
+
+def size_of(table: DocumentTable, key: str) -> float:
+    """Reads the side of a square or a tag [m], or raises DataError."""
+    size_m = table.number(key, positive=True)
+    if size_m > _LARGEST_IN_CM:
+        raise table.refuse(
+            key, size_m, f"a length in metres, such as {1e-3 * size_m:g} for {size_m:g} mm,"
+        )
+    if size_m > LARGEST_M:
+        cm, inches = f"{1e-2 * size_m:g} for {size_m:g} cm", f"{0.0254 * size_m:g} for inches"
+        raise table.refuse(key, size_m, f"metres: {cm}, {inches}")
+    return size_m
+
+
+def sigma_of(table: DocumentTable, size_m: float) -> float:
+    """Reads the standard deviation of a side [m], or raises DataError."""
+    sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
+    if not LEAST_SIGMA_M <= sigma_m <= size_m:
+        needed = f"a standard deviation from {LEAST_SIGMA_M:g} m to the square's own {size_m:g} m"
+        raise table.refuse("square_sigma_m", sigma_m, needed)
+    return sigma_m
+
+
+def counts_of(table: DocumentTable, fewest: int = FEWEST_SQUARES) -> tuple[int, int]:
+    """Reads columns and rows, or raises DataError."""
+    columns, rows = (table.integer(key, fewest, MOST_SQUARES) for key in ("columns", "rows"))
+    return columns, rows
+
+
+def dictionary_size(table: DocumentTable, name: str) -> int:
+    """Number of markers of one of OpenCV's dictionaries; raises DataError for another name."""
+    names = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
+    if name not in names:
+        raise DataError(
+            f"{table.label}: dictionary is {name!r}, which OpenCV does not have.",
+            culprits=[f"{table.label}: dictionary"],
+            next_step=did_you_mean(name.upper(), names)
+            or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
+        )
+    return len(aruco_dictionary(name).bytesList)
+
+
+def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """One of OpenCV's dictionaries by name."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
+    """(n, n) mask of a marker's dark cells, including a border of `border` cells."""
+    dictionary = aruco_dictionary(dictionary_name)
+    size = dictionary.markerSize
+    code = dictionary.bytesList[marker_id : marker_id + 1]
+    bits = np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(code, size))
+    return np.pad(bits == 0, border, constant_values=True)
+
+
+def metres(millimetres: float) -> float:
+    """Converts millimetres to metres without rounding twice: 23.6 becomes 0.0236."""
+    return float(Decimal(str(millimetres)) / 1000)
+
+
+def side_metres(option: str, side_mm: float) -> float:
+    """Converts a side from millimetres to metres; `option` is named in messages.
+
+    Raises:
+        DataError: It is out of range.
+    """
+    most_mm = 1e3 * LARGEST_M
+    if not _SMALLEST_MM <= side_mm <= most_mm:
+        raise DataError(
+            f"{option} is {side_mm:g}; {_SMALLEST_MM:g} to {most_mm:g} mm are possible.",
+            culprits=[option],
+        )
+    return metres(side_mm)

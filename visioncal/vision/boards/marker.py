@@ -1,0 +1,182 @@
+"""Single ArUco or AprilTag markers."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+
+from visioncal.core.files import DocumentTable
+from visioncal.core.number_format import listed, some_of
+from visioncal.core.types import FloatArray, Image, Target, TargetKind
+from visioncal.vision.boards.board import DETECTED_WEIGHT
+from visioncal.vision.boards.identity import Identity, Marker, holding, modules
+from visioncal.vision.boards.kind import (
+    DEFAULT_RELATIVE_SIGMA,
+    BoardKind,
+    BoardRequest,
+    Cells,
+    DetectedCorners,
+    NotFound,
+    OnSheet,
+    aruco_dictionary,
+    dictionary_size,
+    marker_cells,
+    sigma_of,
+    size_of,
+)
+from visioncal.vision.boards.layout import read_markers
+from visioncal.vision.boards.template import refine_tags
+
+# Error of OpenCV's corners, due to rounding by blur; they are used where the template is no better
+# [px].
+_DETECTED_SIGMA_PX = 0.2
+# A marker's corners, clockwise from its upper left, in units of its side.
+CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+# Dictionary of Kalibr's pages, which is the usual one of tags.
+APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
+# Number of markers that a note lists.
+_LISTED = 12
+# Minimum correlation with the ideal marker. Strong lens distortion lowers it to 0.55. Codes of
+# sixteen bits occur by chance in other markers' squares, with up to 0.8; longer codes do not.
+_LIKE, _SHORT_LIKE, _SHORT_MODULES = 0.5, 0.83, 6
+
+
+class MarkerKind(BoardKind):
+    """A single marker. Its origin is its centre."""
+
+    name: ClassVar[TargetKind] = "marker"
+    keys = "id size_m square_sigma_m dictionary"
+    size_key = "size_m"
+    side, sides = "side of the dark square", "a side"
+    unit = "side"
+    has_markers = True
+
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads size_m, square_sigma_m, dictionary and id."""
+        size_m = size_of(table, "size_m")
+        sigma_m = sigma_of(table, size_m)
+        dictionary = table.text("dictionary")
+        number = table.integer("id", 0, dictionary_size(table, dictionary) - 1)
+        return _target(name, size_m, sigma_m, dictionary, number)
+
+    def corners(self, target: Target) -> FloatArray:
+        """(4, 3) corners [m], clockwise from its upper left."""
+        return np.asarray(target.square_m * (CLOCKWISE - np.array([0.5, 0.5, 0.0])))
+
+    def words(self, target: Target, size: str) -> str:
+        """The marker in a few words."""
+        del size
+        return f"marker {target.marker_id} of {target.dictionary}"
+
+    def cells(self, target: Target) -> tuple[Cells, ...]:
+        """Its modules."""
+        dark = marker_cells(target.dictionary, target.marker_id)
+        side = target.square_m
+        return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)
+
+    def quiet_m(self, cells: Sequence[Cells]) -> float:
+        """One module."""
+        return max(grid.cell_m for grid in cells)
+
+    def on_sheet(self, target: Target) -> OnSheet:
+        """What a printed sheet says of it."""
+        return OnSheet(
+            f"{self.words(target, '')}, {1e3 * target.square_m:g} mm a side",
+            "the marker's centre",
+            "Measure the dark square's side and write it into size_m, in metres.",
+        )
+
+    def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
+        """The description of a requested marker."""
+        document = super().requested(request, square_mm)
+        document |= {"dictionary": request.dictionary or APRILGRID_DICTIONARY}
+        return document | ({} if request.marker_id is None else {"id": request.marker_id})
+
+    def file_name(self, target: Target, side: str) -> str:
+        """Name of a marker with sides of `side`."""
+        family = target.dictionary.removeprefix("DICT_").lower()
+        family = family if family.startswith("a") else f"aruco_{family}"
+        return f"{family}_id{target.marker_id}_{side}"
+
+    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+        """Corners of the marker in a (h, w) grey image, or why there are none.
+
+        OpenCV's corners (Garrido-Jurado et al. 2014) are biased inwards by blur. They are refined
+        by the template of `refine_tags`; a corner that it does not fit remains OpenCV's, with less
+        weight.
+        """
+        del quick
+        if min(image.shape) < 2:
+            return NotFound("the image is a line")
+        ids, px = _markers(image, target.dictionary)
+        if target.marker_id not in ids:
+            seen = f"; seen instead: {', '.join(map(str, ids[:5]))}" if ids else ""
+            return NotFound(f"no marker {target.marker_id} of {target.dictionary} is seen{seen}")
+        if ids.count(target.marker_id) > 1:
+            return NotFound(
+                f"marker {target.marker_id} is seen {ids.count(target.marker_id)} times"
+            )
+        corners = px[ids.index(target.marker_id)]
+        count = int(aruco_dictionary(target.dictionary).markerSize) + 2
+        refined = refine_tags(image, count, corners[None])
+        fitted = refined.sigma_px < _DETECTED_SIGMA_PX
+        weights = None if fitted.all() else np.where(fitted, 1.0, DETECTED_WEIGHT)
+        return DetectedCorners(
+            np.arange(4), np.where(fitted[:, None], refined.px, corners), weights
+        )
+
+
+def _target(name: str, size_m: float, sigma_m: float, dictionary: str, number: int) -> Target:
+    return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=number)
+
+
+def marker_ids(image: Image, dictionary: str) -> tuple[int, ...]:
+    """Ids of a dictionary's markers in a (h, w) grey image, each once."""
+    return tuple(dict.fromkeys(_markers(image, dictionary)[0]))
+
+
+def _markers(image: Image, dictionary: str) -> tuple[list[int], FloatArray]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return read_markers(image, dictionary, parameters)
+
+
+def genuine(markers: Sequence[Marker]) -> list[Marker]:
+    """Markers that resemble their ideal; of several at one position, the most similar."""
+    kept: list[Marker] = []
+    for marker in sorted(markers, key=lambda candidate: -candidate.likeness):
+        apart = all(
+            np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
+            for other in kept
+        )
+        short = modules(marker.family) <= _SHORT_MODULES
+        if marker.likeness > (_SHORT_LIKE if short else _LIKE) and apart:
+            kept.append(marker)
+    return kept
+
+
+def single_marker(markers: Sequence[Marker]) -> Identity | None:
+    """The largest marker of the family with the most markers, the most similar first; or None."""
+    if not markers:
+        return None
+    by_family: dict[str, list[Marker]] = {}
+    for marker in markers:
+        by_family.setdefault(marker.family, []).append(marker)
+    # The family of the most similar marker wins ties.
+    members = max(by_family.values(), key=len)
+    largest = max(members, key=lambda member: member.side_px)
+    others = tuple(sorted(member.number for member in members if member is not largest))
+    ids = (largest.number, *others)
+    names = holding(largest.family, max(ids) + 1)
+    notes = []
+    if others:
+        notes.append(
+            f"Also seen: {some_of([*map(str, others)], _LISTED)}. A target is one marker, and the "
+            "largest is taken; where they are a board's, show more of it; where they lie freely, "
+            'describe them by a table of their corners (kind = "points").'
+        )
+    if len(names) > 1:
+        notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this one.")
+    board = _target("board", 1.0, DEFAULT_RELATIVE_SIGMA, names[0], ids[0])
+    return Identity(board, True, 4, 4, names[1:], marker_ids=ids, notes=tuple(notes))

@@ -1,0 +1,310 @@
+"""Rigs of known points, flat or not, which may be corners of tags."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from visioncal.core.documents.columns import Column, TableReader
+from visioncal.core.documents.tables import read_table
+from visioncal.core.errors import DataError
+from visioncal.core.files import DocumentTable, is_inside
+from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.vision.boards.kind import (
+    LEAST_SIGMA_M,
+    BoardKind,
+    Cells,
+    DetectedCorners,
+    NotFound,
+    OnSheet,
+    aruco_dictionary,
+    dictionary_size,
+    marker_cells,
+)
+from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, read_markers
+from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
+from visioncal.vision.boards.template import refine_tags
+
+# Columns of a rig's table; sigma_m is optional, and so are tag and corner together.
+RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
+_WHOLE_NUMBERS = ("point", "tag", "corner")
+# Largest rig [m], beyond which numbers are in millimetres; minimum points for a pose.
+_LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
+# Ratio of the second to the first singular value below which points are collinear.
+_ON_ONE_LINE = 1e-6
+# Largest deviation of a tag's measured corners from a square, as a share of its side.
+_SQUARE = 0.02
+# Minimum number of complete tags in one plane for a check of the layout.
+_LEAST_TAGS = 2
+
+
+class Rig(BoardKind):
+    """A rig of points, in the frame of its table. Points are found if they are corners of tags."""
+
+    name: ClassVar[TargetKind] = "points"
+    unit = "side"
+    fewest = 4
+    is_seen_in_part = True
+
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads points, the columns of the rig's table as lists, and dictionary."""
+        columns = table.content.get("points")
+        if not isinstance(columns, Mapping) or not all(
+            column in columns for column in RIG_COLUMNS[:4]
+        ):
+            raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
+        names = [column for column in RIG_COLUMNS if column in columns]
+        lists = [columns[word] for word in names]
+        try:
+            values = np.array(lists, dtype=float)
+        except (TypeError, ValueError):
+            values = np.zeros(0)
+        for words, step in _rig_problems(names, values):
+            culprit = f"{table.label}: points"
+            raise DataError(f"{culprit}, its table, {words}.", culprits=[culprit], next_step=step)
+        numbers, places_m = values[0], values[1:4].T
+        sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
+        extent_m = float(np.ptp(places_m, axis=0).max())
+        return Target(
+            name,
+            self.name,
+            len(numbers),
+            1,
+            extent_m,
+            0.0,
+            points_m=tuple((x, y, z) for x, y, z in places_m.tolist()),
+            point_numbers=tuple(numbers.astype(int).tolist()),
+            point_sigmas_m=tuple(sigmas_m.tolist()),
+            **_tags_of_rig(table, columns),
+        )
+
+    def document(self, target: Target) -> dict[str, Any]:
+        """The rig as the content of a `.toml`, with its table."""
+        x_m, y_m, z_m = self.corners(target).T.tolist()
+        tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
+        columns = (list(target.point_numbers), x_m, y_m, z_m, list(target.point_sigmas_m), *tags)
+        rig = dict(zip(RIG_COLUMNS, columns, strict=True))
+        points = {"points": {name: value for name, value in rig.items() if value}}
+        return points | ({"dictionary": target.dictionary} if target.point_tags else {})
+
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) points [m], in the order of its table."""
+        return np.array(target.points_m, dtype=float)
+
+    def words(self, target: Target, size: str) -> str:
+        """The rig in a few words."""
+        del target, size
+        return f"target of kind {self.name}"
+
+    def cells(self, target: Target) -> tuple[Cells, ...]:
+        """Its tags, at the poses given by their corners."""
+        ids_of_corners, places = tag_corners(target), self.corners(target)
+        if (
+            not ids_of_corners
+            or np.ptp(places[:, 2]) > 0.0
+            or min(array.min() for array in ids_of_corners.values()) < 0
+        ):
+            raise DataError(
+                f"target {target.name} is a rig of points; a board can be printed, or a rig in one "
+                "plane z = 0 whose points are all four corners of tags.",
+                culprits=[target.name],
+            )
+        grids = []
+        for number, corners in ids_of_corners.items():
+            quad = places[corners, :2]
+            cells = marker_cells(target.dictionary, number)
+            x_side, y_side = quad[1] - quad[0], quad[3] - quad[0]
+            side_m = float(np.linalg.norm(x_side))
+            square = np.array([[-x_side[1], x_side[0]], quad[2] - quad[0] - x_side])
+            if np.abs(square - y_side).max() > _SQUARE * side_m:
+                raise DataError(
+                    f"target {target.name}: the corners of tag {number} are no square, clockwise "
+                    "from its upper left.",
+                    culprits=[f"tag {number}"],
+                )
+            turn = np.stack([x_side, y_side], axis=1) / side_m
+            grids.append(Cells(quad[0], side_m / len(cells), cells, turn))
+        return tuple(grids)
+
+    def quiet_m(self, cells: Sequence[Cells]) -> float:
+        """One module."""
+        return max(grid.cell_m for grid in cells)
+
+    def on_sheet(self, target: Target) -> OnSheet:
+        """What a printed sheet says of it."""
+        return OnSheet(
+            f"{len(target.point_tags) // 4} tags of {target.dictionary}",
+            "the origin of the table of their corners",
+            "Measure the tags' corners and write them into that table, in metres.",
+        )
+
+    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+        """Corners of its tags in a (h, w) grey image, or why there are none."""
+        del quick
+        if not target.point_tags:
+            return NotFound(
+                f"target {target.name} is a rig of points, which no image is searched for: "
+                "corners.csv has no rows of this view"
+            )
+        if min(image.shape) < 2:
+            return NotFound("the image is a line")
+        numbers, found_px = read_markers(image, target.dictionary)
+        corner_ids = tag_corners(target)
+        quads = {
+            number: px
+            for number, px in zip(numbers, found_px, strict=True)
+            if number in corner_ids and numbers.count(number) == 1
+        }
+        if not quads:
+            seen = f"; seen instead: {', '.join(map(str, numbers[:5]))}" if numbers else ""
+            return NotFound(
+                f"no tag of the target's, of {target.dictionary}, is seen{seen}",
+                misfit=bool(numbers),
+            )
+        places = self._in_plane(target, quads)
+        if places is not None:
+            side = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
+            if layout_misfit(places / side, np.array(list(quads.values()))) > LAYOUT_MISFIT:
+                return NotFound("the tags do not lie as the target describes them", misfit=True)
+        count = int(aruco_dictionary(target.dictionary).markerSize) + 2
+        if places is None:
+            parts = [refine_tags(image, count, quad[None]) for quad in quads.values()]
+        else:
+            parts = [refine_tags(image, count, np.array(list(quads.values())), places)]
+        points = np.concatenate([corner_ids[quad] for quad in quads])
+        fitted = np.array([not reason for part in parts for reason in part.reasons]) & (points >= 0)
+        if not fitted.any():
+            return NotFound("no corner of the tags seen is like the print")
+        px = np.concatenate([part.px for part in parts])[fitted]
+        order = np.argsort(points[fitted])
+        blur_px = float(np.nanmedian([part.blur_px.max() for part in parts]))
+        return DetectedCorners(points[fitted][order], px[order], blur_px=blur_px)
+
+    def _in_plane(self, target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:
+        """(t, 4, 2) positions of two complete tags or more in the plane z = 0 [m]; else None."""
+        known = tag_corners(target)
+        numbers = np.array([known[quad] for quad in quads])
+        places = self.corners(target)
+        if len(quads) < _LEAST_TAGS or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
+            return None
+        return np.asarray(places[numbers, :2])
+
+
+def read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
+    """Reads the table of a rig's points by columns, from the folder of the rig's description."""
+    path = folder / name
+    if not is_inside(path, folder):
+        raise DataError(
+            f"points = {name!r} leads out of the folder of the target's file.",
+            culprits=["points"],
+            next_step="Copy the table of points beside the target's file.",
+        )
+    table = read_table(path)
+    unknown = [column for column in table.columns if column not in RIG_COLUMNS]
+    missing = [column for column in RIG_COLUMNS[:4] if column not in table.columns]
+    if unknown or missing:
+        raise DataError(
+            f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
+            "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
+            culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
+        )
+    reader = TableReader(table)
+    read: dict[str, list[Any]] = {
+        name: reader.whole(name).tolist()
+        if name in _WHOLE_NUMBERS
+        else reader.numbers(Column(name, is_needed=True))[:, 0].tolist()
+        for name in table.columns
+    }
+    reader.check()
+    return read
+
+
+def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
+    """Text of a rig's table, from its columns."""
+    columns = [column for column in RIG_COLUMNS if column in points]
+    rows = zip(*(points[column] for column in columns), strict=True)
+    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
+
+
+def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[str, str]]:
+    """Problems of a table of points, each with an instruction.
+
+    Args:
+        names: Columns of the table, point, x_m, y_m and z_m first.
+        values: (columns, n) cells; of another shape if the rows are uneven.
+    """
+    if values.ndim != 2:
+        yield "has rows of several lengths, or cells that are no numbers", "Fill in all cells."
+        return
+    for column, row in np.argwhere(~np.isfinite(values)).tolist():
+        yield (
+            f"has {values[column, row]:g} as {names[column]} of row {row + 1}",
+            "Write a finite number there, or delete the row.",
+        )
+    numbers, places_m = values[0].tolist(), values[1:4].T
+    if len(numbers) < _FEWEST_POINTS:
+        yield f"has {len(numbers)} points", "Give four points or more, which a camera needs."
+    first: dict[float, int] = {}
+    for row, number in enumerate(numbers):
+        if number != round(number) or first.setdefault(number, row) != row:
+            again = " again" if first.get(number, row) != row else ""
+            yield (
+                f"has {number:g}{again} as point of row {row + 1}",
+                "Give each point a whole number of its own.",
+            )
+    spread_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    if spread_m[1] <= _ON_ONE_LINE * spread_m[0]:
+        location = "on one line" if spread_m[0] > 0.0 else "in one place"
+        yield (
+            f"has all points {location}",
+            "Give points beside these: no camera tells how they turn.",
+        )
+    extent_m = float(np.ptp(places_m, axis=0).max())
+    if extent_m > _LARGEST_RIG_M:
+        yield (
+            f"reaches over {extent_m:g} m, and a rig over {_LARGEST_RIG_M:g} m at most",
+            "It looks like millimetres: multiply x_m, y_m, z_m and sigma_m by 0.001.",
+        )
+    for row, sigma_m in enumerate(values[4].tolist() if "sigma_m" in names else ()):
+        if not LEAST_SIGMA_M <= sigma_m <= extent_m:
+            yield (
+                f"has {sigma_m:g} as sigma_m of row {row + 1}, and not {LEAST_SIGMA_M:g} m to the "
+                f"rig's own {extent_m:g} m",
+                "Write metres in this range, or leave the column out where they are not known.",
+            )
+
+
+def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Tag corners of a rig's points, and the tags' dictionary."""
+    given = [name for name in ("tag", "corner") if name in columns]
+    if not given:
+        return {}
+    if len(given) == 1:
+        raise table.refuse(
+            "points", f"a table with {given[0]} alone", "tag and corner, or neither,"
+        )
+    dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
+    markers = dictionary_size(table, dictionary)
+    pairs = list(zip(columns["tag"], columns["corner"], strict=True))
+    counts = Counter(pairs)
+    for tag, corner in pairs:
+        if tag not in range(markers) or corner not in range(4):
+            given_here = f"a table with tag {tag}, corner {corner}"
+            raise table.refuse("points", given_here, f"tags 0 to {markers - 1}, corners 0 to 3,")
+        if counts[tag, corner] > 1:
+            twice = f"a table with corner {corner} of tag {tag} twice"
+            raise table.refuse("points", twice, "each corner once,")
+    return {
+        "dictionary": dictionary,
+        "point_tags": tuple((int(tag), int(corner)) for tag, corner in pairs),
+    }
+
+
+def tag_corners(target: Target) -> dict[int, IntArray]:
+    """Point indices (4,) of a rig's tags' corners, by tag id; -1 for corners that are no points."""
+    corners_of_tag: dict[int, IntArray] = {}
+    for index, (tag, corner) in enumerate(target.point_tags):
+        corners_of_tag.setdefault(tag, np.full(4, -1))[corner] = index
+    return corners_of_tag
