@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from visioncal.robot import Loads
     from visioncal.robot.thermal import OnlineCompensator
     from visioncal.session import Session
-    from visioncal.session.shared_arm import join_sessions
     from visioncal.simulation import CellOptions, simulate, write_session
     from visioncal.vision.boards.identify import identify
     from visioncal.vision.targets import load_target
@@ -79,7 +78,6 @@ _HOMES = {
     "export": "visioncal.interchange.exports",
     "identify": "visioncal.vision.boards.identify",
     "load_target": "visioncal.vision.targets",
-    "join_sessions": "visioncal.session.shared_arm",
     "locate": "visioncal.frames.locate",
     "locate_target": "visioncal.frames.locate",
     "locate_views": "visioncal.frames.session_observations",
@@ -123,7 +121,6 @@ __all__ = [
     "doctor",
     "export",
     "identify",
-    "join_sessions",
     "load_target",
     "locate",
     "locate_target",

@@ -59,10 +59,7 @@ class CalibrateOptions:
     --robot, --target).
     """
 
-    sessions: list[Path] = argument(
-        "A session's folder, or its .rrd recording; several with --robot-shared.",
-        metavar="SESSION...",
-    )
+    session: Path = argument("A session's folder, or its .rrd recording.")
     need: NeedOptions
     work: WorkOptions
     out: Path = out_folder(default=Path("out"))
@@ -82,10 +79,6 @@ class CalibrateOptions:
     )
     convention: Convention | None = option(
         "Convention of the arm's joint table in the result; by default the stated one."
-    )
-    robot_shared: bool = flag(
-        "Several sessions of one arm, each with a camera and a board of its own: the arm "
-        "is calibrated from all of them."
     )
     corrected: bool = flag(
         "Targets are corrected for the calibrated arm (visioncal correct) before they are "

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Condition
 
 import cv2
@@ -237,8 +237,7 @@ def _search(
     name = session.board_of(view)
     earlier = session.images.search_of(view.image, name)
     if earlier is not None:
-        # Views are renumbered where sessions are joined.
-        return replace(earlier, found=replace(earlier.found, view=view.number))
+        return earlier
     absence = session.images.absence(view.image)
     if absence:
         return Searched(Rejection(view.number, f"{view.image} {absence}"), None)
