@@ -100,7 +100,8 @@ def test_a_board_that_the_image_cuts_is_at_least_so_large():
     assert any("may go on" in note for note in identity.notes)
     sideways = identify(page[:, :-300])
     # Columns follow from the ids, the last ones unseen too.
-    assert (sideways.columns, sideways.rows, sideways.whole) == (9, 6, True)
+    board = sideways.board
+    assert (board.columns, board.rows, sideways.whole) == (9, 6, True)
     assert sideways.corners_seen < sideways.corners
 
 

@@ -101,6 +101,8 @@ def hidden_corners(
     # Detecting a corner requires both markers beside it.
     around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     depth = around @ homography[2, :2] + homography[2, 2]
-    px = (around @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None]
+    # Corners at the horizon are at infinity.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        px = (around @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None]
     inside = (depth > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
     return np.asarray(missing[inside.all(axis=1)])
