@@ -507,8 +507,7 @@ class ForeignOptions(RobotPoseOptions):
         "The column or key that names each row's image.", "--image-column", "--image-key"
     )
     corners: Path | None = _camera(
-        "A file with the corners that another program found: mrcal's .vnl or another "
-        "table, OpenCV's image_points, or lists by image in JSON, YAML or .npz."
+        "A table with the corners that another program found: mrcal's .vnl or another one."
     )
     intrinsics: str | None = _camera(
         "A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "

@@ -290,11 +290,6 @@ class CalibrationSections(ArmSections):
         """`uncertainty` of the fit itself; None for a part of a whole cell."""
         return self.uncertainty if isinstance(self.uncertainty, UncertaintyResult) else None
 
-    @property
-    def named_boards(self) -> dict[str, BoardResult]:
-        """The boards by name, which is empty for the only board."""
-        return dict(self.boards) if self.board is None else {"": self.board}
-
 
 @dataclass(frozen=True)
 class CellDetails(Section):

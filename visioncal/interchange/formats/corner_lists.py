@@ -1,38 +1,29 @@
-"""Corners found by another program: a row a corner, or a list for each image.
+"""Corners found by another program: a table with a row a corner.
 
-Tables have columns for the image, the pixel and optionally the corner's number, as mrcal's
+It has columns for the image, the pixel and optionally the corner's number, as mrcal's
 `corners.vnl`: without numbers, an image has all the board's corners row by row, with `-` for one
-that was not found. Documents have a list for each image: parallel lists, as OpenCV's samples write
-`image_points`, or records with the corners' numbers and the image's name.
+that was not found.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from visioncal.core.documents import is_number, read_table
-from visioncal.core.documents.jsons import Array, read_npz
-from visioncal.core.documents.structured import read_opencv
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import natural
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.foreign import ForeignRecording, FoundCorners
-from visioncal.interchange.formats.reading import DOCUMENTS, read_document
+from visioncal.interchange.formats.reading import DOCUMENTS
 
-# Names of the image, of a corner's number and of its pixel: of one corner, and of lists.
+# Names of the image, of a corner's number and of its pixel.
 _IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
-_IMAGES = tuple(f"{name}s" for name in _IMAGE)
 _POINT = ("point", "point_id", "corner", "corner_id", "charuco_id", "id")
-_POINTS = ("ids", "charuco_ids", "corner_ids", "point_ids", "all_ids", "allids")
 _U, _V = ("u_px", "x_px", "u", "x", "img_loc_x"), ("v_px", "y_px", "v", "y", "img_loc_y")
-_PIXEL_LISTS = (
-    *("charuco_corners", "image_points", "imagepoints", "img_points", "imgpoints", "corners"),
-    *("all_corners", "allcorners", "uv", "pixels", "points"),
-)
 # How often mrcal halved the image before it found the corner; `-` where it found none.
 _LEVEL = "level"
 
@@ -43,8 +34,7 @@ def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
     Raises:
         DataError: The file holds no corners, or they are not of this recording's images.
     """
-    is_document = path.suffix.lower() in (*DOCUMENTS, ".npz")
-    images = list(_of_document(path) if is_document else _of_table(path))
+    images = list(_of_table(path))
     if not any(corners.ids.size for _, corners in images):
         raise DataError(f"{path} holds no corners.", culprits=[str(path)])
     count = len(foreign.robot)
@@ -91,6 +81,12 @@ def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
 
 def _of_table(path: Path) -> Iterator[tuple[str, FoundCorners]]:
     """Reads the images of a table in the order of their first rows."""
+    if path.suffix.lower() in (*DOCUMENTS, ".npz"):
+        raise DataError(
+            f"{path.name} is no table; one with a row a corner is needed.",
+            culprits=[str(path)],
+            next_step="Write a .csv with the header filename,id,x,y.",
+        )
     columns, rows, places = _table(path)
     lower = [column.lower() for column in columns]
 
@@ -149,95 +145,7 @@ def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence
     return columns, [cells for _, cells in rows], [place for place, _ in rows]
 
 
-def _of_document(path: Path) -> Iterator[tuple[str, FoundCorners]]:
-    document: object = read_npz(path) if path.suffix.lower() == ".npz" else read_document(path)
-    if path.suffix.lower() == ".json" and isinstance(document, Mapping):
-        document = read_opencv(path)
-    records = list(_records(document))
-    if not records:
-        raise DataError(
-            f"{path.name} has no list of corners; one is called {', '.join(_PIXEL_LISTS[:6])} or "
-            "the like, for each image or in a record of it.",
-            culprits=[str(path)],
-        )
-    for at, record in enumerate(records):
-        name = _value_of(record, _IMAGE)
-        where = f"{path.name}, {name or f'entry {at}'}"
-        places, ids = _value_of(record, _PIXEL_LISTS), _value_of(record, (*_POINTS, *_POINT))
-        try:
-            if isinstance(places, list):
-                places = [
-                    [place["x"], place["y"]] if isinstance(place, Mapping) else place
-                    for place in places
-                ]
-            px = np.array([] if places is None else places, dtype=float)
-            numbers = None if ids is None else np.array(ids, dtype=float)
-        except (KeyError, ValueError, TypeError, OverflowError):
-            px, numbers = np.zeros(1), None
-        if px.size and (not px.ndim or px.shape[-1] % 2):
-            raise DataError(
-                f"{where}: its corners are no list of pairs of numbers.", culprits=[where]
-            )
-        px = px.reshape(-1, 2)
-        numbers = np.arange(len(px), dtype=float) if numbers is None else numbers.ravel()
-        yield "" if name is None else str(name), _checked(numbers, px, where)
-
-
-def _records(document: object) -> Iterator[Mapping[str, object]]:
-    """Finds the records of images in a document: each has a list of corners."""
-    if isinstance(document, list):
-        yield from (
-            value for value in document if isinstance(value, Mapping) and _has_pixel_list(value)
-        )
-    if not isinstance(document, Mapping):
-        return
-    places = _value_of(document, _PIXEL_LISTS)
-    if places is None:
-        for name, value in document.items():
-            if isinstance(value, Mapping) and _has_pixel_list(value):
-                yield {"image": name, **value}
-            elif isinstance(value, list):
-                yield from _records(value)
-    elif not _is_of_images(places):
-        yield document
-    else:
-        ids, names = _value_of(document, _POINTS), _value_of(document, _IMAGES)
-        for at, place in enumerate(parts := _listed(places)):
-            lists = {"ids": ids, "image": names}
-            fields = {
-                key: values[at]
-                for key, values in lists.items()
-                if isinstance(values, list | np.ndarray) and len(values) == len(parts)
-            }
-            yield {"corners": place, **fields}
-
-
-def _is_of_images(places: object) -> bool:
-    """Whether places are a list of lists of corners, one for each image, rather than corners."""
-    lists = [place for place in _listed(places) if len(_listed(place)) > 1]
-    return any(isinstance(_listed(place)[0], list | np.ndarray) for place in lists)
-
-
-def _listed(value: object) -> Sequence[object] | Array:
-    return value if isinstance(value, list | np.ndarray) else ()
-
-
-def _has_pixel_list(record: Mapping[str, object]) -> bool:
-    return any(name.lower() in _PIXEL_LISTS for name in map(str, record))
-
-
-def _value_of(record: Mapping[str, object], names: Sequence[str]) -> object:
-    """The first value under one of some names, in any case; None where there is none."""
-    lower = {str(name).lower(): value for name, value in record.items()}
-    return next((lower[name] for name in names if name in lower), None)
-
-
 def _checked(ids: FloatArray, px: FloatArray, where: str) -> FoundCorners:
-    if len(ids) != len(px):
-        raise DataError(
-            f"{where}: there are {len(px)} corners and {len(ids)} numbers of them.",
-            culprits=[where],
-        )
     if not (np.all(np.isfinite(px)) and np.all((ids % 1 == 0) & (np.abs(ids) < 2**31))):
         raise DataError(
             f"{where}: a corner has no finite place, or its number is not whole.", culprits=[where]
