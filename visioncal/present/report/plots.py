@@ -134,7 +134,9 @@ def residuals(
     ]
     if not shown:
         return None
-    figure, grid = panels(WIDE_IN, (1.6 if is_cell else 1.3) * len(shown) + 0.25, len(shown))
+    margins_in = None if is_cell else (0.8, 0.45, 0.75, 0.06)
+    height_in = (1.6 if is_cell else 1.3) * len(shown) + 0.25
+    figure, grid = panels(WIDE_IN, height_in, len(shown), 1, margins_in)
     for axes, (seer, views, (label, name, unit, limit)) in zip(grid[:, 0], shown, strict=True):
         draw_bars(
             axes,
@@ -281,7 +283,8 @@ def residuals_over_joints(
         return None
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
     twists = np.array([residual for _, residual in pairs])
-    figure, grid = panels(WIDE_IN, 3.0, 2, joints_deg.shape[1], sharex="col", sharey="row")
+    margins_in, joints = (0.8, 0.45, 0.06, 0.3), joints_deg.shape[1]
+    figure, grid = panels(WIDE_IN, 3.0, 2, joints, margins_in, sharex="col", sharey="row")
     rows = (
         (grid[0], 1e3 * twists[:, 3:], "position [mm]"),
         (grid[1], np.rad2deg(twists[:, :3]), "rotation [deg]"),

@@ -95,10 +95,18 @@ def panels(
     height_in: float,
     rows: int = 1,
     columns: int = 1,
+    margins_in: tuple[float, float, float, float] | None = None,
     **options: Any,  # noqa: ANN401 - see there
 ) -> tuple[Figure, np.ndarray]:
-    """A figure and its (rows, columns) axes; `options` are those of `Figure.subplots`."""
-    figure = Figure((width_in, height_in), layout="constrained")
+    """A figure and its (rows, columns) axes; `options` are those of `Figure.subplots`.
+
+    Given margins (left, bottom, right, top) save the layout of many panels, which takes as long as
+    drawing them.
+    """
+    figure = Figure((width_in, height_in), layout=None if margins_in else "constrained")
+    if margins_in:
+        left, bottom, right, top = np.array(margins_in) / (2 * [width_in, height_in])
+        figure.subplots_adjust(left, bottom, 1.0 - right, 1.0 - top, wspace=0.12, hspace=0.16)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
