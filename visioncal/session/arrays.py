@@ -35,24 +35,13 @@ class CellArguments(TypedDict, total=False):
     name: str  # The session's name.
 
 
-class AssembleArguments(TypedDict):
-    """Arguments of `Session.assemble`."""
-
-    document: Mapping[str, Any]
-    columns: Sequence[str]
-    cells: Sequence[Sequence[str]]
-    images: MemoryImages
-    target_document: Mapping[str, Any] | None
-    corners: CornerTable | None
-
-
 def of_images(
     images: Sequence[Image | Image16 | bytes],
     poses: Poses,
     board: Target | str,
     **cell: Unpack[CellArguments],
-) -> AssembleArguments:
-    """Content of a session of images; see `Session.from_arrays`."""
+) -> dict[str, Any]:
+    """Arguments of `Session.assemble` for images; see `Session.from_arrays`."""
     matrices = _matrices(poses, "images", len(images))
     paths = [f"images/{at:03d}.png" for at in range(len(images))]
     files = {
@@ -68,8 +57,8 @@ def of_corners(
     board: Target | str,
     resolution: tuple[int, int],
     **cell: Unpack[CellArguments],
-) -> AssembleArguments:
-    """Content of a session of corners; see `Session.from_corners`."""
+) -> dict[str, Any]:
+    """Arguments of `Session.assemble` for corners; see `Session.from_corners`."""
     matrices = _matrices(poses, "corners", len(corners))
     table = CornerTable.of_lists([_corners(at, *corner) for at, corner in enumerate(corners)])
     content = _content(matrices, board, cell, {}, MemoryImages({}), resolution)
@@ -147,7 +136,7 @@ def _content(
     columns: Mapping[str, Sequence[str]],
     images: MemoryImages,
     resolution: tuple[int, int] | None = None,
-) -> AssembleArguments:
+) -> dict[str, Any]:
     count, known = len(matrices), [*CellArguments.__annotations__]
     for name in cell:
         if name not in known:

@@ -18,7 +18,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     counts_of,
     dictionary_size,
     marker_cells,
@@ -126,13 +125,13 @@ class AprilGrid(Board):
         squares = (side + gap) * np.stack([x, y], axis=-1).reshape(-1, 2) - gap
         return (*grids, *(Cells(square, gap, np.ones((1, 1), bool)) for square in squares))
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
         side_mm, sides = (
             1e3 * target.square_m,
             target.columns + (target.columns - 1) * target.spacing,
         )
-        return OnSheet(
+        return (
             f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm:g} mm, "
             f"{target.spacing * side_mm:g} mm apart, {target.dictionary} from id "
             f"{target.marker_id} at the lower left",

@@ -23,7 +23,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     aruco_dictionary,
     counts_of,
     dictionary_size,
@@ -133,10 +132,10 @@ class Charuco(Board):
             grids.append(Cells(corner_m, target.marker_m / len(cells), cells))
         return tuple(grids)
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
         layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
-        return OnSheet(
+        return (
             f"ChArUco, {target.columns} x {target.rows} squares of {1e3 * target.square_m:g} mm, "
             f"markers of {1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}",
             "the print's top left corner",

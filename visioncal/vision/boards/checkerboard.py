@@ -14,7 +14,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     counts_of,
     sigma_of,
     size_of,
@@ -71,9 +70,9 @@ class Checkerboard(Board):
         side = target.square_m
         return (Cells(np.full(2, -side), side, (row + column) % 2 == 0),)
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
-        return OnSheet(
+        return (
             f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
             f"{1e3 * target.square_m:g} mm",
             "the inner corner at the top left",

@@ -18,7 +18,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     counts_of,
     side_metres,
     sigma_of,
@@ -123,11 +122,11 @@ class CircleGrid(Board):
         """(n, 2) centres of its circles [m]."""
         return self.corners(target)[:, :2]
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
         side_mm, steps = 1e3 * target.square_m, target.rows - 1
         words = self.words(target, f"{target.columns} x {target.rows}")
-        return OnSheet(
+        return (
             f"{words} of {1e3 * target.diameter_m:g} mm, rows {side_mm:g} mm apart",
             "the centre of the circle at the top left",
             "Measure from the first row's centres to the last one's, meant to be "

@@ -91,15 +91,6 @@ class BoardRequest:
     asymmetric: bool = False  # Whether every second row of circles is shifted.
 
 
-@dataclass(frozen=True)
-class OnSheet:
-    """What a printed sheet says of a board."""
-
-    words: str  # Description of the board.
-    origin: str  # Where the origin of its frame is.
-    measure: str  # How to measure its size.
-
-
 class BoardKind(ABC):
     """A kind of target. Its instance has no state: everything is in the `Target`."""
 
@@ -148,8 +139,8 @@ class BoardKind(ABC):
         """
 
     @abstractmethod
-    def on_sheet(self, target: Target) -> OnSheet:
-        """What a printed sheet says of it."""
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
+        """What a printed sheet says of it: words, the origin's place, how to measure its size."""
 
     @abstractmethod
     def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:

@@ -18,7 +18,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     aruco_dictionary,
     dictionary_size,
     marker_cells,
@@ -79,9 +78,9 @@ class MarkerKind(BoardKind):
         """One module."""
         return max(grid.cell_m for grid in cells)
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
-        return OnSheet(
+        return (
             f"{self.words(target, '')}, {1e3 * target.square_m:g} mm a side",
             "the marker's centre",
             "Measure the dark square's side and write it into size_m, in metres.",

@@ -18,7 +18,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    OnSheet,
     aruco_dictionary,
     dictionary_size,
     marker_cells,
@@ -132,9 +131,9 @@ class Rig(BoardKind):
         """One module."""
         return max(grid.cell_m for grid in cells)
 
-    def on_sheet(self, target: Target) -> OnSheet:
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
-        return OnSheet(
+        return (
             f"{len(target.point_tags) // 4} tags of {target.dictionary}",
             "the origin of the table of their corners",
             "Measure the tags' corners and write them into that table, in metres.",

@@ -232,10 +232,10 @@ def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
 
 def _sentences(target: Target) -> tuple[str, str, str]:
     """Description of the board, its frame, and instructions to print and measure it."""
-    says = kind_of(target).on_sheet(target)
+    words, origin, measure = kind_of(target).on_sheet(target)
     return (
-        f"{target.name}: {says.words}",
-        f"Frame: origin at {says.origin}, level with the zeros of both rulers; x to the right, y "
+        f"{target.name}: {words}",
+        f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y "
         "down, z into the page.",
-        "Print at 100 %, not fitted to the page, and check both rulers. " + says.measure,
+        "Print at 100 %, not fitted to the page, and check both rulers. " + measure,
     )
