@@ -198,17 +198,6 @@ def test_a_kernels_time_is_taken_where_it_can_be_true(capture):
     assert frame.exposure_s == 0.02
 
 
-def test_a_stream_whose_decoding_lags_is_stamped_as_if_it_did_not(capture):
-    camera = opened(capture, "rtsp://somewhere/stream")
-    stamps = []
-    # Its clock says 0.1 s a picture; decoding takes 0.3 s each. It then begins anew.
-    for now_s, told_s in ((100.0, 5.0), (100.3, 5.1), (100.6, 5.2), (100.65, 5.9), (101.0, 2.0)):
-        capture.at_s = told_s
-        stamps.append(camera._arrival(now_s)[0])
-    # By 0.1 ms a second their clocks may run apart, which counts as a delay.
-    assert stamps == pytest.approx([100.0, 100.1, 100.2, 100.65, 101.0], abs=1e-4)
-
-
 def test_a_camera_that_hangs_or_ends_is_told(capture):
     camera = opened(capture)
     for _ in range(2):

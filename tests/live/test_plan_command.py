@@ -219,7 +219,6 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur5e", {}, ("--add", "3"), "holds no recorded session"),
         ("ur5e", {}, ("--start-joints", "1,2"), "--start-joints"),
         ("ur5e", {}, ("--floor", "high"), "--floor"),
-        ("ur5e", {}, ("--wish-mm", "-1"), "above zero"),
         ("ur5e", {}, ("--need-mm", "-1"), "above zero"),
         ("ur5e", {}, ("--need-mm", "0.2", "--for", "offsets"), "these stops are for the arm"),
         ("ur5e", {}, ("--robot", "ur3"), "--robot: robot ur5e is named already"),
@@ -276,14 +275,6 @@ def test_stops_are_exchanged_until_an_arm_that_folds_far_back_has_a_way(tmp_path
     done = plan(folding_arm(tmp_path), tmp_path / "plan", *more, **cell)
     assert done.status == 0, done.err
     assert "stops were exchanged for want of a safe way" in done.out
-
-
-def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):
-    out = tmp_path / "out"
-    done = plan("ur5e", out, "--stops", 4, "--wish-mm", "0.0001")
-    assert done.status == 0, done.err
-    assert "cannot be reached from these candidates" in done.out
-    assert json.loads((out / "plan.json").read_text())["wish_met"] is False
 
 
 def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):

@@ -14,7 +14,7 @@ from visioncal.estimation.linalg import covariance_root
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.design import Wish, choose_stops, shortfall
+from visioncal.live.planning.design import choose_stops
 from visioncal.live.planning.information import predict_worlds, stop_factors
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES
@@ -130,14 +130,12 @@ def test_what_is_known_beforehand_may_be_singular_to_rounding(views):
     np.testing.assert_allclose(root.T @ world.prior @ root, np.eye(size), atol=1e-9)
 
 
-def test_a_board_of_unknown_size_is_named_as_what_is_in_the_way():
+def test_a_board_of_unknown_size_is_in_the_way():
     options = CELL
     worlds = predict_worlds([true_cell(options)], KINEMATICS, postures_in_view(options, 60))
     # A size that is open by 0.1 % leaves half a millimetre of an arm's place at a metre.
-    wish = Wish(mm=0.4)
-    design = choose_stops(worlds, 30, wish=wish)
+    design = choose_stops(worlds, 30)
     assert design.best.mm > 0.4 > design.best_known_lens_board.mm
-    assert "square_sigma_m" in shortfall(design, wish, 30)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -193,7 +191,7 @@ def test_the_few_stops_that_a_recorded_cell_allows_are_added():
     request = PlanRequest(HAND_EYE, count=5)
     plan = make_plan(cell, request, begun=replace(begun, cell=cell))
     assert len(plan.stops) == 5
-    # A tenth of the wish is what a guessed cell has to have.
+    # A tenth of the number is what a guessed cell has to have.
     assert 5 < plan.candidate_count < 0.1 * request.candidates
     assert plan.design.predicted.mm < plan.design.before.mm
     with pytest.raises(
@@ -259,9 +257,6 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     assert mm(world, []) == pytest.approx(obtained, rel=0.02 if case == "estimated" else 0.15)
     assert design.before.mm == pytest.approx(obtained, rel=0.15)
     assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
-    wish = Wish(mm=1.0)
-    short = shortfall(next_best(begun, HAND_EYE, q, 3, wish=wish).design, wish, 3)
-    assert ("record joint angles" in short) == (case == "taken for noise")
 
 
 def test_stops_for_the_arm_say_what_of_it_they_tell():

@@ -11,7 +11,7 @@ from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.design import Design, Wish, choose_stops
+from visioncal.live.planning.design import Design, choose_stops
 from visioncal.live.planning.information import WORLDS, predict_worlds
 from visioncal.live.planning.plan import stop_contributions
 from visioncal.live.planning.purposes import Purpose
@@ -67,14 +67,12 @@ def next_best(
     purpose: Purpose,
     q: FloatArray,
     count: int,
-    *,
-    wish: Wish | None = None,
     **draw,
 ) -> Additions:
     """The stops that a plan adds to a session, wherever the arm can drive."""
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
     worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)
-    design = choose_stops(worlds, count, wish=wish)
+    design = choose_stops(worlds, count)
     names = [f"added stop {index + 1}" for index in range(len(design.rows))]
     said = stop_contributions(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
     return Additions(design, tuple(said))

@@ -34,7 +34,6 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.design import Wish
 from visioncal.live.planning.messages import looks_note, need_words, summary_of
 from visioncal.live.planning.plan import Plan, PlanRequest, make_plan
 from visioncal.live.planning.plan_file import plan_document
@@ -107,12 +106,10 @@ def _request(stops: StopOptions, cell: PlanCell) -> PlanRequest:
     purpose = purpose_of(stops.purpose, "--for")
     form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
     start = stops.start_joints and numbers_in(stops.start_joints, "--start-joints", form)
-    has_no_wish = stops.wish_mm is None and stops.wish_deg is None
     has_no_need = stops.need_mm is None and stops.need_deg is None
     return PlanRequest(
         purpose,
         stops.add or stops.stops or (purpose.stops if has_no_need else MOST_FOR_NEED),
-        None if has_no_wish else Wish(stops.wish_mm, stops.wish_deg),
         stops.candidates,
         _box_of(stops.workspace, "--workspace", "workspace") if stops.workspace else None,
         np.array(start) if start else None,
@@ -191,13 +188,10 @@ def _report(plan: Plan) -> None:
         count, obstacles = len(plan.in_the_way), some_of(list(dict.fromkeys(plan.in_the_way)))
         stops = "1 stop was" if count == 1 else f"{count} stops were"
         answer(f"{stops} exchanged for want of a safe way ({obstacles})")
-    if plan.shortfall:
-        answer(plan.shortfall, "warning: ", "bold yellow")
+    if plan.need is not None and plan.need.limits:
+        answer(plan.need.limits, "warning: ", "bold yellow")
     elif note := looks_note(plan):
         answer(note)
-    if plan.design.met:
-        after = plan.design.predicted.words
-        answer(f"that meets the wish, with {len(plan.stops)} stops: {after}")
     if plan.need is not None and plan.need.met:
         answer(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
     if plan.request.start_q is None:

@@ -16,7 +16,6 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.intrinsics import target_named
-from visioncal.live.capture.assessment import RecordedAccuracy
 from visioncal.live.capture.cell import HostClock, LiveCell
 from visioncal.live.capture.devices import ArmSetup, is_folder, open_arm, open_camera
 from visioncal.live.capture.gate import Consent
@@ -239,20 +238,14 @@ def record_guided(
         DriverError: A device failed, or nothing was recorded.
         DataError: A view cannot be written, or three in a row gave none.
     """
-    prediction = RecordedAccuracy(journal.folder)
     lens = cell.camera.factory or scene.lens
-    try:
-        capture = Capture(
-            *(cell, scene.target, scene.robot, lens, journal, taking, prediction.after, watchers)
-        )
-        if not isinstance(cell.arm, MovingArm):
-            if ask is None:
-                say("Poses are read from stdin, one a line, and no question is asked; q ends.")
-            return ask_and_take(capture, cell.arm, views, ask)
-        say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
-        return follow(capture, views)
-    finally:
-        prediction.close()
+    capture = Capture(cell, scene.target, scene.robot, lens, journal, taking, None, watchers)
+    if not isinstance(cell.arm, MovingArm):
+        if ask is None:
+            say("Poses are read from stdin, one a line, and no question is asked; q ends.")
+        return ask_and_take(capture, cell.arm, views, ask)
+    say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
+    return follow(capture, views)
 
 
 @contextmanager

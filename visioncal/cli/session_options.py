@@ -241,8 +241,6 @@ class StopOptions:
         "What they are for.", "--for", default="hand-eye", metavar="|".join(PURPOSES)
     )
     stops: int | None = _what(f"How many stops: {_USUAL_STOPS}.", min=1, max=500)
-    wish_mm: float | None = _what("Fewer stops where they predict this sigma, in mm.")
-    wish_deg: float | None = _what("The same of the rotation, in degrees.")
     need_mm: float | None = _what(
         "Fewer stops where they predict that 95 % of picks land within so many mm; up to "
         f"{MOST_FOR_NEED} stops where no number is given."

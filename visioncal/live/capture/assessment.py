@@ -1,9 +1,7 @@
 """What the views so far amount to: coverage, advice, predicted accuracy, joints against poses."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -16,9 +14,7 @@ from visioncal.live.drivers.protocols import ArmState
 from visioncal.live.planning.design import Accuracy
 from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.plan_file import PlanFile
-from visioncal.live.planning.recorded import calibrate_partially
 from visioncal.robot import Robot
-from visioncal.session import Session
 
 # Cells of the image in which coverage is counted.
 _ACROSS, _DOWN = 8, 5
@@ -27,8 +23,8 @@ _PIXEL_PX = 0.2
 # Tilts below the first count as frontal; to separate the board's distance from the focal length
 # some must exceed the second [deg].
 _STRAIGHT_DEG, _LEANING_DEG = 10.0, 20.0
-# Number of views before advice is given on tilt and distance, and for a calibration.
-_FIRST, _FEWEST = 3, 3
+# Number of views before advice is given on tilt and distance.
+_FIRST = 3
 # Ratio below which the greatest and the least distance count as one.
 _ONE_DISTANCE = 1.25
 _COVERED = 0.8
@@ -182,42 +178,3 @@ def planned_accuracy(plan: PlanFile) -> Prediction:
         return Accuracy.of(*world.variances(world.covariance(rows))) if rows else None
 
     return after
-
-
-class RecordedAccuracy:
-    """Prediction from calibrating the session on the disk in a background thread.
-
-    It is for the views that were there when the calibration started; a new one starts when the last
-    has ended.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        """Prepares to calibrate a session's folder."""
-        self._folder = folder
-        self._worker = ThreadPoolExecutor(1)
-        self._pending: Future[Accuracy | None] | None = None
-        self._latest: Accuracy | None = None
-
-    def after(self, views: Sequence[int]) -> Accuracy | None:
-        """Accuracy of the newest calibration; None while there is none, or it gave no result."""
-        if self._pending is not None and self._pending.done():
-            self._latest, self._pending = self._pending.result(), None
-        if self._pending is None and len(views) >= _FEWEST:
-            self._pending = self._worker.submit(self._calibrated)
-        return self._latest
-
-    def close(self) -> None:
-        """Waits for a calibration in progress."""
-        self._worker.shutdown()
-
-    def _calibrated(self) -> Accuracy | None:
-        """Accuracy of the camera's pose from the session as it is now."""
-        try:
-            assessment = calibrate_partially(Session.load(self._folder)).known.assessment_or_none
-        except VisioncalError:
-            # Too few views yet; the reason is reported when the session is calibrated.
-            return None
-        if assessment is None:
-            return None
-        variances = np.diag(assessment.covariance)
-        return Accuracy.of(float(variances[3:6].sum()), float(variances[:3].sum()))

@@ -22,14 +22,10 @@ from visioncal.vision.boards.imaging import decode_image
 _OPENING_S, _OPEN_MS, _READ_MS = 5.0, 5000, 1500
 # OpenCV's format of packets as they come, and the code of JPEG files.
 _UNDECODED, _JPEG = -1, cv2.VideoWriter.fourcc(*"MJPG")
-# Streams whose pictures carry the camera's own timestamps.
-_TIMESTAMPED = ("rtsp", "rtsps", "rtmp", "srt")
 # V4L2's value for manual exposure, and its unit [s].
 _MANUAL_EXPOSURE, _EXPOSURE_UNIT_S = 1.0, 1e-4
 # A driver's timestamp no older than this is taken as one of this host's clock [s].
 _RECENT_S = 10.0
-# Greatest relative drift between the clocks of a camera and of this host.
-_DRIFT = 1e-4
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
 # requested one, and one more for network jitter; and the pictures of which the mean counts.
 _INTERVALS, _PACED = 3.0, 50
@@ -61,13 +57,11 @@ class UvcCamera:
         requested = requested or DeviceSetup()
         self.name = f"camera {without_password(str(source))}"
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
-        self._is_timestamped = _scheme(source) in _TIMESTAMPED
         self._capture = _open_capture(source, self.name, requested)
         # JPEG files of a network camera are decoded only when they are asked for: at a high
         # resolution they come faster than they could be decoded.
         self._is_jpeg = self._capture.get(cv2.CAP_PROP_FORMAT) == _UNDECODED
         self.settings = MappingProxyType(_configure(self._capture, requested))
-        self._reported_s, self._ahead_s = math.inf, math.inf
         self._arrivals_s: deque[float] = deque(maxlen=_PACED)
         self._news = threading.Condition()
         # The moment after which the exposure of a requested picture begins, how many were too old
@@ -142,14 +136,6 @@ class UvcCamera:
         """Stamp of the grabbed picture, and earliest possible start of its exposure [s]."""
         reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         before_s = self._arrivals_s[-1] if self._arrivals_s else -math.inf
-        if self._is_timestamped:
-            # Decoding may lag: the least delay so far counts, as far as the clocks drift apart.
-            # Without times, or after a restart of the stream, the time of arrival counts.
-            ahead_s, passed_s = now_s - reported_s, reported_s - self._reported_s
-            if passed_s > 0.0:
-                ahead_s = min(ahead_s, self._ahead_s + _DRIFT * passed_s)
-            self._ahead_s, self._reported_s = ahead_s, reported_s
-            return reported_s + ahead_s, before_s
         # Only V4L2 of Linux reports the kernel's timestamp.
         if now_s - _RECENT_S < reported_s <= now_s:
             return reported_s, reported_s - self._exposure_s
@@ -228,16 +214,14 @@ def without_password(url: str) -> str:
     return f"{scheme}{separator}{authority.rpartition('@')[2]}{slash}{path}" if separator else url
 
 
-def _scheme(source: int | str) -> str:
-    """Scheme of a URL; empty for anything else, such as a GStreamer pipeline that contains one."""
-    if isinstance(source, int) or "!" in source.partition("://")[0]:
-        return ""
-    scheme, separator, _ = source.partition("://")
-    return scheme.lower() if separator else ""
+def _is_url(source: int | str) -> bool:
+    """Whether a source is a URL, and no GStreamer pipeline that contains one."""
+    scheme, separator, _ = str(source).partition("://")
+    return bool(separator) and "!" not in scheme
 
 
 def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.VideoCapture:
-    is_url = bool(_scheme(source))
+    is_url = _is_url(source)
     if is_url and (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
         raise DriverError(
             f"The {name} cannot be set from here: a URL gives nothing but pictures.",

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_root, gram
@@ -24,23 +24,6 @@ from visioncal.live.planning.information import WEAK_SIGMA, World
 _GAIN = 1e-4
 # A sigma above this comes from the weak prior alone: no data determine it [rad or m].
 OPEN_SIGMA = 0.25 * WEAK_SIGMA
-
-
-@dataclass(frozen=True)
-class Wish:
-    """Wished accuracy, as standard deviations; None where that does not matter."""
-
-    mm: float | None = None  # Of the position [mm].
-    deg: float | None = None  # Of the rotation [deg].
-
-    def __post_init__(self) -> None:
-        for name in ("mm", "deg"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < np.inf:
-                raise DataError(
-                    f"the wished accuracy is {value} {name}; a number above zero is needed.",
-                    culprits=[f"wish_{name}"],
-                )
 
 
 @dataclass(frozen=True)
@@ -64,12 +47,6 @@ class Accuracy:
     def words(self) -> str:
         """States it: `0.12 mm and 0.02 deg`."""
         return "not determined" if self.is_open else mm_and_deg(self.mm, self.deg)
-
-    def meets(self, wish: Wish) -> bool:
-        """Whether it is at least as good as wished."""
-        return (wish.mm is None or self.mm <= wish.mm) and (
-            wish.deg is None or self.deg <= wish.deg
-        )
 
 
 class _Reduced:
@@ -179,8 +156,6 @@ class Design:
     history: tuple[Accuracy, ...]
     best: Accuracy  # Accuracy with all candidates.
     best_known_lens_board: Accuracy  # The same if lens and board were known exactly.
-    best_exact_arm: Accuracy  # The same without errors of the arm that a fit treats as noise.
-    met: bool | None  # Whether the wish is met; None where there was none.
 
     @property
     def predicted(self) -> Accuracy:
@@ -193,12 +168,11 @@ class Design:
         return self.history[0]
 
 
-def choose_stops(worlds: Sequence[World], count: int, *, wish: Wish | None = None) -> Design:
-    """Chooses at most `count` of the candidates to add to the recorded stops, the most informative.
+def choose_stops(worlds: Sequence[World], count: int) -> Design:
+    """Chooses `count` of the candidates to add to the recorded stops, the most informative.
 
-    Stops are added greedily until there are enough, or the predicted accuracy meets the wish; then
-    the best unused candidate replaces the least informative stop while that gains (Mitchell 1974,
-    DETMAX, with excursions of one).
+    Stops are added greedily; then the best unused candidate replaces the least informative stop
+    while that gains (Mitchell 1974, DETMAX, with excursions of one).
 
     Raises:
         DataError: There are fewer candidates than stops.
@@ -211,31 +185,23 @@ def choose_stops(worlds: Sequence[World], count: int, *, wish: Wish | None = Non
             next_step="Ask for fewer stops, or make more candidates.",
         )
     with one_blas_thread():
-        # A wish that is met already needs no stop.
         state = _Selection.of(worlds)
-        while len(state.rows) < count and not (wish and state.accuracy.meets(wish)):
+        for _ in range(count):
             state = state.with_best()
         state = _exchanged(state)
-        while wish and state.rows and (fewer := state.without_least()).accuracy.meets(wish):
-            state = fewer
         rows = np.array(state.rows, dtype=np.int64)
         ranking = _Selection.of([world.of_candidates(rows) for world in worlds])
         history = [ranking.accuracy]
         for _ in rows:
             ranking = ranking.with_best()
             history.append(ranking.accuracy)
-        best, known_lens_board, exact_arm = (
+        best, known_lens_board = (
             _Selection.of(assumed).with_rows(list(range(candidates))).accuracy
-            for assumed in (
-                worlds,
-                [world.with_known_lens_board() for world in worlds],
-                [world.without_unestimated_arm() for world in worlds],
-            )
+            for assumed in (worlds, [world.with_known_lens_board() for world in worlds])
         )
-    met = None if wish is None else history[-1].meets(wish)
     sigma_mm = 1e3 * float(np.sqrt(state.variances[0]))
     rows = rows[list(ranking.rows)]
-    return Design(rows, sigma_mm, tuple(history), best, known_lens_board, exact_arm, met)
+    return Design(rows, sigma_mm, tuple(history), best, known_lens_board)
 
 
 def _exchanged(state: _Selection) -> _Selection:
@@ -251,38 +217,3 @@ def _exchanged(state: _Selection) -> _Selection:
             break
         state = exchanged
     return state
-
-
-def shortfall(design: Design, wish: Wish, count: int) -> str:
-    """Explains why at most `count` stops do not meet a wish, and a remedy; empty if they do."""
-    if design.met is not False:
-        return ""
-    wished, predicted, best = (
-        " and ".join(
-            f"{figure(getattr(accuracy, unit))} {unit}"
-            for unit in ("mm", "deg")
-            if getattr(wish, unit) is not None
-        )
-        for accuracy in (wish, design.predicted, design.best)
-    )
-    given = f"{len(design.rows)} stops give {predicted}"
-    if design.best.meets(wish):
-        return (
-            f"{given} of the {wished} that were wished; more than {count} are needed: all "
-            f"candidates together give {best}."
-        )
-    cause = "A larger board, a nearer camera or more room to move would give more."
-    if design.best_known_lens_board.meets(wish):
-        cause = (
-            "The uncertainty of the board's size and the lens is in the way: measure the print, "
-            "and state its square_sigma_m."
-        )
-    elif design.best_exact_arm.meets(wish):
-        cause = (
-            "Errors of the arm that go with its posture are in the way: record joint angles "
-            "(q1_rad ...) with all views, and they are calibrated."
-        )
-    return (
-        f"The wished {wished} cannot be reached from these candidates: all of them together "
-        f"give {best}, and {given}. {cause}"
-    )

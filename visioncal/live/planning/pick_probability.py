@@ -155,7 +155,7 @@ def check_need(need: Need, judged: str) -> None:
         raise DataError(
             "a need is of picks by what the camera sees, and these stops are for the arm.",
             culprits=["need"],
-            next_step="Plan for hand-eye, or wish for a sigma: --wish-mm.",
+            next_step="Plan for hand-eye, or leave the need out.",
         )
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg, percent, some_of
+from visioncal.core.number_format import figure, percent, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.estimation.armmodel import block_size
@@ -19,9 +19,7 @@ from visioncal.live.planning.design import (
     OPEN_SIGMA,
     Accuracy,
     Design,
-    Wish,
     choose_stops,
-    shortfall,
 )
 from visioncal.live.planning.information import WORLDS, World, predict_worlds
 from visioncal.live.planning.path import Route, order_stops
@@ -44,8 +42,6 @@ _ROUNDS = 12
 _NEARLY_AXIS, _ASIDE = 0.95, 0.4
 # A rotation from an earlier stop smaller than this is called a shift [rad].
 _TURN_RAD = 0.17
-# An error of which more than this share remains is reduced "little".
-_LITTLE_SHARE = 0.99
 # Distance at which a rotation error is compared with an offset error [m].
 _LEVER_M = 0.5
 
@@ -56,7 +52,6 @@ class PlanRequest:
 
     purpose: Purpose
     count: int  # Most stops.
-    wish: Wish | None = None  # Accuracy at which fewer stops are enough; None for none.
     candidates: int = 1500
     # Region in which the arm's accuracy counts; None for all of its reach.
     workspace: Box | None = None
@@ -97,9 +92,6 @@ class Plan:
     candidate_count: int  # Number of candidates.
     lost: Mapping[str, int]  # Number of tries that each limit rejected.
     in_the_way: tuple[str, ...]  # What blocked stops that were replaced, one entry for each.
-    # Why the wished accuracy, or the need, is not met, in words; empty where it is met or there is
-    # none.
-    shortfall: str
     need: NeedPlanned | None = None  # Prediction for picks; None where there is no need.
 
 
@@ -144,8 +136,6 @@ def make_plan(
     if request.need is not None:
         picking = Picking(cells, worlds, stops.q, request.need)
         need = need_planned(picking, design.rows, request.count)
-    shortfalls = [] if request.wish is None else [shortfall(design, request.wish, request.count)]
-    shortfalls += [] if need is None else [need.limits]
     return Plan(
         cell,
         request,
@@ -156,7 +146,6 @@ def make_plan(
         len(stops),
         stops.lost,
         in_the_way,
-        " ".join(name for name in shortfalls if name),
         need,
     )
 
@@ -207,19 +196,11 @@ class _Planning:
         )
 
     def _smallest_design(self, rows: IntArray) -> Design:
-        """Design with the fewest stops that meet wish and need, or as many as are allowed."""
+        """Design with the fewest stops that meet the need, or as many as are allowed."""
         request, recorded = self.request, () if self.begun is None else self.begun.views
         needed_stops = CalibrationLimits.stops[0] - len(recorded)
         worlds = tuple(world.of_candidates(rows) for world in self.worlds)
-        design = choose_stops(worlds, request.count, wish=request.wish)
-        if not len(design.rows):
-            before = design.before
-            raise DataError(
-                "plan: the wish is met by what was recorded, which predicts "
-                f"{mm_and_deg(before.mm, before.deg)}; no stop needs to be added.",
-                next_step="Wish for more, or leave the wish out to see what further stops would "
-                "give.",
-            )
+        design = choose_stops(worlds, request.count)
         if request.need is not None:
             picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
             fewest, share = picking.fewest(design.rows)
@@ -236,7 +217,7 @@ class _Planning:
             # The first stops of a large design are not the best small design, which may need one
             # stop less.
             for count in range(max(fewest - 1, 1), len(design.rows)):
-                smaller = choose_stops(worlds, count, wish=request.wish)
+                smaller = choose_stops(worlds, count)
                 if count >= needed_stops and picking.chance(smaller.rows) >= share:
                     design = smaller
                     break
@@ -371,17 +352,5 @@ def _change_words(what: str, before: float, after: float, *, is_rotation: bool) 
     if before > OPEN_SIGMA:
         return f"determines what was open; {what} is now {figure(after * scale)} {unit}"
     figures = f"({figure(before * scale)} -> {figure(after * scale)} {unit})"
-    share = after / before
-    if share > _LITTLE_SHARE:
-        return f"takes little off {what} {figures}"
-    if share > 0.72:
-        return f"takes {100 * (1 - share):.0f} % off {what} {figures}"
-    for least, verb in (
-        (0.58, "takes a third off {}"),
-        (0.42, "halves {}"),
-        (0.28, "cuts {} to a third"),
-        (0.2, "cuts {} to a quarter"),
-    ):
-        if share > least:
-            return f"{verb.format(what)} {figures}"
-    return f"cuts {what} {1 / share:.0f}-fold {figures}"
+    less = 100.0 * (1.0 - after / before)
+    return f"takes {f'{less:.0f} %' if less >= 1.0 else 'little'} off {what} {figures}"

@@ -20,7 +20,7 @@ from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.cell import Box, Limits, PlanCell
-from visioncal.live.planning.design import Accuracy, Wish
+from visioncal.live.planning.design import Accuracy
 from visioncal.live.planning.plan import Plan, PlannedStop, PlanRequest
 from visioncal.live.planning.purposes import Purpose, purpose_of
 from visioncal.robot import Robot, has_ur_axes
@@ -81,8 +81,6 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
     }
     if plan.start is not None and plan.start.refusal:
         document["refusal_before"] = plan.start.refusal
-    if design.met is not None:
-        document["wish_met"] = design.met
     if plan.need is not None:
         document["need"] = {
             **_stated_values(plan.need.need),
@@ -90,8 +88,8 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
             **({} if plan.start is None else {"probability_before": plan.need.before}),
             "probability_of_all_candidates": plan.need.best,
         }
-    if plan.shortfall:
-        document["shortfall"] = plan.shortfall
+    if plan.need is not None and plan.need.limits:
+        document["shortfall"] = plan.need.limits
     document |= {
         "stops": [_stop_document(stop) for stop in plan.stops],
         "joints": list(plan.cell.robot.joint_names),
@@ -111,8 +109,6 @@ def _request_document(request: PlanRequest) -> dict[str, Any]:
         "candidates": request.candidates,
         "seed": request.seed,
     }
-    if request.wish is not None:
-        document["wish"] = _stated_values(request.wish)
     if request.need is not None:
         document["need"] = _stated_values(request.need)
     if request.workspace is not None:
@@ -229,8 +225,8 @@ def _box_document(box: Box) -> dict[str, Any]:
     }
 
 
-def _stated_values(wish: Wish | Need) -> dict[str, float]:
-    return {name: getattr(wish, name) for name in ("mm", "deg") if getattr(wish, name) is not None}
+def _stated_values(need: Need) -> dict[str, float]:
+    return {name: getattr(need, name) for name in ("mm", "deg") if getattr(need, name) is not None}
 
 
 @dataclass(frozen=True, eq=False)

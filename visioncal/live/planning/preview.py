@@ -49,8 +49,8 @@ def _note(stop: PlannedStop) -> str:
 def _plan_note(plan: Plan, name: str) -> str:
     lines = [f"# {len(plan.stops)} stops for {plan.request.purpose.name}", name, ""]
     lines.append(f"{summary_of(plan)}.")
-    if plan.shortfall:
-        lines += ["", f"**{plan.shortfall}**"]
+    if plan.need is not None and plan.need.limits:
+        lines += ["", f"**{plan.need.limits}**"]
     elif note := looks_note(plan):
         lines += ["", note]
     if plan.start is not None and plan.start.refusal:

@@ -32,56 +32,32 @@ _GUESSES, _CHECKED, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
 _BORDER_RAYS = 9
 # Least half width of the field of view at unit distance.
 _NARROWEST = 1e-4
-# Rays along each side of the image, and the relative margin of the bounds for what lies between.
-_RAYS, _BOUND_MARGIN = 33, 2e-3
-
+# Rays along each side of the image.
+_RAYS = 33
 # A line of sight may end on a box, such as the table under a board: only this share must be free.
 _FREE_SHARE, _TINY = 0.99, 1e-12
 
 
 class FieldOfView:
-    """Field of view of a camera.
-
-    A lens bends the image's sides. Points within inner bounds of x / z and y / z are in the image,
-    points beyond outer bounds are not; only points in between need be projected.
-    """
+    """Field of view of a camera."""
 
     def __init__(self, camera: Camera, edge_px: float) -> None:
-        """Prepares the bounds for points that stay `edge_px` from the image's edge [px]."""
+        """Takes a camera, and how far from its image's edge points have to stay [px]."""
         self._camera, self._edge_px = camera, edge_px
         border = _border_tangents(camera, 0.0, _RAYS)
         # Beyond these tangents a lens model may fold back into the image.
         self._largest_tangent = float(np.nanmax(np.linalg.norm(border, axis=-1))) * (1.0 + 1e-6)
-        tangents = _border_tangents(camera, edge_px, _RAYS)
-        margin = _BOUND_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
-        upper, lower, left, right = tangents
-        low = np.column_stack([left[:, 0], upper[:, 1]])
-        high = np.column_stack([right[:, 0], lower[:, 1]])
-        # Of a lens without rays to its corners no point is surely inside, any in front may be.
-        self._inner = low.max(axis=0) + margin, high.min(axis=0) - margin
-        self._outer = (
-            np.nan_to_num(low.min(axis=0) - margin, nan=-np.inf),
-            np.nan_to_num(high.max(axis=0) + margin, nan=np.inf),
-        )
 
     def holds(self, points_cam: FloatArray) -> Mask:
         """Whether all of (..., p, 3) points in the camera frame are in the image (...)."""
-        depth = points_cam[..., 2:]
-        tangents = points_cam[..., :2] / np.where(depth > 0.0, depth, np.nan)
-        inside, possible = (
-            ((tangents >= low) & (tangents <= high)).all(axis=(-1, -2))
-            for low, high in (self._inner, self._outer)
-        )
-        doubtful = ~inside & possible
-        if doubtful.any():
-            flat = points_cam[doubtful].reshape(-1, 3)
-            valid = np.linalg.norm(flat[:, :2], axis=1) < self._largest_tangent * flat[:, 2]
-            px = np.full((len(flat), 2), -np.inf)
-            px[valid] = project_with_jacobian(self._camera, flat[valid], lens=False).px
-            high_px = np.array(self._camera.resolution) - 1.0 - self._edge_px
-            good = ((px >= self._edge_px) & (px <= high_px)).all(axis=1)
-            inside[doubtful] = good.reshape(-1, points_cam.shape[-2]).all(axis=-1)
-        return np.asarray(inside)
+        ahead = points_cam[..., 2] > 0.0
+        reach = np.linalg.norm(points_cam[..., :2], axis=-1)
+        inside = np.asarray((ahead & (reach < self._largest_tangent * points_cam[..., 2])).all(-1))
+        px = project_with_jacobian(self._camera, points_cam[inside].reshape(-1, 3), lens=False).px
+        high_px = np.array(self._camera.resolution) - 1.0 - self._edge_px
+        good = ((px >= self._edge_px) & (px <= high_px)).all(axis=1)
+        inside[inside] = good.reshape(-1, points_cam.shape[-2]).all(axis=-1)
+        return inside
 
 
 def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
