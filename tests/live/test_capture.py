@@ -4,7 +4,6 @@ import errno
 import shutil
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from support.killed import kill_and_resume
@@ -116,26 +115,6 @@ def test_a_knock_between_frames_throws_all_of_them_away(plan, tmp_path):
     session = Session.load(tmp_path / "live")
     assert knocks
     assert max(errors_m(session, camera)) < REPEATABILITY_M
-
-
-def test_the_sharpest_frame_is_kept_or_the_mean(plan, tmp_path):
-    for keep in ("sharpest", "mean"):
-        arm, camera = fake_devices(plan)
-        camera.noise = 6.0
-        options = replace(QUICK, frames=6, keep=keep)
-        recorded(tmp_path / keep, plan, arm, camera, options)
-    means, singles = (
-        np.std(_corner_of_first(tmp_path / keep).astype(float)) for keep in ("mean", "sharpest")
-    )
-    # Noise of 6 levels, and of 6 over the root of 6 with the rounding to whole levels.
-    assert singles == pytest.approx(6.0, rel=0.15)
-    assert means == pytest.approx(6.0 / np.sqrt(6.0), rel=0.15)
-
-
-def _corner_of_first(folder) -> np.ndarray:
-    """A part of the first image that shows nothing but the even backdrop."""
-    image = cv2.imread(str(folder / "images" / "001.png"), cv2.IMREAD_GRAYSCALE)
-    return image[:20, :40]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from visioncal.live.drivers.ur_net import (
     connect,
     read_condition,
     read_tool_offset,
-    resolve,
 )
 from visioncal.live.simulated.controller import ControllerOptions, free_host, spawn
 
@@ -125,8 +124,8 @@ def test_another_service_at_the_port_is_no_controller():
 def test_closed_ports_and_unknown_names_are_told_apart():
     with pytest.raises(DriverError, match=r"port 29999 \(the dashboard\) is closed"):
         read_condition(free_host())
-    with pytest.raises(DriverError, match=r"'no-such-robot.invalid' is not known"):
-        resolve("no-such-robot.invalid")
+    with pytest.raises(DriverError, match=r"no-such-robot\.invalid cannot be reached"):
+        read_condition("no-such-robot.invalid")
 
 
 def test_an_address_that_nobody_has_is_unreachable(monkeypatch):

@@ -52,7 +52,6 @@ def record_command(options: RecordOptions) -> None:
     taking = CaptureOptions(
         speed=takes.speed,
         frames=takes.frames,
-        keep=takes.keep,
         still=Stillness(image_px=takes.still_px, quiet_s=takes.settle_s),
         # A folder provides each picture once.
         single=is_folder(options.camera),

@@ -32,7 +32,7 @@ from visioncal.core.choices import (
     Faults,
     Mount,
 )
-from visioncal.live.capture.options import Keep, Stillness
+from visioncal.live.capture.options import Stillness
 from visioncal.live.planning.purposes import PURPOSES
 
 # Options by their headings in the help.
@@ -388,7 +388,6 @@ class TakingOptions:
     """How views are taken."""
 
     frames: int = _taking("Frames a view.", default=3, min=1, max=100)
-    keep: Keep = _taking("The sharpest of these, or their mean.", default="sharpest")
     still_px: float = _taking(
         "Image motion above which no view is taken.", default=Stillness.image_px, min=0.01, max=10.0
     )

@@ -1,12 +1,10 @@
 """Options of a recording."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.errors import DataError
 
-Keep = Literal["sharpest", "mean"]
 # Fastest joint speed at which a person can watch with a hand on the stop button [rad/s].
 FASTEST = 1.5
 
@@ -32,8 +30,7 @@ class CaptureOptions:
 
     speed: float = PLAN_SPEED  # Speed of the joint that travels farthest [rad/s].
     acceleration: float = PLAN_ACCELERATION  # Its acceleration [rad/s^2].
-    frames: int = 3  # Frames per view.
-    keep: Keep = "sharpest"  # Whether the sharpest frame is kept, or their mean.
+    frames: int = 3  # Frames per view, of which the sharpest is kept.
     # Limits within which arm and image count as still.
     still: Stillness = field(default_factory=Stillness)
     # Whether every frame is of another pose, as in a folder of pictures; it is then taken without

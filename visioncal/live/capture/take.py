@@ -1,7 +1,7 @@
-"""Taking a view: wait for arm and image to settle, take frames, keep one or their mean."""
+"""Taking a view: wait for arm and image to settle, take frames, keep the sharpest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -36,7 +36,7 @@ _GREY_DIFFERENCE = 25.0
 class TakenView:
     """A view."""
 
-    frame: Frame  # The sharpest frame, or the mean of all.
+    frame: Frame  # The sharpest frame.
     state: ArmState  # The arm at its exposure.
     corners: Corners  # Corners detected in it.
     motion_px: float  # Image motion from the first to the last frame [px].
@@ -112,7 +112,7 @@ def take(
             frames.append(_StillFrame.of(cell))
             reason, motion_px = first.why_moved(frames[-1], options.still)
         if not reason:
-            return _selected(frames, target, view, options, motion_px), settled_s
+            return _selected(frames, target, view, motion_px), settled_s
     return Missed(f"something moved during every exposure: {reason}"), settled_s
 
 
@@ -134,13 +134,9 @@ def _settled(cell: LiveCell, options: CaptureOptions) -> tuple[_StillFrame, _Sti
 
 
 def _selected(
-    frames: Sequence[_StillFrame],
-    target: Target,
-    view: int,
-    options: CaptureOptions,
-    motion_px: float,
+    frames: Sequence[_StillFrame], target: Target, view: int, motion_px: float
 ) -> TakenView | Missed:
-    """The view of the sharpest frame, or of the mean of all."""
+    """The view of the sharpest frame."""
 
     def detected(still: _StillFrame) -> TakenView | Missed:
         corners, _ = find_corners(_grey(still.frame.image), target, view)
@@ -152,13 +148,6 @@ def _selected(
         )
         return TakenView(still.frame, nearer, corners, motion_px)
 
-    if options.keep == "mean":
-        # With the arm's state at the middle one.
-        middle = frames[len(frames) // 2]
-        images = np.stack([frame.frame.image for frame in frames]).astype(np.float32)
-        mean: Image = np.asarray(np.rint(images.mean(axis=0)), dtype=np.uint8)
-        stamp_s = float(np.mean([frame.frame.stamp_s for frame in frames]))
-        return detected(replace(middle, frame=replace(middle.frame, image=mean, stamp_s=stamp_s)))
     first = detected(frames[0])
     if isinstance(first, Missed):
         return first

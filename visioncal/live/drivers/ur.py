@@ -31,7 +31,6 @@ from visioncal.live.drivers.ur_net import (
     connect,
     read_condition,
     read_tool_offset,
-    resolve,
     safety_of,
 )
 
@@ -257,7 +256,7 @@ class UrArm:
     def __init__(self, host: str, *, watch_only: bool = False) -> None:
         receive = client_library("rtde_receive", _EXTRA)
         control = None if watch_only else client_library("rtde_control", _EXTRA)
-        self._host = resolve(host)
+        self._host = host
         condition = check_controller(self._host, moves=not watch_only)
         self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
         self._states = StateStream(receive, self._host, condition.version)
@@ -529,12 +528,11 @@ class UrMotion:
 
     def __init__(self, host: str) -> None:
         receive = client_library("rtde_receive", _EXTRA)
-        address = resolve(host)
-        condition = check_controller(address, moves=False)
+        condition = check_controller(host, moves=False)
         self.name = f"{condition.model} at {host}"
         self.model = condition.model.lower()
         self.rate_hz = _RATES_HZ[condition.version[0]]
-        self._states = StateStream(receive, address, condition.version, self.rate_hz)
+        self._states = StateStream(receive, host, condition.version, self.rate_hz)
 
     def sample(self) -> JointSample:
         """Waits for the next state that the controller sends.

@@ -6,11 +6,9 @@ message is its size, its type and its content; a robot state message (16) holds 
 form; numbers are big-endian (Universal Robots, "Remote Control Via TCP/IP").
 """
 
-import queue
 import re
 import socket
 import struct
-import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -74,35 +72,6 @@ _SAFETY_BITS: tuple[tuple[int, Safety], ...] = (
     (1 << 2 | 1 << 3 | 1 << 4, "protective-stop"),
     (1 << 1, "reduced"),
 )
-
-
-def resolve(host: str) -> str:
-    """Resolves a host's name to its address, such as `192.168.0.10`.
-
-    Raises:
-        DriverError: The name is not known, or no name server answers in time.
-    """
-    result: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
-
-    def ask() -> None:
-        try:
-            result.put(socket.gethostbyname(host))
-        except OSError as error:
-            result.put(error)
-
-    # The system's resolver takes many seconds, and has no timeout.
-    threading.Thread(target=ask, daemon=True).start()
-    try:
-        address = result.get(timeout=_ANSWER_S)
-    except queue.Empty:
-        address = TimeoutError(f"no answer within {_ANSWER_S} s")
-    if isinstance(address, str):
-        return address
-    raise DriverError(
-        f"The robot's address {host!r} is not known: {address.strerror or address}.",
-        culprits=[host],
-        next_step="Give the IP address that the pendant shows (Settings > System > Network).",
-    ) from address
 
 
 def connect(host: str, port: int, what: str) -> socket.socket:

@@ -12,11 +12,11 @@ and packages of size, type and content. Numbers are big-endian.
 """
 
 import asyncio
+import itertools
 import multiprocessing
 import os
 import re
 import signal
-import socket
 import struct
 import threading
 import time
@@ -82,6 +82,8 @@ _SAFETY = {
 _MODES = {"POWER_OFF": 3, "RUNNING": 7}
 # States are dropped for a client with this many unread bytes; period of primary messages [s].
 _BUFFER_BYTES, _PRIMARY_EVERY_S = 1 << 20, 0.1
+# Numbers of the controllers that this process has started.
+_STARTED = itertools.count()
 # The last line of the client's program.
 _END = re.compile(rb"^end\s*$", re.MULTILINE)
 _Handler: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
@@ -562,12 +564,12 @@ class SimulatedController:
 
 
 def spawn(options: ControllerOptions | None = None, host: str | None = None) -> SimulatedController:
-    """Starts a simulated controller at a loopback address such as `127.0.0.2`; None for any free.
+    """Starts a simulated controller at a loopback address such as `127.0.0.2`; None for its own.
 
     Raises:
         DriverError: It does not start, for example because a port is taken.
     """
-    host = free_host() if host is None else host
+    host = host or free_host()
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     arguments = (options or ControllerOptions(), host, there)
@@ -589,26 +591,9 @@ def spawn(options: ControllerOptions | None = None, host: str | None = None) -> 
 
 
 def free_host() -> str:
-    """Finds a loopback address on which no port of a controller is taken.
-
-    Raises:
-        DriverError: There is none, as on systems whose loopback is one address only.
-    """
-    for step in range(200):
-        # Processes start at different ones.
-        number = os.getpid() + 251 * step
-        host = f"127.{number // 62500 % 250 + 2}.{number // 250 % 250 + 2}.{number % 250 + 2}"
-        with suppress(OSError), ExitStack() as probes:
-            for port in PORTS:
-                probe = probes.enter_context(socket.socket())
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind((host, port))
-            return host
-    raise DriverError(
-        "No loopback address with free ports was found for a simulated controller.",
-        culprits=["127.0.0.0/8"],
-        next_step="End other simulated controllers.",
-    )
+    """A loopback address that no controller of this process has, nor of another one."""
+    number = os.getpid() + 251 * next(_STARTED)
+    return f"127.{number // 62500 % 250 + 2}.{number // 250 % 250 + 2}.{number % 250 + 2}"
 
 
 def _serve(options: ControllerOptions, host: str, pipe: "Connection[Any, Any]") -> None:
