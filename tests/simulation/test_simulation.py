@@ -133,13 +133,12 @@ def test_stretched_ur_arm_is_where_its_data_sheet_puts_it():
 
 
 @pytest.mark.parametrize("camera", [wide_camera(), RATIONAL, fine_camera(), fisheye_camera()])
-def test_projection_agrees_with_opencv_and_rays_invert_it(camera):
+def test_rays_invert_the_projection(camera):
     rng = np.random.default_rng(3)
     px = rng.uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
     points = rays(camera, px) * rng.uniform(0.2, 3.0, (500, 1))
     # Pixels of order a thousand, in double precision.
     np.testing.assert_allclose(project(camera, points), px, atol=1e-9)
-    np.testing.assert_allclose(cv_project(camera, points), px, atol=1e-9)
 
 
 def test_wrong_number_of_coefficients_is_named():

@@ -13,7 +13,8 @@ from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, CameraMount, FloatArray
 from visioncal.live.drivers.protocols import ArmState, Frame, Safety
 from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.plan_file import PlanFile, Stop
+from visioncal.live.planning.plan import Stop
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate

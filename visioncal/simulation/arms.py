@@ -31,7 +31,7 @@ GRAVITY = np.array([0.0, 0.0, -9.80665])
 _ROUNDS = 8
 # Masses [kg] and centres of mass [m] in the link frames, from Universal Robots, "DH parameters for
 # calculations of kinematics and dynamics"; round numbers for the other arm.
-_BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
+BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     "ur3e": (
         (1.98, (0.0, -0.02, 0.0)),
         (3.4445, (0.13, 0.0, 0.1157)),
@@ -332,7 +332,7 @@ def load_torques(arm: DhArm, joints: FloatArray, payloads: Sequence[Payload]) ->
     They are computed from the simulated arm's own frames, independent of the application's model.
     """
     frames = link_frames(arm, joints)
-    kg, centres = (np.array(pair) for pair in zip(*_BODIES[arm.name], strict=True))
+    kg, centres = (np.array(pair) for pair in zip(*BODIES[arm.name], strict=True))
     weights = kg[:, None] * GRAVITY
     lever = frames[:, 1:, :3, :3] @ centres[:, :, None]
     places = lever[..., 0] + frames[:, 1:, :3, 3]

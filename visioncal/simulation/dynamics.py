@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
-from visioncal.simulation.arms import GRAVITY, DhArm, link_frames, ur_arm
+from visioncal.simulation.arms import BODIES, GRAVITY, DhArm, link_frames, ur_arm
 from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.records import write_truth
 
@@ -21,24 +21,16 @@ from visioncal.simulation.records import write_truth
 _HARMONICS = 5
 # Relative standard deviation of masses and inertias from the published values.
 _INERTIA_ERROR = 0.2
-# Mass [kg], centre of mass [m] and principal moments of inertia about it [kg m^2], in the link
-# frames: Universal Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
-_BODIES: Mapping[str, Sequence[tuple[float, Sequence[float], Sequence[float]]]] = {
+# Principal moments of inertia about the centres of mass [kg m^2], in the link frames: Universal
+# Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
+_INERTIA: Mapping[str, Sequence[Sequence[float]]] = {
     "ur5e": (
-        (3.761, (0.0, -0.0256, 0.0019), (0.0084, 0.0064, 0.0084)),
-        (8.058, (0.2125, 0.0, 0.1134), (0.0078, 0.21, 0.21)),
-        (2.846, (0.15, 0.0, 0.0265), (0.0016, 0.0462, 0.0462)),
-        (1.37, (0.0, -0.0018, 0.0163), (0.0016, 0.0016, 0.0009)),
-        (1.3, (0.0, 0.0018, 0.0163), (0.0016, 0.0016, 0.0009)),
-        (0.365, (0.0, 0.0, -0.0012), (0.0001, 0.0001, 0.0001)),
+        *((0.0084, 0.0064, 0.0084), (0.0078, 0.21, 0.21), (0.0016, 0.0462, 0.0462)),
+        *((0.0016, 0.0016, 0.0009), (0.0016, 0.0016, 0.0009), (0.0001, 0.0001, 0.0001)),
     ),
     "ur10e": (
-        (7.369, (0.021, 0.0, 0.027), (0.0341, 0.0353, 0.0216)),
-        (13.051, (0.38, 0.0, 0.158), (0.0281, 0.7707, 0.7694)),
-        (3.989, (0.24, 0.0, 0.068), (0.0101, 0.3093, 0.3065)),
-        (2.1, (0.0, 0.007, 0.018), (0.003, 0.0022, 0.0026)),
-        (1.98, (0.0, 0.007, 0.018), (0.003, 0.0022, 0.0026)),
-        (0.615, (0.0, 0.0, -0.026), (0.0004, 0.0004, 0.0005)),
+        *((0.0341, 0.0353, 0.0216), (0.0281, 0.7707, 0.7694), (0.0101, 0.3093, 0.3065)),
+        *((0.003, 0.0022, 0.0026), (0.003, 0.0022, 0.0026), (0.0004, 0.0004, 0.0005)),
     ),
 }
 # Typical Coulomb [N m] and viscous friction [N m s/rad] of each joint.
@@ -109,13 +101,14 @@ def nominal_dynamics(name: str) -> DynamicArm:
     Raises:
         DataError: The arm's dynamics are unknown.
     """
-    if name not in _BODIES:
+    if name not in _INERTIA:
         raise DataError(
             f"simulation: nothing is known of the dynamics of {name!r}, only of "
-            f"{', '.join(sorted(_BODIES))}."
+            f"{', '.join(sorted(_INERTIA))}."
         )
     bodies = tuple(
-        LinkBody(kg, np.array(centre), np.diag(main)) for kg, centre, main in _BODIES[name]
+        LinkBody(kg, np.array(centre), np.diag(main))
+        for (kg, centre), main in zip(BODIES[name], _INERTIA[name], strict=True)
     )
     zeros = np.zeros(len(bodies))
     return DynamicArm(ur_arm(name), bodies, Gears(zeros, zeros, zeros, zeros, zeros + 1.0, zeros))
@@ -138,7 +131,7 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
     """
     nominal = nominal_dynamics(name)
     count = len(nominal.bodies)
-    scale = nominal.bodies[1].kg / _BODIES["ur5e"][1][0]
+    scale = nominal.bodies[1].kg / BODIES["ur5e"][1][0]
 
     def around(values: Sequence[float]) -> FloatArray:
         return np.asarray(scale * np.array(values) * rng.uniform(0.7, 1.3, count))

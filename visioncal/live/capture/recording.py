@@ -20,7 +20,8 @@ from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
 from visioncal.live.drivers.protocols import Arm, ArmState
 from visioncal.live.planning.design import Accuracy
-from visioncal.live.planning.plan_file import PlanFile, Stop
+from visioncal.live.planning.plan import Stop
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 from visioncal.vision.boards.imaging import decode_image
 

@@ -63,18 +63,24 @@ class PlanRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedStop:
-    """A planned stop."""
+class Stop:
+    """A stop to drive to."""
 
     view: int  # Number of the view to be taken there.
     q: FloatArray  # (n,) joint angles [rad].
     # (j, n) via postures after the previous stop, connected straight in joint space [rad].
     via: FloatArray
+    words: str  # What the stop contributes.
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedStop(Stop):
+    """A stop with what is predicted of it."""
+
     base_from_flange: FloatArray  # (4, 4) flange, by the robot's model [m].
     cam_from_target: FloatArray  # (4, 4) board in the camera if the guesses are right [m].
     seen: float  # Share of the uncertain cell's draws in which the whole board is in the image.
     rank: int  # 1 for the most informative stop, 2 for the next, ...
-    words: str  # What the stop contributes.
     before: Accuracy  # Accuracy predicted with the recorded stops and those of lower rank number.
     after: Accuracy  # The same with this one.
 
@@ -244,11 +250,11 @@ class _Planning:
                 int(numbers[row]),
                 q[row],
                 via,
+                contributions[row],
                 flange[row],
                 found.cam_from_target[design.rows[row]],
                 float(found.seen[design.rows[row]]),
                 row + 1,
-                contributions[row],
                 design.history[row],
                 design.history[row + 1],
             )

@@ -21,7 +21,7 @@ from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.design import Accuracy
-from visioncal.live.planning.plan import Plan, PlannedStop, PlanRequest
+from visioncal.live.planning.plan import Plan, PlannedStop, PlanRequest, Stop
 from visioncal.live.planning.purposes import Purpose, purpose_of
 from visioncal.robot import Robot, has_ur_axes
 from visioncal.session.columns import POSE, pose_row
@@ -227,16 +227,6 @@ def _box_document(box: Box) -> dict[str, Any]:
 
 def _stated_values(need: Need) -> dict[str, float]:
     return {name: getattr(need, name) for name in ("mm", "deg") if getattr(need, name) is not None}
-
-
-@dataclass(frozen=True, eq=False)
-class Stop:
-    """A stop to drive to."""
-
-    view: int  # Number of the view to be taken there.
-    q: FloatArray  # (n,) joint angles [rad].
-    via: FloatArray  # (j, n) via postures after the previous stop [rad].
-    words: str = ""  # What it contributes.
 
 
 @dataclass(frozen=True, eq=False)
