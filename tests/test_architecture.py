@@ -36,7 +36,7 @@ HOMES = {
     "rerun": {"present.recording", "present.viewer"},
     "pinocchio": {"robot"},
     "matplotlib": {"vision.printing", "present.report"},
-    "jinja2": {"present.report", "present.recording"},
+    "jinja2": {"present"},
     "pydantic": {"core.arguments", "session"},
     "yaml": {"core.documents", "interchange.exports"},
     "typer": {"cli"},
