@@ -22,12 +22,7 @@ EXAMPLES = {
 }
 
 PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
-QUICK = (
-    "an_arm_with_a_urdf",
-    "fixed_camera_over_a_bin",
-    "weekly_check_by_cron",
-    "pictures_and_a_table",
-)
+QUICK = ("an_arm_with_a_urdf", "weekly_check_by_cron")
 
 
 # The quicker ones are run each time.

@@ -141,6 +141,7 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert np.linalg.norm(away[3:]) < 2.5e-4
 
 
+@pytest.mark.slow
 def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found():
     """The later push is found first."""
     pushes = (Moved("target_floor", 4), Moved("target_floor", 10))
@@ -176,6 +177,7 @@ def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
         assert off(cell, found, *frames)[1] < 22.0
 
 
+@pytest.mark.slow
 def test_a_board_of_a_wholly_other_size_is_found_and_the_cell_is_where_it_is():
     """Five per cent: the chain is not linear in a size so far off, and lenses seem to breathe."""
     floor, _, plate = OPTIONS.boards
@@ -474,7 +476,7 @@ def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     assert reason == "nothing ties cam_apart to the rest of the cell"
 
 
-@pytest.mark.parametrize("camera", [LEFT.camera, fine_camera()])
+@pytest.mark.parametrize("camera", [LEFT.camera, slow(fine_camera())])
 def test_a_camera_that_one_standing_view_ties_is_told_what_ties_it_better(camera):
     far = replace(LEFT, place_m=(0.0, -1.5, 1.6), camera=camera)
     boards, cameras = (FLOOR, BoardAt("plate_b", "b")), (far, CameraAt("hand", on="a"))
@@ -542,6 +544,7 @@ def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
         calibrate(turned, corners=corners)
 
 
+@pytest.mark.slow
 def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     springs = (1e-4, 1e-4, 8e-5, 2e-5, 2e-5, 1e-5)
     loads = (Payload(0.0, (0.0, 0.0, 0.0)), Payload(8.0, (0.0, 0.0, 0.08)))

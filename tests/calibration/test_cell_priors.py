@@ -119,6 +119,7 @@ def test_a_prior_of_no_fixed_place_is_refused(cell, prior, words):
     assert words in f"{raised.value.message} {raised.value.next_step}".replace("Did", "did")
 
 
+@pytest.mark.slow
 def test_cameras_of_other_mounts_take_priors_too():
     options = NetworkOptions(stops=STOPS, cameras=(CameraAt("hand", "a"), CameraAt("left")))
     cell = simulate(options)

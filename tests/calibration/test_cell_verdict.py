@@ -195,6 +195,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
     assert not any(reason.startswith(("cam_left: ", "cam_hand: ")) for reason in verdict.reasons)
 
 
+@pytest.mark.slow
 def test_a_board_that_is_bent_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
     verdict = calibrate(recorded(simulate(replace(CELL, boards=boards)))).verdict
@@ -298,6 +299,7 @@ def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, 
         assert found[0].words.startswith(words)
 
 
+@pytest.mark.slow
 def test_poses_that_were_measured_worse_than_others_are_no_outliers():
     # A board that is seen squarely turns unseen: errors of its pose have no single size.
     poses = cell_session(simulate(replace(CELL, seed=6)), "two arms", seen="poses")

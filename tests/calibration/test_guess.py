@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from support.commands import visioncal as visioncal_command
 from support.fuzz.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
 from support.marks import slow
@@ -396,22 +396,6 @@ def doosan(data):
     return robot, np.array([from_rvec(board["rvec"], board["tvec"]) for board in boards])
 
 
-def ethz(data):
-    """Robot and target streams, paired at the slow moments with the offset that the README has."""
-    folder = data / "pose_pairs_small/ethz_unsynchronised_streams"
-    robot = np.loadtxt(next(folder.glob("*hinge.csv")), delimiter=",")
-    target = np.loadtxt(next(folder.glob("*target_ir.csv")), delimiter=",")
-    times = target[:, 0] + 0.02
-    inside = (times > robot[0, 0]) & (times < robot[-1, 0])
-    target, times = target[inside], times[inside]
-    turns = Slerp(robot[:, 0], Rotation.from_quat(robot[:, 4:]))(times)
-    places = np.stack([np.interp(times, robot[:, 0], robot[:, at]) for at in (1, 2, 3)], axis=1)
-    speed = np.linalg.norm(np.gradient(places, times, axis=0), axis=1)
-    slow = np.sort(np.argsort(speed)[:200])[::5]
-    camera = compose(Rotation.from_quat(target[:, 4:]).as_matrix(), target[:, 1:4])
-    return compose(turns.as_matrix(), places)[slow], camera[slow]
-
-
 def test_real_poses_in_two_units_are_read_right(real_data):
     robot, camera = doosan(real_data)
     told = PoseNumbers(
@@ -426,13 +410,6 @@ def test_real_poses_in_two_units_are_read_right(real_data):
     assert guess.best.changes == 1
     # Park's solution of all views leaves 1.6 mm; these are the 70 % that agree best.
     assert guess.best.rms_mm < 1.6
-
-
-def test_a_real_stream_that_is_inverse_is_named(real_data):
-    robot, camera = ethz(real_data)
-    guess = guess_reading(numbers(robot), numbers(camera), "eye-in-hand")
-    assert guess.stands_out
-    assert guess.best.words == "the camera's poses inverse"
 
 
 def test_a_real_session_of_images_is_not_accused(real_data):

@@ -167,6 +167,7 @@ def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
     assert 0.3 < np.mean(ratios) < 2.0
 
 
+@pytest.mark.slow
 def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
     options = replace(ANYHOW, function_sigma_rad=3e-4, function_length_rad=0.12)
     place = lot(options, 20)

@@ -369,7 +369,7 @@ def test_a_push_is_found_in_few_views_of_an_arm_that_errs():
     assert {*ids(calibrated(simulate(options)).verdict)} <= {"optimism"}
 
 
-@pytest.mark.parametrize(("since", "mount"), [(24, "eye-in-hand"), (6, "eye-to-hand")])
+@pytest.mark.parametrize(("since", "mount"), [(24, "eye-in-hand"), slow(6, "eye-to-hand")])
 def test_views_left_out_after_a_bump_name_it_before_the_errors_of_the_arm(mount, since):
     options = CellOptions(mount=mount, seed=2, views=30, dh_sigma_m=3e-4, dh_sigma_rad=3e-4)
     before, after = (

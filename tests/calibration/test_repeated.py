@@ -142,6 +142,7 @@ def test_still_boards_seen_often_outvote_no_robot():
         assert off(cell, found, name) < 22.5, name
 
 
+@pytest.mark.slow
 def test_rows_of_a_cell_in_which_the_robot_stands_still_are_of_one_stop():
     _, session = of_a_cell(3, stops=True, seed=1)
     _, unnamed = of_a_cell(3, stops=False, seed=1)

@@ -273,6 +273,7 @@ def test_poses_that_close_under_no_reading_are_not_written(cell, tmp_path):
     assert not (tmp_path / "fixed").exists()
 
 
+@pytest.mark.slow
 def test_poses_that_no_reading_explains_are_wrong_where_the_joints_agree(cell):
     def exchanged(rows):
         for row in rows:

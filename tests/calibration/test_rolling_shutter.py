@@ -154,6 +154,7 @@ def test_poses_that_others_measured_say_nothing_of_rows():
     assert calibrate(session).clock.shutter is None
 
 
+@pytest.mark.slow
 def test_a_camera_of_a_whole_cell_has_its_own():
     cell = cell_of(NetworkOptions(stops=16, seed=1), replace(HOW, readout_s=READOUT_S))
     session, corners = swept_session(cell)

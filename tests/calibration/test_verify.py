@@ -200,6 +200,7 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
 
 
+@pytest.mark.slow
 def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
     cell = simulate(replace(options, views=FITTED + 20))

@@ -18,7 +18,7 @@ from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
 
 # Of each kind of advice one; the others are slow.
-QUICK = ("two rows exchanged", "two images missing", "columns rx, ry, rz", "another dictionary")
+QUICK = ("two rows exchanged", "two images missing", "columns rx, ry, rz")
 # Read as they are, as tests of tables show: what is then printed is that of semicolons.
 ALIKE = ("decimal commas", "a byte-order mark", "empty rows")
 
@@ -151,6 +151,7 @@ def test_of_a_fixture(place):
             assert list(failures(done.said)) == []
 
 
+@pytest.mark.slow
 def test_of_a_whole_cell(place):
     recorded(simulate(OPTIONS)).save(place / "cell")
 

@@ -161,6 +161,7 @@ def test_a_short_search_already_beats_random_motions(found):
     assert found.starts == 1
 
 
+@pytest.mark.slow
 def test_a_slow_computer_finds_the_same_motion_unless_a_limit_of_time_is_wished(monkeypatch):
     allowed = motion_limits(small_arm(), MotionMargins())
     wished = replace(QUICK, steps=3, harmonics=3, starts=2)

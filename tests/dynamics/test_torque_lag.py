@@ -133,6 +133,7 @@ def test_late_torques_are_named_and_taken_earlier(sessions, tmp_path):
         assert (result.validation.rms_nm < 1.25 * known).all()
 
 
+@pytest.mark.slow
 def test_late_torques_of_another_day_are_taken_earlier_too(sessions, tmp_path):
     asked = ("--stream", "excite", "--validate-on", "fresh", "-o", tmp_path)
     assert run("dynamics", "identify", sessions[0.0], *asked).status == 0
