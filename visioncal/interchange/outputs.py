@@ -110,14 +110,7 @@ def write_outputs(
 def write_check(
     folder: Path, check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict", document: str
 ) -> Written:
-    """Writes a check's page and JSON into a folder, atomically.
-
-    Returns:
-        The files that were written: the JSON even where drawing the page failed.
-
-    Raises:
-        DataError: The folder cannot be written; the files in it are unchanged.
-    """
+    """Writes a check's page and JSON into a folder; see `write_outputs`."""
 
     def page(path: Path) -> None:
         from visioncal.present.report.check import render_check
@@ -142,14 +135,9 @@ def refuse_calibration(folder: Path) -> None:
 
 
 def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
-    """Writes a plan's table, program, preview and JSON into a folder, atomically.
+    """Writes a plan's table, program, preview and JSON into a folder; see `write_outputs`.
 
-    Returns:
-        The files that were written: all but the preview even where drawing that failed. Robots that
-        are not programmed like a UR get no program, and that of an earlier plan is removed.
-
-    Raises:
-        DataError: The folder cannot be written; the files in it are unchanged.
+    Robots that are not programmed like a UR get no program, and that of an earlier plan is removed.
     """
 
     def draw(path: Path) -> None:
@@ -172,14 +160,9 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
 def write_motions(
     folder: Path, plan: "MotionPlan", rate_hz: float, document: Mapping[str, Any]
 ) -> Written:
-    """Writes planned motions as tables, preview and JSON, atomically.
+    """Writes planned motions as tables, preview and JSON; see `write_outputs`.
 
-    Returns:
-        The files that were written: all but the preview even where drawing that failed. Files of
-        an earlier plan that this one lacks are removed.
-
-    Raises:
-        DataError: The folder cannot be written; the files in it are unchanged.
+    Files of an earlier plan that this one lacks are removed.
     """
 
     def draw(path: Path) -> None:
@@ -198,14 +181,7 @@ def write_motions(
 
 
 def write_dynamics(folder: Path, run: "Run") -> Written:
-    """Writes identified dynamics, their report and recording into a folder, atomically.
-
-    Returns:
-        The files that were written: the result even where drawing the others failed.
-
-    Raises:
-        DataError: The folder cannot be written; the files in it are unchanged.
-    """
+    """Writes identified dynamics, their report and recording; see `write_outputs`."""
 
     def report(path: Path) -> None:
         from visioncal.present.report.dynamics import render_dynamics

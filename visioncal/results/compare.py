@@ -1,7 +1,7 @@
 """Comparison of two calibrations of one cell: tests of changes against noise."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -339,12 +339,12 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
     return _NOTHING
 
 
+# Keys of the document where they differ from the fields' names; None for those by name.
+_KEYS = {"a": "first", "b": "second", "significance": "test", "name": None}
+
+
 def to_document(comparison: Comparison) -> dict[str, Any]:
     """Document of `visioncal diff --json`; what was not computed is absent."""
-
-    def test(significance: Significance) -> dict[str, Any]:
-        return {"is_change": significance.is_change, **asdict(significance)}
-
     document: dict[str, Any] = {
         "is_change": comparison.is_change,
         "findings": list(comparison.findings),
@@ -352,38 +352,30 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         "mounts": list(comparison.mounts),
         "verdicts": list(comparison.verdicts),
         "transforms": {
-            edge.name: {
-                "is_change": edge.is_change,
-                "moved_mm": edge.moved_mm,
-                "moved_deg": edge.moved_deg,
-                "sigma_mm": edge.sigma_mm,
-                "sigma_deg": edge.sigma_deg,
-                "twist": edge.twist.tolist(),
-                "covariance": edge.covariance.tolist(),
-                "translation": test(edge.translation),
-                "rotation": test(edge.rotation),
-            }
+            edge.name: _written(edge) | {"sigma_mm": edge.sigma_mm, "sigma_deg": edge.sigma_deg}
             for edge in comparison.edges
         },
         "only_in_first": list(comparison.only_in_a),
         "only_in_second": list(comparison.only_in_b),
-        "noise": {
-            level.name: {
-                which: value
-                for which, value in (("first", level.a), ("second", level.b))
-                if value is not None
-            }
-            for level in comparison.noise
-        },
+        "noise": {level.name: _written(level) for level in comparison.noise},
     }
-    lens = comparison.lens
-    if lens is not None:
-        names, values = list(lens.names), {"first": lens.a.tolist(), "second": lens.b.tolist()}
-        document["camera"] = {"is_change": lens.is_change, "names": names, **values}
-        if lens.sigmas is not None and lens.significance is not None:
-            tested = {"sigmas": lens.sigmas.tolist(), "test": test(lens.significance)}
-            document["camera"] |= tested
-    return document
+    return (
+        document if comparison.lens is None else {**document, "camera": _written(comparison.lens)}
+    )
+
+
+def _written(value: Any) -> Any:  # noqa: ANN401 - a field of any of the dataclasses here
+    """JSON of a value; dataclasses with whether they are a change."""
+    if isinstance(value, np.ndarray | tuple):
+        return np.asarray(value).tolist()
+    if not is_dataclass(value):
+        return value
+    written = {"is_change": value.is_change} if hasattr(value, "is_change") else {}
+    for field in fields(value):
+        key, content = _KEYS.get(field.name, field.name), getattr(value, field.name)
+        if key is not None and content is not None:
+            written[key] = _written(content)
+    return written
 
 
 @dataclass(frozen=True)
