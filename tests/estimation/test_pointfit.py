@@ -62,7 +62,7 @@ def test_the_error_over_its_sigma_is_distributed_as_it_should_be():
     shares = []
     for seed in range(240):
         frame, pairs = measured_part(seed, 3 + seed % 6)
-        fit = fit_groups(PointProblem(pairs, scaled=False))
+        fit = fit_groups(PointProblem(pairs))
         error = away(fit.state.base_from_fixture, frame)
         square = error @ np.linalg.solve(fit.covariance, error) / 6
         shares.append(f_distribution.cdf(square, 6, fit.freedom))
@@ -77,7 +77,7 @@ def test_known_and_unknown_noise_add_up():
         frame, nominal, known = some_frame(rng), some_drawing(rng, 10), uneven(rng, 10)
         noise = noise_of(known + even(10, 2 * NOISE_M), rng)
         pairs = pairs_of(nominal, placed(frame, nominal) + noise, known)
-        fit = fit_groups(PointProblem(pairs, scaled=False))
+        fit = fit_groups(PointProblem(pairs))
         error = away(fit.state.base_from_fixture, frame)
         squares.append(error @ np.linalg.solve(fit.covariance, error))
         levels.append(fit.sigma)
@@ -93,7 +93,7 @@ def test_weights_reach_the_bound():
         rng = np.random.default_rng(seed)
         frame, nominal, known = some_frame(rng), some_drawing(rng, 6), uneven(rng, 6)
         pairs = pairs_of(nominal, placed(frame, nominal) + noise_of(known, rng), known)
-        fit = fit_groups(PointProblem(pairs, scaled=False))
+        fit = fit_groups(PointProblem(pairs))
         errors.append(away(frame, fit.state.base_from_fixture) ** 2)
         plain.append(away(frame, align(pairs.measured, nominal)) ** 2)
         bounds.append(np.diag(point_bound(frame, nominal, known)))

@@ -7,7 +7,6 @@ from scipy.linalg import expm
 
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
-from visioncal.estimation.features import FeatureTouches
 from visioncal.estimation.pointfit import PointPairs
 
 # Derivatives by central differences are exact to 1e-8 at this step, of lengths near a metre.
@@ -75,9 +74,7 @@ def pairs_of(
     )
 
 
-def some_touches(
-    rng: np.random.Generator, frame: FloatArray, kinds: Sequence[str]
-) -> FeatureTouches:
+def some_touches(rng: np.random.Generator, frame: FloatArray, kinds: Sequence[str]) -> PointPairs:
     """Exact touches of a fixture's features, named 0, 1 ..."""
     ranges = {
         "origin": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
@@ -86,7 +83,8 @@ def some_touches(
     }
     local = np.array([rng.uniform(*ranges[kind]) for kind in kinds])
     names = tuple(str(at) for at in range(len(kinds)))
-    return FeatureTouches(names, tuple(kinds), placed(frame, local), np.zeros((len(kinds), 3, 3)))
+    noise = np.zeros((len(kinds), 3, 3))
+    return PointPairs.of_features(names, tuple(kinds), placed(frame, local), noise)
 
 
 def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
@@ -101,12 +99,12 @@ def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> 
     return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
 
 
-def feature_bound(frame: FloatArray, touches: FeatureTouches, sigma_m: float) -> FloatArray:
+def feature_bound(frame: FloatArray, touches: PointPairs, sigma_m: float) -> FloatArray:
     """Least covariance (6, 6) of a frame from touches with even noise.
 
     Where a touch lies on the axis or in the plane is unknown beside the frame.
     """
-    local = placed(np.linalg.inv(frame), touches.points)
+    local = placed(np.linalg.inv(frame), touches.measured)
     free = {"origin": 0, "x": 1, "xy": 2}
     total = np.zeros((6, 6))
     for point, kind in zip(local, touches.kinds, strict=True):

@@ -166,39 +166,24 @@ def fit_groups(
     state = next(iter(problem.guesses())) if start is None else start
     groups = problem.linearise(state)
     chosen = np.ones(len(groups), dtype=bool) if used is None else used
-    sigma, settled = _rms(groups.subset(chosen)), False
+    inside, settled = groups.subset(chosen), False
+    square = float(np.sum(inside.residuals**2)) / max(int(inside.observed.sum()), 1)
+    sigma = max(float(np.sqrt(square)), _START_SIGMA)
     for _ in range(_ROUNDS):
         # Weights are held during the descent: weights that follow the state would favour states
         # with large noise.
         weights = np.asarray(np.linalg.inv(groups.covariance(sigma)), dtype=float)
         state, settled = descended(problem, state, chosen, weights)
         groups = problem.linearise(state)
-        before, sigma = sigma, groups.subset(chosen).level(max(sigma, LEAST_SIGMA))[0]
+        inside = groups.subset(chosen)
+        before, sigma = sigma, inside.level(max(sigma, LEAST_SIGMA))[0]
         if np.isclose(before, sigma, rtol=1e-4):
             break
-    return _finished(state, groups, chosen, sigma, expected_sigma, settled=settled)
-
-
-def _finished(
-    state: State,
-    groups: Groups,
-    chosen: Mask,
-    sigma: float,
-    expected_sigma: float,
-    *,
-    settled: bool,
-) -> GroupFit[State]:
-    inside = groups.subset(chosen)
     freedom = inside.freedom
     if freedom < 1:
         sigma = max(expected_sigma, LEAST_SIGMA)
     covariance = covariance_from(inside.information(sigma))
     return GroupFit(state, covariance, sigma, freedom, groups, chosen, settled)
-
-
-def _rms(groups: Groups) -> float:
-    square = float(np.sum(groups.residuals**2)) / max(int(groups.observed.sum()), 1)
-    return max(float(np.sqrt(square)), _START_SIGMA)
 
 
 def descended(

@@ -19,14 +19,8 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.linalg import covariance_from, spectrum
-from visioncal.estimation.observability import (
-    SIGMA_LIMIT_M,
-    SIGMA_LIMIT_RAD,
-    Direction,
-    axis_words,
-    turn_axis,
-)
-from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_noise_m
+from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, axis_words, turn_axis
+from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_noise_m, worst_of
 from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns, in_tool
@@ -77,11 +71,6 @@ class PivotFit:
     def sigma_m(self) -> float:
         """Noise of a touch per axis [m], beyond the robot's stated one."""
         return self.agreement.fit.sigma
-
-    @property
-    def rms_m(self) -> float:
-        """Root mean square of the used touches' distances [m]."""
-        return float(np.sqrt(np.mean(self.agreement.off_m[self.agreement.mask] ** 2)))
 
     @property
     def looks_inverse(self) -> bool:
@@ -137,7 +126,17 @@ def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
         covariance = covariance_from(inliers.fit.groups.subset(inliers.fit.used).information(level))
         inliers = replace(inliers, fit=replace(inliers.fit, sigma=level, covariance=covariance))
         worst = check_turning(problem, inliers.fit)
-    return _result(problem, inliers, worst)
+    fit, edge, count = inliers.fit, 6 if problem.oriented else 3, len(inliers.fit.state.points)
+    blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
+    at = np.arange(count)
+    return PivotFit(
+        inliers,
+        problem.oriented,
+        _edge_covariance(problem, fit.covariance),
+        blocks[at, :, at, :],
+        _belonging(problem, inliers),
+        worst,
+    )
 
 
 def _check_doubt(problem: TouchProblem, inliers: GroupInliers[TouchUnknowns]) -> None:
@@ -176,19 +175,6 @@ def _check_sides(touches: Touches, inliers: GroupInliers[TouchUnknowns]) -> None
                 culprits=behind,
                 next_step="Leave the wrong ones out, or touch again.",
             )
-
-
-def _result(
-    problem: TouchProblem, inliers: GroupInliers[TouchUnknowns], worst: tuple[Direction, ...]
-) -> PivotFit:
-    fit, edge = inliers.fit, 6 if problem.oriented else 3
-    covariance = np.zeros((6, 6))
-    covariance[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
-    count = len(fit.state.points)
-    blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
-    at = np.arange(count)
-    belongs = _belonging(problem, inliers)
-    return PivotFit(inliers, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
 
 
 def _belonging(
@@ -302,23 +288,18 @@ def check_turning(problem: TouchProblem, fit: GroupFit[TouchUnknowns]) -> tuple[
 def _worst(
     problem: TouchProblem, fit: GroupFit[TouchUnknowns], level: float
 ) -> tuple[Direction, ...]:
-    covariance = covariance_from(fit.groups.subset(fit.used).information(level))
-    first = 3 if problem.oriented else 0
-    to_flange = fit.state.flange_from_tool[:3, :3]
-    tip = to_flange @ covariance[first : first + 3, first : first + 3] @ to_flange.T
-    values, vectors = np.linalg.eigh(tip)
-    several = values[-2] > SIGMA_LIMIT_M**2
-    words = "from the flange" if several else f"along the flange's {axis_words(vectors[:, -1])}"
-    worst = [_direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)]
-    if problem.oriented:
-        values, vectors = np.linalg.eigh(covariance[:3, :3])
-        words = f"the tool's rotation about its {axis_words(vectors[:, -1])}"
-        worst.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
-    return tuple(worst)
+    edge = _edge_covariance(
+        problem, covariance_from(fit.groups.subset(fit.used).information(level))
+    )
+    offset, rotation = worst_of(fit.state.flange_from_tool, edge, "tool", "flange", origin="tip")
+    return (offset, rotation) if problem.oriented else (offset,)
 
 
-def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) -> Direction:
-    return Direction(words, float(np.sqrt(variance)), limit, is_rotation)
+def _edge_covariance(problem: TouchProblem, covariance: FloatArray) -> FloatArray:
+    """(6, 6) of the tool's right perturbation; zero in a rotation that is not estimated."""
+    edge, size = np.zeros((6, 6)), 6 if problem.oriented else 3
+    edge[6 - size :, 6 - size :] = covariance[:size, :size]
+    return edge
 
 
 def _cause(
@@ -341,26 +322,27 @@ def _cause(
             )
         return cause, "Look for poses of another tool or in other units, and touch again."
     if culprit.is_rotation:
-        return _levers(used, fit)
+        # Levers of the touches of the axes.
+        local = np.abs(in_tool(used, fit.state))
+        along = 1e3 * local[used.are("z"), 2].max()
+        aside = 1e3 * local[used.are("xz"), 0].max()
+        return (
+            f"the touches of kind z have their point at most {figure(along)} mm from the tip, and "
+            f"those of kind xz at most {figure(aside)} mm beside the tool's z axis"
+        ), "Move the tool back by 50 mm or more along its axes before touching for z and xz."
     return _motion(used), _ADVICE
-
-
-def _levers(used: Touches, fit: GroupFit[TouchUnknowns]) -> tuple[str, str]:
-    """Levers of the touches of the axes, in words, and advice."""
-    local = np.abs(in_tool(used, fit.state))
-    along = 1e3 * local[used.are("z"), 2].max()
-    aside = 1e3 * local[used.are("xz"), 0].max()
-    return (
-        f"the touches of kind z have their point at most {figure(along)} mm from the tip, and "
-        f"those of kind xz at most {figure(aside)} mm beside the tool's z axis"
-    ), "Move the tool back by 50 mm or more along its axes before touching for z and xz."
 
 
 def _motion(used: Touches) -> str:
     """Words for what is wrong with the motion, of touches of the same point."""
-    turns = _turns(used.subset(used.are("point")))
+    tips = used.subset(used.are("point"))
+    first, second = np.triu_indices(len(tips), 1)
+    same = tips.points[first] == tips.points[second]
+    poses = tips.base_from_flange
+    relative = invert(poses[second[same]]) @ poses[first[same]]
+    turns = np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
     angles = np.linalg.norm(turns, axis=1)
-    largest, count = np.rad2deg(angles.max()), int(used.are("point").sum())
+    largest, count = np.rad2deg(angles.max()), len(tips)
     if angles.max() < _STILL_RAD:
         return (
             f"the {count} used touches are all from one orientation of the flange (largest "
@@ -376,12 +358,3 @@ def _motion(used: Touches) -> str:
         f"the {count} used touches turn by at most {figure(largest)} deg, and by {figure(aside)} "
         "deg about a second axis"
     )
-
-
-def _turns(touches: Touches) -> FloatArray:
-    """Rotation vectors (p, 3) in the flange between all pairs of touches of one point [rad]."""
-    first, second = np.triu_indices(len(touches), 1)
-    same = touches.points[first] == touches.points[second]
-    poses = touches.base_from_flange
-    relative = invert(poses[second[same]]) @ poses[first[same]]
-    return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())

@@ -13,17 +13,20 @@ from visioncal.core.limits import FixtureLimits, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
-from visioncal.estimation.features import (
-    FEATURE_KINDS,
-    FeatureKind,
-    FeatureTouches,
-    fit_features,
-)
 from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
-from visioncal.estimation.pointfit import FixturePlacement, PointFit, PointPairs, fit_points
+from visioncal.estimation.pointfit import (
+    FEATURE_KINDS,
+    DrawingFit,
+    FeatureKind,
+    FixturePlacement,
+    PointFit,
+    PointPairs,
+    fit_features,
+    fit_points,
+)
 from visioncal.frames.touches import (
     MeasuredPoints,
     NominalPoints,
@@ -305,39 +308,52 @@ def touched_fixture(
 
 def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: FitSettings) -> Frame:
     """Fits the fixture to touches of its origin, x axis and xy plane."""
-    touches = FeatureTouches(
+    touches = PointPairs.of_features(
         measured.labels,
         cast("tuple[FeatureKind, ...]", tuple(kinds)),
         measured.points,
         measured.scattered,
     )
-    stated_m = setting.touch_noise_m
-    if stated_m is None and len(measured) == len(FEATURE_KINDS):
-        # One of each kind leaves no residual to estimate the noise from.
-        stated_m = TOUCH_NOISE_M
-    fit = fit_features(touches, stated_m)
-    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
-    matrix, centroid = fit.base_from_fixture, measured.points[fit.agreement.mask].mean(axis=0)
-    fitted = PointsFit(
-        measured.source,
-        measured.labels,
-        [f"Touch {label}" for label in measured.labels],
-        measured.places,
-        kinds,
-        Edge(matrix, measured.carried(fit.by_points, np.full(len(measured), noise_m))),
-        fit.agreement,
-        [_CAUSE] * len(measured),
-        noise_m,
-        (),
-    )
+    fit = fit_features(touches, setting.touch_noise_m)
+    fitted = _fitted(fit, touches, measured, [_CAUSE] * len(measured), setting)
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
     more = tuple(_redundancy_findings(fitted, setting))
+    centroid, matrix = measured.points[fitted.agrees].mean(axis=0), fit.base_from_fixture
     centre = np.asarray((centroid - matrix[:3, 3]) @ matrix[:3, :3])
     return _fixture_frame(fitted, centre, f"{counts} touches", more, {}, setting)
 
 
+def _fitted(
+    fit: PointFit,
+    pairs: PointPairs,
+    measured: MeasuredPoints,
+    causes: Sequence[str],
+    setting: FitSettings,
+) -> PointsFit[FixturePlacement]:
+    """The fit with the points' common errors in its covariance; `causes` are as in `PointsFit`."""
+    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
+    noise = np.hypot(noise_m, pairs.nominal_sigma_m)
+    thing = "Touch" if pairs.kinds else "Point"
+    return PointsFit(
+        measured.source,
+        # A point measured several times also has the measurement's label.
+        [
+            f"{name}, {label}" if pairs.labels.count(name) > 1 else name
+            for name, label in zip(pairs.labels, measured.labels, strict=True)
+        ],
+        [f"{thing} {label}" for label in pairs.labels],
+        measured.places,
+        pairs.kinds or ("",) * len(measured),
+        Edge(fit.base_from_fixture, measured.carried(fit.by_points, noise)),
+        fit.agreement,
+        causes,
+        noise_m,
+        (),
+    )
+
+
 def _fixture_frame(
-    fitted: PointsFit[State],
+    fitted: PointsFit[FixturePlacement],
     centre: FloatArray,
     method: str,
     more: Sequence[Finding],
@@ -357,7 +373,9 @@ def _fixture_frame(
     return fitted.frame(method, more, {"worst": worst, **details}, setting)
 
 
-def _redundancy_findings(fitted: PointsFit[FloatArray], setting: FitSettings) -> Iterator[Finding]:
+def _redundancy_findings(
+    fitted: PointsFit[FixturePlacement], setting: FitSettings
+) -> Iterator[Finding]:
     used = [kind for kind, ok in zip(fitted.kinds, fitted.agrees.tolist(), strict=True) if ok]
     once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
@@ -393,24 +411,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
         for at in fit.numbering.moved.tolist():
             other = points.drawn_labels[fit.numbering.assignment[at]]
             causes[points.labels[at]] = f"it is where {other} is drawn{RENAMED}"
-    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
-    noise = np.hypot(noise_m, pairs.nominal_sigma_m)
-    fitted = PointsFit(
-        measured.source,
-        # A point measured several times also has the measurement's label.
-        [
-            f"{name}, {label}" if pairs.labels.count(name) > 1 else name
-            for name, label in zip(pairs.labels, measured.labels, strict=True)
-        ],
-        [f"Point {label}" for label in pairs.labels],
-        measured.places,
-        ("",) * len(measured),
-        Edge(fit.base_from_fixture, measured.carried(fit.by_points, noise)),
-        fit.agreement,
-        [causes[label] for label in pairs.labels],
-        noise_m,
-        (),
-    )
+    fitted = _fitted(fit, pairs, measured, [causes[label] for label in pairs.labels], setting)
     count = len(set(pairs.labels))
     several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
@@ -432,7 +433,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
 
 def _drawing_findings(
-    fit: PointFit,
+    fit: DrawingFit,
     fitted: PointsFit[FixturePlacement],
     measured: MeasuredPoints,
     pairs: PointPairs,
