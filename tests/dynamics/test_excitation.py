@@ -151,13 +151,12 @@ def pinocchio_with_bodies(robot: Robot) -> pin.Model:
 def test_a_short_search_already_beats_random_motions(found):
     """By singular values of the regressor, with columns that pivots of its own choose."""
     assert found.base.rank == 54
-    rows = found.base.model.regressor(found.series.sampled(50.0))
+    rows = found.base.model.regressor(found.series.sampled(50.0)) * found.weights[:, None]
     rows = rows.reshape(-1, rows.shape[2])[:, found.base.independent]
-    plain = np.linalg.cond(rows / np.linalg.norm(rows, axis=0))
+    weighted = np.linalg.cond(rows / np.linalg.norm(rows, axis=0))
     # Other samples of the same motion.
-    assert plain == pytest.approx(found.condition.scaled, rel=0.02)
-    assert found.condition.weighted < 0.8 * found.random.weighted
-    assert found.condition.raw > found.condition.scaled
+    assert weighted == pytest.approx(found.condition, rel=0.02)
+    assert found.condition < 0.8 * found.random
     assert found.starts == 1
 
 

@@ -157,36 +157,15 @@ def _sum_text(names: tuple[str, ...], row: FloatArray, kept: int) -> str:
     return text
 
 
-@dataclass(frozen=True)
-class Condition:
-    """Condition numbers of a motion's regressor of the base parameters.
+def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> float:
+    """Condition number of an evenly sampled motion's regressor of the base parameters.
 
-    The parameters' units change the raw condition arbitrarily, and do not matter to a least-squares
-    fit: compare motions by columns of unit length (van der Sluis 1969).
+    Each joint's rows are weighted, and columns are of unit length: the parameters' units, which do
+    not matter to a least-squares fit, would change it arbitrarily (van der Sluis 1969). The weights
+    (n,) are inverse to each joint's torque noise, up to a common factor.
     """
-
-    weighted: float  # Each joint's rows divided by its noise, columns of unit length.
-    scaled: float  # Rows as they are, columns of unit length.
-    raw: float  # Rows and columns as they are, in SI units.
-
-
-def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> Condition:
-    """Condition numbers of an evenly sampled motion.
-
-    The weights (n,) are inverse to each joint's torque noise, up to a common factor.
-    """
-    rows = base.regressor(motion)
-    flat = rows.reshape(-1, base.rank)
-    weighted = (rows * weights[:, None]).reshape(-1, base.rank)
-    figures = [
-        float(np.linalg.cond(array))
-        for array in (_unit_columns(weighted), _unit_columns(flat), flat)
-    ]
-    return Condition(*figures)
-
-
-def _unit_columns(rows: FloatArray) -> FloatArray:
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), _TINY))
+    rows = (base.regressor(motion) * weights[:, None]).reshape(-1, base.rank)
+    return float(np.linalg.cond(rows / np.maximum(np.linalg.norm(rows, axis=0), _TINY)))
 
 
 def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatArray]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import JointMotion, Measured, sign
@@ -89,7 +89,8 @@ def _predicted_better(robot: Robot, as_it_is: _Hypothesis) -> tuple[_Hypothesis,
     """The mistake whose correction makes the prediction fit far better, and why; else None."""
     before = _unexplained_shares(as_it_is)
     best, gain = None, np.log(_BETTER)
-    for hypothesis in _hypotheses(robot, as_it_is):
+    for mistake in _mistakes(robot.joint_count):
+        hypothesis = mistake.undone(robot, as_it_is)
         after = _unexplained_shares(hypothesis)
         better = float(np.sum(np.log(before / after)))
         if better > gain and after[list(hypothesis.joints)].max() < _LEFT:
@@ -113,7 +114,10 @@ def _fitted_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis,
     # at all explain the other joints' torques.
     before, predicted = _residual_power(base, as_it_is.measured), _unexplained_shares(as_it_is)
     best, gain = None, np.log(_FITS_BETTER)
-    for hypothesis in _swapped_joints(base.model.robot, as_it_is):
+    for mistake in _mistakes(len(as_it_is.joints)):
+        if mistake.angles is not mistake.torques:
+            continue
+        hypothesis = mistake.undone(base.model.robot, as_it_is)
         if np.sum(np.log(predicted / _unexplained_shares(hypothesis))) < -1.0:
             continue
         after = _residual_power(base, hypothesis.measured)
@@ -133,7 +137,8 @@ def _explained_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothes
     """
     before = _residual_power(base, as_it_is.measured)
     tried = []
-    for hypothesis in _hypotheses(base.model.robot, as_it_is):
+    for mistake in _mistakes(len(as_it_is.joints)):
+        hypothesis = mistake.undone(base.model.robot, as_it_is)
         after = _residual_power(base, hypothesis.measured)
         if after.max() < _EXPLAINED:
             tried.append((float(np.sum(np.log(before / after))), hypothesis))
@@ -158,79 +163,52 @@ def _residual_power(base: BaseModel, measured: Measured) -> FloatArray:
     return np.asarray(np.maximum(left, 1e-12))
 
 
-def _hypotheses(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording with each possible mistake undone."""
-    yield from _swapped_columns(robot, as_it_is)
-    yield from _swapped_joints(robot, as_it_is)
-    yield from _flipped(robot, as_it_is)
-    measured, every = as_it_is.measured, as_it_is.joints
-    motion, torques = measured.motion, measured.torques_nm
-    words = "all torques have the other sign (what the links do to the drives)"
-    flipped = replace(measured, torques_nm=-torques)
-    yield replace(as_it_is, words=words, measured=flipped)
-    words = "the joints are in the reverse order"
-    yield _moved(robot, _reordered(motion, every[::-1]), torques[:, ::-1], words, every)
-    yield _moved(robot, _scaled(motion, np.pi / 180.0), torques, "angles are in degrees", every)
+@dataclass(frozen=True, eq=False)
+class _Mistake:
+    """A possible mistake, with the (n, n) matrices that undo it in rows of angles and torques."""
+
+    words: str
+    joints: tuple[int, ...]  # The joints concerned.
+    angles: FloatArray
+    torques: FloatArray
+
+    def undone(self, robot: Robot, as_it_is: _Hypothesis) -> _Hypothesis:
+        """The recording with the mistake undone."""
+        motion, torques = as_it_is.measured.motion, as_it_is.measured.torques_nm @ self.torques
+        parts = (array @ self.angles for array in (motion.q, motion.dq, motion.ddq))
+        motion = JointMotion(motion.times_s, *parts)
+        measured = Measured(motion, torques)
+        return _Hypothesis(self.words, self.joints, measured, _predicted(robot, motion))
 
 
-def _swapped_columns(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording with the torques, or the angles, of two joints swapped back."""
-    measured = as_it_is.measured
-    for pair, order in _pairs(as_it_is):
-        words = f"of joints {pair[0] + 1} and {pair[1] + 1} are swapped"
-        swapped = replace(measured, torques_nm=measured.torques_nm[:, order])
-        yield replace(as_it_is, words=f"the torques {words}", joints=pair, measured=swapped)
-        motion = _reordered(measured.motion, order)
-        yield _moved(robot, motion, measured.torques_nm, f"the angles {words}", pair)
-
-
-def _swapped_joints(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording with two joints swapped back, angles and torques together."""
-    measured = as_it_is.measured
-    for pair, order in _pairs(as_it_is):
-        words = f"joints {pair[0] + 1} and {pair[1] + 1} are swapped, with angles and torques"
-        motion = _reordered(measured.motion, order)
-        yield _moved(robot, motion, measured.torques_nm[:, order], words, pair)
-
-
-def _pairs(as_it_is: _Hypothesis) -> Iterator[tuple[tuple[int, int], IntArray]]:
-    for first, second in combinations(as_it_is.joints, 2):
-        order = np.array(as_it_is.joints)
-        order[[first, second]] = second, first
-        yield (first, second), order
-
-
-def _flipped(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording with the sign of a joint's torque or angle reversed."""
-    measured = as_it_is.measured
-    for joint in as_it_is.joints:
-        signs = np.where(np.array(as_it_is.joints) == joint, -1.0, 1.0)
-        flipped = replace(measured, torques_nm=measured.torques_nm * signs)
+def _mistakes(joints: int) -> Iterator[_Mistake]:
+    """All mistakes that are tested."""
+    same, every = np.eye(joints), tuple(range(joints))
+    both = []
+    for first, second in combinations(every, 2):
+        pair, swap = (first, second), same.copy()
+        swap[[first, second]] = same[[second, first]]
+        words = f"of joints {first + 1} and {second + 1} are swapped"
+        yield _Mistake(f"the torques {words}", pair, same, swap)
+        yield _Mistake(f"the angles {words}", pair, swap, same)
+        words = f"joints {first + 1} and {second + 1} are swapped, with angles and torques"
+        both.append(_Mistake(words, pair, swap, swap))
+    yield from both
+    for joint in every:
+        flip = np.diag(np.where(np.arange(joints) == joint, -1.0, 1.0))
         words = f"the torque of joint {joint + 1} has the other sign than its angle"
-        yield replace(as_it_is, words=words, joints=(joint,), measured=flipped)
-        words = f"the angle of joint {joint + 1} has the other sign"
-        motion = _scaled(measured.motion, signs)
-        yield _moved(robot, motion, measured.torques_nm, words, (joint,))
-
-
-def _moved(
-    robot: Robot, motion: JointMotion, torques: FloatArray, words: str, joints: tuple[int, ...]
-) -> _Hypothesis:
-    return _Hypothesis(words, joints, Measured(motion, torques), _predicted(robot, motion))
+        yield _Mistake(words, (joint,), same, flip)
+        yield _Mistake(f"the angle of joint {joint + 1} has the other sign", (joint,), flip, same)
+    yield _Mistake(
+        "all torques have the other sign (what the links do to the drives)", every, same, -same
+    )
+    yield _Mistake("the joints are in the reverse order", every, same[::-1], same[::-1].copy())
+    yield _Mistake("angles are in degrees", every, np.pi / 180.0 * same, same)
 
 
 def _predicted(robot: Robot, motion: JointMotion) -> FloatArray:
     inertias = robot.inertias or Inertias(np.zeros((robot.joint_count, 10)))
     return joint_torques(robot, inertias, motion.q, motion.dq, motion.ddq)
-
-
-def _reordered(motion: JointMotion, order: Sequence[int] | IntArray) -> JointMotion:
-    parts = (array[:, list(order)] for array in (motion.q, motion.dq, motion.ddq))
-    return JointMotion(motion.times_s, *parts)
-
-
-def _scaled(motion: JointMotion, factor: FloatArray | float) -> JointMotion:
-    return JointMotion(motion.times_s, factor * motion.q, factor * motion.dq, factor * motion.ddq)
 
 
 def _unexplained_shares(hypothesis: _Hypothesis) -> FloatArray:

@@ -21,7 +21,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
-from visioncal.dynamics.base import BaseModel, Condition, condition_of, smooth_condition
+from visioncal.dynamics.base import BaseModel, condition_of, smooth_condition
 from visioncal.dynamics.limits import CHECK_HZ, MotionExtremes, MotionLimits, motion_extremes
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 
@@ -292,8 +292,8 @@ class Excitation:
     # ones where these are not known.
     weights: FloatArray
     series: Series  # The motion.
-    condition: Condition  # Condition numbers of its regressor.
-    random: Condition  # Median of those of random motions within the limits of joints and drives.
+    condition: float  # Condition number of its regressor; see `condition_of`.
+    random: float  # Median of those of random motions within the limits of joints and drives.
     extremes: MotionExtremes  # Its extremes, at a thousand samples a second.
     starts: int  # Number of descents made.
     seconds: float  # Duration of the search [s of one core].
@@ -325,7 +325,7 @@ class _ExcitationSearch:
         self._harmonics = Harmonics(request.period_s, request.harmonics)
         self._objective = Objective(allowed, self._base, self._weights, self._harmonics)
         self._rng = np.random.default_rng(request.seed)
-        self._best: tuple[Condition, Series, MotionExtremes] | None = None
+        self._best: tuple[float, Series, MotionExtremes] | None = None
         self._breaches: tuple[str, ...] = ()
 
     def run(self) -> Excitation:
@@ -386,7 +386,7 @@ class _ExcitationSearch:
         series = _shrunk_to_limits(self._allowed, self._objective.series(free))
         for _ in range(_TRIES):
             condition = self._figures(series)
-            if self._best is not None and condition.weighted >= self._best[0].weighted:
+            if self._best is not None and condition >= self._best[0]:
                 return
             kept = motion_extremes(self._allowed, series.sampled(CHECK_HZ))
             self._breaches = kept.breaches
@@ -395,7 +395,7 @@ class _ExcitationSearch:
                 return
             series = series.shrunk(_SMALLER)
 
-    def _figures(self, series: Series) -> Condition:
+    def _figures(self, series: Series) -> float:
         return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
 
     def _start(self) -> FloatArray:
@@ -447,13 +447,10 @@ class _ExcitationSearch:
         scaled = _MODEST * np.min(shares, axis=0)[:, None] * free
         return Series(self._harmonics, scaled + np.outer(posture, resting[0]))
 
-    def _random(self) -> Condition:
+    def _random(self) -> float:
         """Median condition of random motions, for comparison."""
         drawn = [self._figures(self._modest(self._posture())) for _ in range(_COMPARED)]
-        figures = np.median(
-            [(condition.weighted, condition.scaled, condition.raw) for condition in drawn], axis=0
-        )
-        return Condition(*figures.tolist())
+        return float(np.median(drawn))
 
 
 def _shrunk_to_limits(allowed: MotionLimits, series: Series) -> Series:

@@ -183,7 +183,13 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
         lag_s -= change
         if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
             break
-    lag = Lag(lag_s, sigma, _change_share(fit, lag_s))
+    # Greatest change of a joint's torques by the lag, over their range.
+    changes = [
+        rms_of(lag_s * block.x[:, :, -1], block.used)
+        / np.maximum(std_of(block.y, block.used), 1e-12)
+        for block in fit.blocks
+    ]
+    lag = Lag(lag_s, sigma, float(np.max(changes)))
     # A torque that never changes tells nothing of a lag.
     residual_shares = [
         np.divide(rms_of(residual, block.used), std, out=np.ones(len(std)), where=std > 0.0)
@@ -255,16 +261,6 @@ def _inside(stream: Conditioned, lag_s: float) -> Mask:
         )
         parts.append((piece.times_s >= ends_s[0]) & (piece.times_s <= ends_s[1]))
     return np.concatenate(parts)
-
-
-def _change_share(fit: Regression, lag_s: float) -> float:
-    """Greatest change of a joint's torques by a lag, over their range."""
-    shares = [
-        rms_of(lag_s * block.x[:, :, -1], block.used)
-        / np.maximum(std_of(block.y, block.used), 1e-12)
-        for block in fit.blocks
-    ]
-    return float(np.max(shares))
 
 
 @dataclass(frozen=True, eq=False)

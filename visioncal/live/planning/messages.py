@@ -45,13 +45,9 @@ def looks_note(plan: Plan) -> str:
 def plan_words(plan: MotionPlan) -> tuple[str, ...]:
     """States the quality of a plan and what it uses of the limits, in sentences."""
     motion = plan.excitation
-    condition, random = motion.condition, motion.random
     words = [
-        f"exciting motion of {motion.request.period_s:g} s: condition {condition.weighted:.1f} for "
-        f"{motion.base.rank} base parameters (random motions: {random.weighted:.0f})",
-        "joints weighted by their greatest torques, columns of unit length; unweighted "
-        f"{condition.scaled:.1f} (random: {random.scaled:.0f}), raw {condition.raw:.0f} (random: "
-        f"{random.raw:.0f})",
+        f"exciting motion of {motion.request.period_s:g} s: condition {motion.condition:.1f} for "
+        f"{motion.base.rank} base parameters (random motions: {motion.random:.0f})",
         f"it uses {_used(motion.extremes)}",
     ]
     if plan.sweeps is not None:
