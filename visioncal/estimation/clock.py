@@ -4,8 +4,9 @@ Starting where both rotate alike, the offset is one more unknown of the chain of
 the flange along its trajectory.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, ImageTimes
 from visioncal.estimation.corners import floored_sigma_px
+from visioncal.estimation.effects import EFFECTS
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
 from visioncal.estimation.linalg import covariance_from, gram
@@ -49,6 +51,35 @@ _ALIKE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
+class DelayEstimate:
+    """Estimated delay within images, such as that of a rolling shutter."""
+
+    of: Delay
+    time_s: float  # The delay [s].
+    sigma_s: float  # Its standard deviation [s].
+    is_clear: bool  # Whether it is significant, and was corrected.
+    resolution: tuple[int, int]  # Resolution of the images [px].
+    # (6,) Jacobian of each view's `cam_from_target` by the delay, by view.
+    jacobian: Mapping[int, FloatArray] = field(default_factory=dict)
+
+    def effect(self, views: Sequence[int], name: str = "") -> Effect:
+        """Error of the delay as an unknown of some views; see `stages.clocks.clock_effects`."""
+        unaffected = np.zeros(6)
+        jacobian = np.array([self.jacobian.get(view, unaffected) for view in views])
+        prior = PriorInformation(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
+        return Effect.free(name or self.of.name, prior, jacobian.reshape(-1, 6, 1))
+
+    def result(self) -> dict[str, Any]:
+        """Fields of `results.ClockResult`."""
+        return self.of.result(self.time_s, self.sigma_s, self.is_clear, self.resolution)
+
+    @property
+    def words(self) -> str:
+        """The delay in words."""
+        return self.of.words(self.time_s, self.sigma_s)
+
+
+@dataclass(frozen=True, eq=False)
 class ClockFit:
     """A clock offset with both edges."""
 
@@ -56,23 +87,12 @@ class ClockFit:
     sigma_s: float  # Its standard deviation [s]; very large where the motion does not determine it.
     fit: Solution  # Both edges, by the moving frames, and the noise.
     frames: int  # Number of frames used.
-
-
-@dataclass(frozen=True, eq=False)
-class DelayedFit:
-    """A clock offset with delays of corners within the image."""
-
-    clock: ClockFit  # The offset and both edges.
-    delays: tuple[Delay, ...]
-    times_s: FloatArray  # (k,) their times [s].
-    sigmas_s: FloatArray  # (k,) standard deviations of the times [s].
-    freedom: float  # Degrees of freedom of these.
+    delays: tuple[DelayEstimate, ...] = ()  # Delays within the images, where they were fitted.
 
     @property
-    def is_clear(self) -> Mask:
-        """(k,) mask of the times that are significant."""
-        limit = f_limit(_FALSE_ALARM, 1, self.freedom)
-        return np.asarray((self.times_s / self.sigmas_s) ** 2 > limit)
+    def residual(self) -> float:
+        """Residual noise of rotations times positions, as the likelihood has it."""
+        return float(self.fit.noise.robots.prod())
 
 
 @dataclass(frozen=True)
@@ -98,9 +118,9 @@ class ClockChange:
 class _Delays:
     """Delays within images, with their current times [s]; none without a camera."""
 
-    camera: Camera | None
-    delays: tuple[Delay, ...]
-    times_s: FloatArray
+    camera: Camera | None = None
+    delays: tuple[Delay, ...] = ()
+    times_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def problem(
         self, robot: Trajectory, frames: ImageTimes, offset_s: float, state: State
@@ -147,32 +167,31 @@ def fit_offset(
     near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
     with one_blas_thread():
         selected = frames.only(_evenly(len(frames), _MOST_FRAMES))
-        no_delays = _Delays(None, (), np.zeros(0))
         fits = [
-            fit.clock
+            fit
             for start in starts
-            if (fit := _fitted(robot, selected, start, None, no_delays)) is not None
-            and abs(fit.clock.offset_s - start) <= near_s
+            if (fit := _fitted(robot, selected, start, None, _Delays())) is not None
+            and abs(fit.offset_s - start) <= near_s
         ]
     # A fit of few frames agrees with anything.
     most = max((fit.frames for fit in fits), default=0)
     complete = (fit for fit in fits if 2 * fit.frames > most)
-    return tuple(sorted(complete, key=left_by))
+    return tuple(sorted(complete, key=lambda fit: fit.residual))
 
 
 def fit_delays(
-    robot: Trajectory, frames: ImageTimes, camera: Camera, start: ClockFit, delays: Sequence[Delay]
-) -> DelayedFit | None:
-    """Fits delays within images, the offset and both edges together.
+    robot: Trajectory, frames: ImageTimes, camera: Camera | None, start: ClockFit
+) -> ClockFit | None:
+    """Fits all delays within images, the offset and both edges together.
 
-    `start` is the fit without delays. None where too few frames are covered, or their corners are
-    not known.
+    `start` is the fit without delays. None where too few frames are covered, or their corners or
+    the camera's intrinsics are not known.
     """
-    if frames.stack is None or not delays:
+    if frames.stack is None or camera is None:
         return None
     with one_blas_thread():
         selected = frames.only(_evenly(len(frames), _MOST_DELAYED))
-        free = _Delays(camera, tuple(delays), np.zeros(len(delays)))
+        free = _Delays(camera, EFFECTS, np.zeros(len(EFFECTS)))
         return _fitted(robot, selected, start.offset_s, start.fit.state, free)
 
 
@@ -273,22 +292,13 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
 
     Then it is the one near the stated offset; None where none is, or there are no fits.
     """
-    if not fits:
-        return None
-    rivals = [fit for fit in fits if left_by(fit) <= _ALIKE * left_by(fits[0])]
-    if all(abs(clock_fit.offset_s - fits[0].offset_s) <= NEAR_S for clock_fit in rivals):
-        return fits[0]
-    near = [
-        clock_fit
-        for clock_fit in rivals
-        if stated_s is not None and abs(clock_fit.offset_s - stated_s) <= NEAR_S
-    ]
-    return near[0] if near else None
-
-
-def left_by(fit: ClockFit) -> float:
-    """Residual noise of rotations times positions, as the likelihood has it."""
-    return float(fit.fit.noise.robots.prod())
+    rivals = [fit for fit in fits if fit.residual <= _ALIKE * fits[0].residual]
+    if all(abs(fit.offset_s - fits[0].offset_s) <= NEAR_S for fit in rivals):
+        return next(iter(fits), None)
+    near = (
+        fit for fit in rivals if stated_s is not None and abs(fit.offset_s - stated_s) <= NEAR_S
+    )
+    return next(near, None)
 
 
 def _evenly(count: int, most: int) -> IntArray:
@@ -297,22 +307,22 @@ def _evenly(count: int, most: int) -> IntArray:
 
 def _fitted(
     robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, delays: _Delays
-) -> DelayedFit | None:
+) -> ClockFit | None:
     """Fits from one start, and once more without outlier frames."""
-    result = _iterated(robot, frames, offset_s, start, delays)
-    if result is None:
+    clock = _iterated(robot, frames, offset_s, start, delays)
+    if clock is None:
         return None
-    delays, clock = replace(delays, times_s=result.times_s), result.clock
+    delays = replace(delays, times_s=np.array([delay.time_s for delay in clock.delays]))
     near = _covered(robot, frames, clock.offset_s)
     inliers = _inliers(delays.problem(robot, near, clock.offset_s, clock.fit.state)[0], clock.fit)
     if inliers.all():
-        return result
+        return clock
     return _iterated(robot, near.only(inliers), clock.offset_s, clock.fit.state, delays)
 
 
 def _iterated(
     robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, delays: _Delays
-) -> DelayedFit | None:
+) -> ClockFit | None:
     """Iterates delays, offset and edges to convergence; None where too few frames are covered."""
     for _ in range(_ROUNDS):
         covered = _covered(robot, frames, offset_s)
@@ -333,8 +343,15 @@ def _iterated(
             break
     fit = replace(solution, state=State(solution.state.edges, problem.start_values))
     sigmas_s, freedom = _sigmas_s(problem, fit, covered.stamps_s, pulls)
-    clock = ClockFit(offset_s, float(sigmas_s[0]), fit, len(covered))
-    return DelayedFit(clock, delays.delays, delays.times_s, sigmas_s[1:], freedom)
+    limit = f_limit(_FALSE_ALARM, 1, freedom)
+    size = (0, 0) if delays.camera is None else delays.camera.resolution
+    estimates = tuple(
+        DelayEstimate(of, time_s, sigma_s, bool((time_s / sigma_s) ** 2 > limit), size)
+        for of, time_s, sigma_s in zip(
+            delays.delays, delays.times_s.tolist(), sigmas_s[1:].tolist(), strict=True
+        )
+    )
+    return ClockFit(offset_s, float(sigmas_s[0]), fit, len(covered), estimates)
 
 
 def _covered(robot: Trajectory, frames: ImageTimes, offset_s: float) -> ImageTimes:

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
+from visioncal.calibration.stages.detect import corners_in
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FixtureLimits
 from visioncal.core.number_format import counted, some_of
-from visioncal.core.types import Corners, FloatArray, Image, Target
+from visioncal.core.types import Corners, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS
 from visioncal.frames.camera_chain import CalibratedCamera
@@ -33,8 +33,7 @@ from visioncal.frames.target_pose import (
 from visioncal.frames.touches import MeasuredPoints, NominalPoints
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
-from visioncal.vision.boards import NotFound, find_target, kind_of
-from visioncal.vision.boards.imaging import blur_at_corners
+from visioncal.vision.boards import NotFound, kind_of
 from visioncal.vision.boards.marker import MarkerKind, marker_ids
 from visioncal.vision.targets import target_from_document
 
@@ -50,27 +49,15 @@ _WORDS = Words(
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerPoints:
-    """Markers' centres measured in the base, n of them.
+class MarkerPoints(MeasuredPoints):
+    """Markers' centres measured in the base, n of them, named by the markers' ids.
 
-    A fit to the points weights them with `independent`; `common` adds J common J^T to the result's
-    covariance, where J (6, 3 n) is the result's Jacobian by the points.
+    Their common errors are the camera's transform, its lens, the markers' printed size, the arm's
+    errors, and the robot's noise, which moves all markers of one image together.
     """
 
-    names: tuple[str, ...]  # (n,) the markers' ids as text.
-    points: FloatArray  # (n, 3) [m].
-    independent: FloatArray  # (n, 3, 3) covariance of each by its pixel noise [m^2].
-    # (3 n, 3 n) covariance by shared errors: the camera's transform, its lens, the markers' printed
-    # size, the arm's errors, and the robot's noise, which moves all markers of one image together
-    # [m^2].
-    common: FloatArray
     seen_in: tuple[int, ...]  # (n,) number of inlier images of each.
     warnings: tuple[str, ...]  # Sentences.
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(3 n, 3 n) joint covariance of all points [m^2]."""
-        return np.asarray(block_diag(*self.independent) + self.common)
 
 
 def measure_markers(
@@ -82,6 +69,7 @@ def measure_markers(
     *,
     size_sigma_m: float | None = None,
     sigma_px: float | None = None,
+    source: str = "images",
 ) -> MarkerPoints:
     """Measures the centres of markers in the base.
 
@@ -93,6 +81,7 @@ def measure_markers(
         size_m: Side of each [m].
         size_sigma_m: Its standard deviation, common to all markers [m]; 0.1 % of it where None.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
+        source: What the images were read from, for the record.
 
     Raises:
         DataError: There is no camera, a marker is in no image, or a pose of the robot is missing.
@@ -133,9 +122,9 @@ def measure_markers(
         ]
         views = all_places(eye, own_sights, looks, "base")
         fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
-        by_centre = np.concatenate([np.zeros((3, 3)), fit.mean.matrix[:3, :3]], axis=1)
+        by_centre = np.concatenate([np.zeros((3, 3)), fit.matrix[:3, :3]], axis=1)
         own = np.zeros((3, 3))
-        for (at, _), view, pick, gain in zip(shown, views, fit.picks, fit.mean.gains, strict=True):
+        for (at, _), view, pick, gain in zip(shown, views, fit.picks, fit.gains, strict=True):
             place, jacobian = view[pick], by_centre @ gain
             own += jacobian @ place.pixels @ jacobian.T
             by_common[marker] += jacobian @ place.by_common
@@ -152,12 +141,21 @@ def measure_markers(
     flat = by_common.reshape(3 * len(ids), -1)
     stops_flat = by_stop.reshape(len(sights), 3 * len(ids), 6)
     by_robot = np.einsum("sij,jk,slk->il", stops_flat, eye.flange_noise, stops_flat)
+    names, seen_in = tuple(map(str, ids)), tuple(int(fit.inliers.sum()) for fit in fits)
+    points = np.array([fit.matrix[:3, 3] for fit in fits])
+    # Directions to the camera's mean position.
+    positions = [eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights]
+    outward = np.mean(positions, axis=0) - points
     return MarkerPoints(
-        tuple(map(str, ids)),
-        np.array([fit.mean.matrix[:3, 3] for fit in fits]),
+        source,
+        names,
+        tuple(counted(images, "image") for images in seen_in),
+        names,
+        points,
         np.array(independent),
         flat @ common @ flat.T + by_robot,
-        tuple(int(fit.inliers.sum()) for fit in fits),
+        outward / np.linalg.norm(outward, axis=1)[:, None],
+        seen_in,
         tuple(warnings),
     )
 
@@ -169,12 +167,9 @@ def _corners(eye: CalibratedCamera, sight: Sight, target: Target) -> Corners | N
             f"{sight.label}: markers are looked for in images, and corners were given.",
             next_step="Give the image; or place one target by its corners with place_seen.",
         )
-    image: Image = sight.seen
-    check_image_size(eye, image, sight.label)
-    detected = find_target(image, target)
-    if isinstance(detected, NotFound):
-        return None
-    return Corners(0, detected.ids, detected.px, blur_at_corners(image, detected.px))
+    check_image_size(eye, sight.seen, sight.label)
+    seen = corners_in(sight.seen, target)
+    return None if isinstance(seen, NotFound) else seen
 
 
 def fixture_from_marker_images(
@@ -220,32 +215,20 @@ def fixture_from_marker_images(
             next_step="Name a marker there; or leave --cad away, and the board places the fixture.",
         )
     seen = _shown_markers(shown, tuple(ids))
-    points = measure_markers(
+    measured = measure_markers(
         calibration,
         shown.sights,
         seen,
         shown.target.dictionary,
         shown.target.square_m,
         size_sigma_m=shown.target.square_sigma_m,
+        source=session.name,
     )
     eye = CalibratedCamera.of(calibration)
-    # Directions to the camera's mean position.
-    positions = [eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in shown.sights]
-    outward = np.mean(positions, axis=0) - points.points
-    measured = MeasuredPoints(
-        session.name,
-        points.names,
-        tuple(counted(images, "image") for images in points.seen_in),
-        tuple(ids[number] for number in seen),
-        points.points,
-        points.independent,
-        points.common,
-        outward / np.linalg.norm(outward, axis=1)[:, None],
-    )
     findings = (
         *(
             replace(remark, is_fatal=remark.words in eye.warnings)
-            for remark in remarks(points.warnings)
+            for remark in remarks(measured.warnings)
         ),
         *view_findings(session, shown.lost),
         *remarks(shown.warnings),
@@ -255,7 +238,7 @@ def fixture_from_marker_images(
         details={
             "dictionary": shown.target.dictionary,
             "marker_mm": 1e3 * shown.target.square_m,
-            "seen_in": dict(zip(points.names, points.seen_in, strict=True)),
+            "seen_in": dict(zip(measured.names, measured.seen_in, strict=True)),
             **camera_details(calibration),
         },
         options=options or FixtureLimits(),
@@ -263,7 +246,8 @@ def fixture_from_marker_images(
         # Each point's own covariance already holds its noise.
         assumed_noise_m=0.0,
     )
-    return drawn_fixture(measured, drawing, setting)
+    named = replace(measured, names=tuple(ids[number] for number in seen))
+    return drawn_fixture(named, drawing, setting)
 
 
 def _shown_markers(shown: SessionImages, ids: Sequence[int]) -> tuple[int, ...]:

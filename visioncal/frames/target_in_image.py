@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.calibration.stages.detect import corners_in
 from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
@@ -18,8 +19,8 @@ from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import determines_pose
 from visioncal.frames.camera_chain import CalibratedCamera
-from visioncal.vision.boards import NotFound, find_target
-from visioncal.vision.boards.imaging import GREY, blur_at_corners, poor_image_reason
+from visioncal.vision.boards import NotFound
+from visioncal.vision.boards.imaging import GREY, poor_image_reason
 from visioncal.vision.targets import corner_positions, rotations
 
 # Significance of corners that scatter more than the noise.
@@ -137,15 +138,14 @@ def check_image_size(eye: CalibratedCamera, image: Image, label: str) -> None:
 
 def _detected(eye: CalibratedCamera, image: Image, target: Target, label: str) -> Corners:
     check_image_size(eye, image, label)
-    seen = find_target(image, target)
+    seen = corners_in(image, target)
     if isinstance(seen, NotFound):
         cause = poor_image_reason(image, MAX_BLUR_PX)
         raise DataError(
             f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
             culprits=[label],
         )
-    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    return Corners(0, seen.ids, seen.px, blur, seen.weights)
+    return seen
 
 
 def _check_corners(corners: Corners, target: Target, label: str) -> None:

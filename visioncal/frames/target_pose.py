@@ -115,34 +115,26 @@ def candidate_places(
     Raises:
         DataError: The robot's pose is needed and missing or invalid.
     """
-    flange = sight.base_from_flange
-    if not needs_robot(eye, parent):
-        zero = np.zeros((len(view.symmetries), 6, 6))
-        return _in_parent(view, eye.edge, zero, np.zeros((6, eye.arm_error_count)), of_stop)
-    if flange is None:
-        raise DataError(
-            f"{sight.label}: the robot stands between the {parent} and what the camera "
-            f"({eye.mount}) sees, and its pose is missing.",
-            culprits=[sight.label],
-            next_step="Give base_from_flange as the robot reported it when the image was taken.",
-        )
-    checked_pose(flange, f"{sight.label}: base_from_flange")
-    arm = eye.arm_basis(flange, sight.joints_rad)
-    if parent == "base":
-        flange_jacobian = adjoint(invert(eye.edge @ view.cam_from_target))
-        return _in_parent(view, flange @ eye.edge, flange_jacobian, arm, of_stop)
-    flange_from_cam = invert(flange) @ eye.edge
-    flange_jacobian = -adjoint(invert(flange_from_cam @ view.cam_from_target))
-    return _in_parent(view, flange_from_cam, flange_jacobian, arm, of_stop)
-
-
-def _in_parent(
-    view: PoseCandidates,
-    parent_from_cam: FloatArray,
-    flange_jacobian: FloatArray,
-    arm: FloatArray,
-    of_stop: int,
-) -> tuple[TargetPlace, ...]:
+    parent_from_cam, arm = eye.edge, np.zeros((6, eye.arm_error_count))
+    flange_jacobian = np.zeros((len(view.symmetries), 6, 6))
+    if needs_robot(eye, parent):
+        flange = sight.base_from_flange
+        if flange is None:
+            raise DataError(
+                f"{sight.label}: the robot stands between the {parent} and what the camera "
+                f"({eye.mount}) sees, and its pose is missing.",
+                culprits=[sight.label],
+                next_step="Give base_from_flange as the robot reported it at the image.",
+            )
+        checked_pose(flange, f"{sight.label}: base_from_flange")
+        arm = eye.arm_basis(flange, sight.joints_rad)
+        # In the hand the flange carries the camera, else the target.
+        sign, parent_from_cam = 1.0, flange @ eye.edge
+        flange_from_cam = eye.edge
+        if parent == "flange":
+            sign, parent_from_cam = -1.0, invert(flange) @ eye.edge
+            flange_from_cam = parent_from_cam
+        flange_jacobian = sign * adjoint(invert(flange_from_cam @ view.cam_from_target))
     by_edge = adjoint(invert(view.cam_from_target))
     return tuple(
         TargetPlace(
@@ -203,20 +195,13 @@ class CandidateViews:
 
 
 @dataclass(frozen=True, eq=False)
-class Mean:
-    """Weighted mean pose of a target over images."""
+class ImageInliers:
+    """Inlier images of a target, and their mean pose, weighted by independent errors."""
 
-    matrix: FloatArray  # (4, 4) `parent_from_target`.
+    matrix: FloatArray  # (4, 4) `parent_from_target`, the mean of the inliers.
     independent: FloatArray  # (6, 6) covariance by the images' independent errors.
     gains: FloatArray  # (m, 6, 6) weight of each image; zero for outliers.
     by_common: FloatArray  # (6, c) Jacobian by the errors that all images share.
-
-
-@dataclass(frozen=True, eq=False)
-class ImageInliers:
-    """Inlier images and their mean pose."""
-
-    mean: Mean  # Mean of the inliers.
     picks: IntArray  # (m,) index of each image's selected candidate.
     inliers: Mask  # (m,) inlier mask.
     residuals: FloatArray  # (m, 6) residual of each image's pose from the mean [rad, m].
@@ -289,57 +274,51 @@ def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray,
 
 
 def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
-    """Mean over the inliers, and the distances of all images from it."""
+    """Mean pose over the inliers, and the distances of all images from it."""
     chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
-    mean = _mean(candidates, chosen, agrees)
-    errors = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
-    independent = np.array([candidates.independent(value) for value in chosen])
-    common_difference = np.array([value.by_common for value in chosen]) - mean.by_common
-    shared = common_difference @ candidates.common @ np.swapaxes(common_difference, 1, 2)
-    is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
-    squared = np.einsum(
-        "mi,mi->m", errors, np.linalg.solve(independent + shared, errors[..., None])[..., 0]
-    )
-    # Six degrees of freedom for each image beyond the first.
-    variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
-    # The residual of an image that is part of the mean has a smaller covariance.
-    covariance = independent + shared + np.where(is_inlier, -1.0, 1.0) * mean.independent
-    mahalanobis_sq = (
-        squared_lengths(errors, covariance, independent)[0]
-        if others
-        else np.where(agrees, 0.0, squared)
-    )
-    return ImageInliers(
-        mean,
-        picks,
-        agrees,
-        errors,
-        mahalanobis_sq,
-        candidates.limit,
-        variance,
-        _rival(candidates, mean.matrix, agrees, variance),
-    )
-
-
-def _mean(candidates: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mask) -> Mean:
-    """Mean pose weighted by the images' independent errors; common errors do not average out."""
-    weights = np.array(
-        [
-            np.linalg.inv(candidates.independent(place)) if ok else np.zeros((6, 6))
-            for place, ok in zip(chosen, agrees, strict=True)
-        ]
-    )
-    independent = covariance_from(weights.sum(axis=0))
-    gains = independent @ weights
     matrices = np.array([place.matrix for place in chosen])
+    of_images = np.array([candidates.independent(place) for place in chosen])
+    # Weighted by the images' independent errors: common errors do not average out.
+    weights = np.where(agrees[:, None, None], np.linalg.inv(of_images), 0.0)
+    of_mean = covariance_from(weights.sum(axis=0))
+    gains = of_mean @ weights
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
     for _ in range(_STEPS):
         step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
         matrix = matrix @ exp(step)
         if np.abs(step).max() < _CONVERGED:
             break
-    by_common = np.einsum("mij,mjk->ik", gains, np.array([place.by_common for place in chosen]))
-    return Mean(matrix, independent, gains, by_common)
+    errors = log(invert(matrix) @ matrices)
+    by_common = np.array([place.by_common for place in chosen])
+    mean_by_common = np.einsum("mij,mjk->ik", gains, by_common)
+    difference = by_common - mean_by_common
+    shared = difference @ candidates.common @ np.swapaxes(difference, 1, 2)
+    is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
+    squared = np.einsum(
+        "mi,mi->m", errors, np.linalg.solve(of_images + shared, errors[..., None])[..., 0]
+    )
+    # Six degrees of freedom for each image beyond the first.
+    variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
+    # The residual of an image that is part of the mean has a smaller covariance.
+    covariance = of_images + shared + np.where(is_inlier, -1.0, 1.0) * of_mean
+    mahalanobis_sq = (
+        squared_lengths(errors, covariance, of_images)[0]
+        if others
+        else np.where(agrees, 0.0, squared)
+    )
+    return ImageInliers(
+        matrix,
+        of_mean,
+        gains,
+        mean_by_common,
+        picks,
+        agrees,
+        errors,
+        mahalanobis_sq,
+        candidates.limit,
+        variance,
+        _rival(candidates, matrix, agrees, variance),
+    )
 
 
 def _rival(
@@ -454,9 +433,9 @@ def place_target(
     fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
-        fit.mean.matrix,
-        fit.variance * fit.mean.independent,
-        fit.mean.by_common @ common @ fit.mean.by_common.T,
+        fit.matrix,
+        fit.variance * fit.independent,
+        fit.by_common @ common @ fit.by_common.T,
         labels,
         fit.inliers,
         1e3 * np.linalg.norm(fit.residuals[:, 3:], axis=1),
@@ -523,7 +502,7 @@ def _distance_words(fit: ImageInliers, at: int) -> str:
 
 def _ambiguity_warning(fit: ImageInliers, looks: Sequence[PoseCandidates], thing: str) -> str:
     rival = np.eye(4) if fit.rival is None else fit.rival
-    millimetres, degrees = pose_difference(fit.mean.matrix, rival)
+    millimetres, degrees = pose_difference(fit.matrix, rival)
     shift = f"{mm_and_deg(millimetres, degrees)} away"
     if any(len(set(look.symmetries)) > 1 for look in looks):
         return (

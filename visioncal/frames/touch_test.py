@@ -37,7 +37,6 @@ class TouchPoint:
     """Point of a board to be touched."""
 
     name: str  # The point's name on the board.
-    board_m: FloatArray  # (3,) position on the board [m].
     base_m: FloatArray  # (3,) position in the base by the camera [m].
     # (4, 4) flange pose with the tip on it and the tool's z into the board.
     base_from_flange: FloatArray
@@ -139,7 +138,7 @@ def touch_targets(
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
         radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
-        points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm))
+        points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     carried_m = np.vstack([tip.matrix[None, :3, 3], parts_m])
     return TouchTargets(tuple(points), frame, tip, carried_m)
 

@@ -327,14 +327,19 @@ class MeasuredPoints:
         at = np.arange(count)
         return np.asarray(self.independent + uneven[at, :, at, :])
 
+    @property
+    def covariance(self) -> FloatArray:
+        """(3 n, 3 n) joint covariance of all points [m^2]."""
+        return np.asarray(block_diag(*self.independent) + self.common)
+
     def carried(self, by_points: FloatArray, noise_m: FloatArray) -> FloatArray:
         """(p, p) covariance of a result with the (n, p, 3) Jacobian `by_points` by each point.
 
         `noise_m` is the (n,) additional noise of each per axis [m].
         """
-        independent = self.independent + noise_m[:, None, None] ** 2 * np.eye(3)
         jacobian = np.concatenate(list(by_points), axis=1)
-        return np.asarray(jacobian @ (block_diag(*independent) + self.common) @ jacobian.T)
+        total = self.covariance + np.diag(np.repeat(noise_m**2, 3))
+        return np.asarray(jacobian @ total @ jacobian.T)
 
 
 def touched_points(

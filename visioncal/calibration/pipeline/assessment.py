@@ -26,7 +26,7 @@ from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arms import IdentifiedArm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.clock_offset import ClockOffset, DelayEstimate
+from visioncal.calibration.stages.clock_offset import ClockOffset
 from visioncal.calibration.stages.clock_sweep import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views
@@ -38,6 +38,7 @@ from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residua
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
+from visioncal.estimation.clock import DelayEstimate
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.poses import fit_poses

@@ -5,8 +5,8 @@ the corners are moved to where they would have been at the stamp.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -17,21 +17,17 @@ from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Remedy
-from visioncal.estimation.clock import ClockChange, ClockFit, DelayedFit, fit_delays
+from visioncal.estimation.clock import ClockChange, ClockFit, DelayEstimate
 from visioncal.estimation.clock_correlation import ImageTimes, Match
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
-from visioncal.estimation.effects import EFFECTS
 from visioncal.estimation.effects.delays import (
-    Delay,
     compress_delayed,
     delayed_points,
     shares_of,
     target_twists,
 )
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
+from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.results.sections import ClockResult
 from visioncal.session import View, too_far_apart
 
@@ -54,79 +50,13 @@ _SHUFFLED = 0.25
 ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 
-@dataclass(frozen=True, eq=False)
-class DelayEstimate:
-    """Estimated delay within images, such as that of a rolling shutter."""
-
-    of: Delay
-    time_s: float  # The delay [s].
-    sigma_s: float  # Its standard deviation [s].
-    is_clear: bool  # Whether it is significant, and was corrected.
-    resolution: tuple[int, int]  # Resolution of the images [px].
-    # (6,) Jacobian of each view's `cam_from_target` by the delay, by view.
-    jacobian: Mapping[int, FloatArray] = field(default_factory=dict)
-
-    def effect(self, views: Sequence[int], name: str = "") -> Effect:
-        """Error of the delay as an unknown of some views; see `stages.clocks.clock_effects`."""
-        unaffected = np.zeros(6)
-        jacobian = np.array([self.jacobian.get(view, unaffected) for view in views])
-        prior = PriorInformation(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
-        return Effect.free(name or self.of.name, prior, jacobian.reshape(-1, 6, 1))
-
-    def result(self) -> dict[str, Any]:
-        """Fields of `results.ClockResult`."""
-        return self.of.result(self.time_s, self.sigma_s, self.is_clear, self.resolution)
-
-    @property
-    def words(self) -> str:
-        """The delay in words."""
-        return self.of.words(self.time_s, self.sigma_s)
-
-
-def find_delays(
-    flange: Trajectory, frames: ImageTimes, camera: Camera | None, start: ClockFit
-) -> tuple[DelayedFit | None, tuple[DelayEstimate, ...]]:
-    """Estimates delays within images.
-
-    Args:
-        flange: `base_from_flange` over the robot's time.
-        frames: The camera's observations.
-        camera: Its intrinsics; None where its corners are not known.
-        start: The fit without delays.
-
-    Returns:
-        The fit with the significant delays, None without any; and all delays.
-    """
-    full = None if camera is None else fit_delays(flange, frames, camera, start, EFFECTS)
-    if full is None or camera is None:
-        return None, ()
-    columns = (full.times_s.tolist(), full.sigmas_s.tolist(), full.is_clear.tolist())
-    delays = tuple(
-        DelayEstimate(of, time_s, sigma_s, is_clear, camera.resolution)
-        for of, time_s, sigma_s, is_clear in zip(EFFECTS, *columns, strict=True)
-    )
-    clear = [delay.of for delay in delays if delay.is_clear]
-    if len(clear) in (0, len(delays)):
-        return (full if clear else None), delays
-    return fit_delays(flange, frames, camera, full.clock, clear), delays
-
-
-@dataclass(frozen=True, eq=False)
-class CorrectedViews:
-    """Views with corners corrected to the image's stamp."""
-
-    # The views' poses by the corrected corners; ambiguous ones stay as they are.
-    poses: Mapping[int, ViewPoses]
-    jacobian: Mapping[int, FloatArray]  # (6, k) Jacobian of each by the k delays, by view.
-
-
 def correct_corners(
     frames: ImageTimes,
     flange: tuple[FloatArray, FloatArray],
     seen: Sequence[ViewPoses],
     camera: Camera,
-    fit: DelayedFit,
-) -> CorrectedViews:
+    fit: ClockFit,
+) -> tuple[Mapping[int, ViewPoses], Mapping[int, FloatArray]]:
     """Corrects corners for the delays within images.
 
     Args:
@@ -134,19 +64,23 @@ def correct_corners(
         flange: (v, 4, 4) `base_from_flange` and (v, 6) its twists a second, in the flange frame.
         seen: The poses of the same views.
         camera: The intrinsics.
-        fit: The delays, and the camera's extrinsics.
+        fit: The k delays, and the camera's extrinsics.
+
+    Returns:
+        The views' poses by the corrected corners, of which ambiguous ones stay as they are; and the
+        (6, k) Jacobian of each by the delays; both by view.
     """
     stack, starts = frames.stack, frames.cam_from_target
     if stack is None or not len(seen):
-        return CorrectedViews({}, {})
+        return {}, {}
     with one_blas_thread():
-        x = fit.clock.fit.state.edges[0]
+        x, times_s = fit.fit.state.edges[0], np.array([delay.time_s for delay in fit.delays])
         twists = target_twists(frames.mount, flange[0], x, starts, flange[1])
-        shares = shares_of(fit.delays, stack, camera)
-        delayed = compress_delayed(stack, camera, shares, twists, fit.times_s, starts)
-        unknowns = 6 * len(seen) + len(fit.times_s)
+        shares = shares_of([delay.of for delay in fit.delays], stack, camera)
+        delayed = compress_delayed(stack, camera, shares, twists, times_s, starts)
+        unknowns = 6 * len(seen) + len(times_s)
         sigma_px = floored_sigma_px(stack.sigma_px(delayed.residuals, unknowns))
-        points, _ = delayed_points(stack, shares, twists, fit.times_s)
+        points, _ = delayed_points(stack, shares, twists, times_s)
         plain = replace(stack, weights=None)
         delayed_px = _projected(plain.with_points(points), camera, delayed.cam_from_target)
         px = stack.px + _projected(plain, camera, delayed.cam_from_target) - delayed_px
@@ -157,7 +91,7 @@ def correct_corners(
         )
         for at, view in enumerate(seen)
     }
-    return CorrectedViews(poses, dict(zip(poses, delayed.by_shared, strict=True)))
+    return poses, dict(zip(poses, delayed.by_shared, strict=True))
 
 
 def _projected(stack: CornerStack, camera: Camera, poses: FloatArray) -> FloatArray:

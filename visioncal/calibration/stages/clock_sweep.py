@@ -18,7 +18,6 @@ from visioncal.calibration.stages.clock_offset import (
     change_doubt,
     clock_words,
     correct_corners,
-    find_delays,
     not_ascending,
     shared_stamps_error,
     speed_words,
@@ -41,11 +40,10 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import (
     ClockChange,
     ClockFit,
-    DelayedFit,
     clear_fit,
     clock_change,
+    fit_delays,
     fit_offset,
-    left_by,
     refined_change,
 )
 from visioncal.estimation.clock_correlation import ImageTimes, Match, turning_matches
@@ -192,7 +190,13 @@ def _clocked(sweep: CameraSweep, matched: _Matched, poses: Mapping[int, ViewPose
         match = min(sound, key=lambda value: abs(value.offset_s - offset_s))
         return _by_motion(sweep, matched.views, (fit, match), matched.frames, poses)
     if len(sound) == 1 and matched.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
-        return _by_turning(sweep, matched.views, sound[0])
+        # By rotation alone, where the chain of frames does not close.
+        (match,), stated_s = sound, sweep.stated_s
+        clock = ClockOffset(
+            match.offset_s, match.sigma_s, "turning", stated_s, 0, match.correlation, speeds={}
+        )
+        warnings = [turning_doubt(match), *stated_doubts(clock, matched.views)]
+        return _at_offset(sweep, matched.views, clock, warnings, [])
     error = shared_stamps_error(matched.views, poses)
     if error is not None:
         raise error
@@ -208,7 +212,7 @@ def _change(sweep: CameraSweep, frames: ImageTimes, fit: ClockFit) -> ClockChang
             return None
         corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
         fits = fit_offset(flange, corrected, [fit.offset_s])
-        if not fits or left_by(fits[0]) > _CLEARLY_LESS * left_by(fit):
+        if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
             return None
         if frames.stack is not None:
             # A rolling shutter follows the motion, and would be taken for the clock's change.
@@ -278,8 +282,11 @@ def _by_motion(
     poses: Mapping[int, ViewPoses],
 ) -> ClockedViews:
     fit, match = found
-    delayed, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
-    fit = fit if delayed is None else delayed.clock
+    delayed = fit_delays(sweep.motion.flange, frames, sweep.camera, fit)
+    delays = () if delayed is None else delayed.delays
+    clear = [delay for delay in delays if delay.is_clear]
+    if delayed is not None and clear:
+        fit = delayed
     clock = ClockOffset(
         fit.offset_s,
         fit.sigma_s,
@@ -291,9 +298,9 @@ def _by_motion(
         delays=delays,
     )
     words, warnings = clock_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
-    notes = [words, *(delay.words for delay in delays if delay.is_clear)]
+    notes = [words, *(delay.words for delay in clear)]
     clocked = _at_offset(sweep, views, clock, warnings, notes)
-    return clocked if delayed is None else _with_corrected(sweep, clocked, views, poses, delayed)
+    return _with_corrected(sweep, clocked, views, poses, fit) if clear else clocked
 
 
 def _with_corrected(
@@ -301,7 +308,7 @@ def _with_corrected(
     clocked: ClockedViews,
     views: Sequence[View],
     poses: Mapping[int, ViewPoses],
-    fit: DelayedFit,
+    fit: ClockFit,
 ) -> ClockedViews:
     """Corrects the corners of all views that the stream covers for delays."""
     flange, clock = sweep.motion.flange, clocked.clock
@@ -311,31 +318,21 @@ def _with_corrected(
     seen, at_s = [pair for pair, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
     if sweep.camera is None:
         return clocked
-    corrected = correct_corners(
+    corrected, by_delays = correct_corners(
         sweep.frames(seen),
         (flange.at(at_s), flange.speeds(at_s)),
         [view for _, view in seen],
         sweep.camera,
         fit,
     )
-    jacobian = {view: array for view, array in corrected.jacobian.items() if view in clock.speeds}
-    places = {delay: at for at, delay in enumerate(fit.delays)}
     delays = tuple(
-        replace(delay, jacobian={view: by[:, places[delay.of]] for view, by in jacobian.items()})
-        if delay.of in places
-        else delay
-        for delay in clock.delays
+        replace(
+            delay,
+            jacobian={view: by[:, at] for view, by in by_delays.items() if view in clock.speeds},
+        )
+        for at, delay in enumerate(fit.delays)
     )
-    return replace(clocked, clock=replace(clock, delays=delays), poses=corrected.poses)
-
-
-def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> ClockedViews:
-    """Takes the offset by rotation alone, where the chain of frames does not close."""
-    clock = ClockOffset(
-        match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
-    )
-    warnings = [turning_doubt(match), *stated_doubts(clock, views)]
-    return _at_offset(sweep, views, clock, warnings, [])
+    return replace(clocked, clock=replace(clock, delays=delays), poses=corrected)
 
 
 def _undetermined(

@@ -257,6 +257,17 @@ def _search(
     return Searched(found, (image.shape[1], image.shape[0]), misfit, faint)
 
 
+def corners_in(
+    image: Image, target: Target, view: int = 0, *, quick: bool = False
+) -> Corners | NotFound:
+    """Finds a target's corners in an (h, w) grey image, with their blur; see `find_target`."""
+    seen = find_target(image, target, quick=quick)
+    if isinstance(seen, NotFound):
+        return seen
+    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
+    return Corners(view, seen.ids, seen.px, blur, seen.weights)
+
+
 def find_corners(
     image: Image, target: Target, view: int, *, quick: bool = False, name: str = ""
 ) -> tuple[Corners | Rejection, bool]:
@@ -273,17 +284,14 @@ def find_corners(
         The corners, or why the view is rejected; and whether markers were seen in another layout
         than the target's.
     """
-    seen = find_target(image, target, quick=quick)
+    seen = corners_in(image, target, view, quick=quick)
     if isinstance(seen, NotFound):
         cause = poor_image_reason(image, MAX_BLUR_PX)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
-    blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    reason = _why_unusable(target, seen.ids, blur)
-    if reason:
-        return Rejection(view, reason), False
-    return Corners(view, seen.ids, seen.px, blur, seen.weights), False
+    reason = _why_unusable(target, seen.ids, seen.blur_px)
+    return (Rejection(view, reason) if reason else seen), False
 
 
 def _imported(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
