@@ -89,10 +89,14 @@ def correct_command(options: CorrectOptions) -> None:
     columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
     warnings = [
         *bad,
-        *_warn_payload(arm, options.payload_kg),
         *_warn_turns(arm, targets, corrected, options.widest_deg),
         *_warn_singular(arm, targets, corrected.q, rows),
     ]
+    if options.payload_kg and not arm.compliance.any():
+        warnings.append(
+            f"--payload-kg {options.payload_kg:g} changes nothing: the calibration has no joints "
+            "that bend (level elastic)."
+        )
     if file is not None:
         write_atomically(file, table_to_send(targets, columns, rows))
     if options.as_json:
@@ -132,15 +136,6 @@ def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration
     if wrong:
         raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
     return calibration.at_temperatures(temperatures)
-
-
-def _warn_payload(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
-    """Warns where a payload has no effect."""
-    if payload_kg and not arm.compliance.any():
-        yield (
-            f"--payload-kg {payload_kg:g} changes nothing: the calibration has no joints that bend "
-            "(level elastic)."
-        )
 
 
 def _tool(calibration: Calibration, name: str | None) -> FloatArray:

@@ -14,7 +14,15 @@ from visioncal.interchange.result_files import load_exportable
 
 def export_command(options: ExportOptions) -> None:
     """Runs `visioncal export`."""
-    load = _load(options.mass_kg, options.cog_mm)
+    if (options.mass_kg is None) != (options.cog_mm is None):
+        raise DataError(
+            "A load is a mass and where its centre is.",
+            culprits=["--mass-kg", "--cog-mm"],
+            next_step="Give both --mass-kg and --cog-mm, or neither.",
+        )
+    load = None
+    if options.mass_kg is not None and options.cog_mm is not None:
+        load = Load(options.mass_kg, options.cog_mm)
     selection = Selection(
         options.edge,
         options.inverse,
@@ -39,16 +47,3 @@ def export_command(options: ExportOptions) -> None:
     check_free(options.out, force=options.force)
     write_atomically(options.out, written.text)
     say(f"wrote {options.out}")
-
-
-def _load(mass_kg: float | None, cog_mm: tuple[float, float, float] | None) -> Load | None:
-
-    if mass_kg is None and cog_mm is None:
-        return None
-    if mass_kg is None or cog_mm is None:
-        raise DataError(
-            "A load is a mass and where its centre is.",
-            culprits=["--mass-kg", "--cog-mm"],
-            next_step="Give both --mass-kg and --cog-mm, or neither.",
-        )
-    return Load(mass_kg, cog_mm)

@@ -265,10 +265,8 @@ def _by_image(
 
 
 def _target(words: str, result: Calibration) -> Target:
-
     if result.cell is not None and words in result.cell.targets:
         return target_from_document(result.cell.targets[words], words)
-
     return target_named(words, Path(words).stem)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from visioncal.cli.console import asked, print_json, say
+from visioncal.cli.parsing import refuse_given
 from visioncal.cli.session_options import RecordCellOptions, RecordOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import counted, figure
@@ -46,8 +47,12 @@ def record_command(options: RecordOptions) -> None:
     """Runs `visioncal record`."""
     scene = scene_of(options.plan, options.described)
     drives = not options.follow and options.arm.partition(":")[0] != "manual"
-    if drives or options.dry_run:
-        check_driven(scene, drives=drives)
+    if drives:
+        # Refuses to drive without a plan, before a device is opened.
+        _ = scene.planned
+    else:
+        is_dry = {"--dry-run": options.dry_run or None}
+        refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
     takes, device = options.takes, options.device
     taking = CaptureOptions(
         speed=takes.speed,
@@ -71,8 +76,13 @@ def record_command(options: RecordOptions) -> None:
         count = len(scene.planned.stops) if drives else options.views
         facts = facts_of(scene, cell, options.out.name)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        if taking.single:
-            check_not_begun(journal, options.camera)
+        if taking.single and journal.views:
+            raise DataError(
+                f"--resume: {options.camera} begins with its first picture again, and "
+                f"{len(journal.views)} views are there.",
+                culprits=["--resume"],
+                next_step="Record all of it into a new folder.",
+            )
         with shown_in(scene, cell, wanted=options.view) as viewers:
             watchers = [ViewLines(), *viewers]
             if drives:
@@ -384,26 +394,3 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
         f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
         f"{shlex.quote(str(journal.folder))} -o out"
     )
-
-
-def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
-    """Refuses to drive without a plan, before a device is opened."""
-    if drives:
-        _ = scene.planned
-        return
-    raise DataError(
-        "--dry-run: a guided arm is not driven, so there is nothing to say of it.",
-        culprits=["--dry-run"],
-        next_step="Leave it out.",
-    )
-
-
-def check_not_begun(journal: Journal, camera: str) -> None:
-    """Refuses to resume from a folder of images, which would start again with the first one."""
-    if journal.views:
-        raise DataError(
-            f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "
-            "views are there.",
-            culprits=["--resume"],
-            next_step="Record all of it into a new folder.",
-        )
