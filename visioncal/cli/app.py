@@ -19,38 +19,16 @@ from visioncal.core.version import __version__
 _EXIT_BROKEN_PIPE = 128 + 13
 
 
-class _Dynamics(LazyGroup):
-    """Its commands, in the order of a typical workflow."""
-
-    prefix = "dynamics_"
-    records = ("visioncal.cli.dynamics_options",)
-    listed = ("plan", "record", "identify", "validate", "payload", "gains")
-    homes: ClassVar = dict.fromkeys(listed, "dynamics")
-
-
-dynamics_app = typer.Typer(
-    cls=_Dynamics,
-    help="Identify an arm's inertias and friction, and weigh what it carries.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-
-
-class _Target(LazyGroup):
-    """What is done with a board."""
-
-    prefix = "target_"
-    records = ("visioncal.cli.session_options",)
-    listed = ("make", "check")
-    homes: ClassVar = dict.fromkeys(listed, "target")
-
-
-target_app = typer.Typer(
-    cls=_Target,
-    help="Print a board at its exact size, or name the one in a photograph.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+def _group(name: str, words: str, records: str, *listed: str) -> typer.Typer:
+    """A command with commands of its own, in the order of a typical workflow."""
+    attributes = {
+        "prefix": f"{name}_",
+        "records": (f"visioncal.cli.{records}",),
+        "listed": listed,
+        "homes": dict.fromkeys(listed, name),
+    }
+    cls = type(name, (LazyGroup,), attributes)
+    return typer.Typer(cls=cls, help=words, no_args_is_help=True, rich_markup_mode=None)
 
 
 class _Commands(LazyGroup):
@@ -58,7 +36,20 @@ class _Commands(LazyGroup):
 
     records = ("visioncal.cli.session_options", "visioncal.cli.result_options")
     homes: ClassVar = {"tcp": "framing", "fixture": "framing"}
-    groups: ClassVar = {"target": target_app, "dynamics": dynamics_app}
+    groups: ClassVar = {
+        "target": _group(
+            "target",
+            "Print a board at its exact size, or name the one in a photograph.",
+            "session_options",
+            *("make", "check"),
+        ),
+        "dynamics": _group(
+            "dynamics",
+            "Identify an arm's inertias and friction, and weigh what it carries.",
+            "dynamics_options",
+            *("plan", "record", "identify", "validate", "payload", "gains"),
+        ),
+    }
     listed = (
         *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "diff"),
         *("convert", "export", "tcp", "locate", "fixture", "touch-test", "correct", "simulate"),
