@@ -33,7 +33,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats import FOREIGN_FORMATS
-from visioncal.live.capture.options import Keep
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -277,7 +276,7 @@ def test_help_has_every_word_within_the_terminal(columns):
 CHOICES = {
     "calibrate": {"level": (*ASKED, "hand-eye"), "solver": get_args(SolverName)},
     "plan": {"purpose": PURPOSES, "mount": get_args(Mount)},
-    "record": {"pose_form": ("ours", *POSE_FORMS), "keep": get_args(Keep)},
+    "record": {"pose_form": ("ours", *POSE_FORMS)},
     "simulate": {"robot": SIMULATED_ARMS},
     "export": {
         "to": [export_format.name for export_format in EXPORT_FORMATS],
