@@ -48,7 +48,7 @@ def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
 def test_a_slow_motion_moves_corners_to_the_middle_of_the_exposure():
     cell = a_cell(image_noise=0.0)
     live = LiveView(cell)
-    for size in (2e-4, 1e-3):  # under 1 px, and some 4 px: made of exact and of shifted pictures
+    for size in (2e-4, 1e-3):  # under 1 px, and some 4 px: made of fine and of coarse pictures
         shares = np.linspace(-0.5, 0.5, 5)[:, None]
         image = live.picture(cell.robot.joints[0] + shares * size * SWAY)
         # A smear is symmetric about its middle, so its corners stay; a mistake in its direction or

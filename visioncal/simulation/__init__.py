@@ -4,14 +4,9 @@ Boards are drawn as they are printed. Nothing here uses the application's camera
 estimator, so that an error in a projection or in a kinematic chain cannot cancel out.
 """
 
-from visioncal.simulation.arms import ArmOptions, DhArm, Heat, Payload, arm_named, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forward, ur_arm
 from visioncal.simulation.boards import BOARDS
-from visioncal.simulation.cell import (
-    InstrumentReading,
-    SimulatedCell,
-    SimulatedRobot,
-    SimulatedSight,
-)
+from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.cell_files import cell_names, read_cell
 from visioncal.simulation.layout import (
     BoardAt,
@@ -44,7 +39,7 @@ from visioncal.simulation.records import (
     truth_path,
     write_session,
 )
-from visioncal.simulation.render import RenderScene, prepare_scene, render
+from visioncal.simulation.render import prepare_scene, render
 from visioncal.simulation.touching import touch
 
 __all__ = [
@@ -55,21 +50,16 @@ __all__ = [
     "CameraAt",
     "CameraOptions",
     "CellOptions",
-    "DhArm",
     "Heat",
     "InstrumentAt",
-    "InstrumentReading",
     "Moved",
     "NetworkOptions",
     "Payload",
     "PointAt",
-    "RenderScene",
     "RobotAt",
     "Round",
     "Second",
     "SimulatedCell",
-    "SimulatedRobot",
-    "SimulatedSight",
     "SweepOptions",
     "Swept",
     "Truth",
