@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
-from visioncal.vision.boards import DetectedCorners, NotFound, find_target
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.boards.imaging import blur_at_corners, claimed_size, decode_image
 from visioncal.vision.targets import corner_positions
@@ -155,7 +155,7 @@ def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
     )
     assert list(found.corners) == [1]
     assert "on one line" in found.rejections[0].reason
-    monkeypatch.setattr("visioncal.calibration.stages.detect._FEWEST_FOUND", 41)
+    monkeypatch.setattr(type(kind_of(target)), "fewest", 41)
     refused = detect(
         session_of({"row.png": encoded(one_row), "whole.png": encoded(images[0])}, target)
     )

@@ -42,8 +42,6 @@ from visioncal.vision.targets import corner_positions, point_numbers
 
 # Fewest corners of corners.csv: a homography takes four points.
 _FEWEST_GIVEN = 4
-# Fewest detected corners, or all that a board has: four for a homography, the rest for its check.
-_FEWEST_FOUND = 6
 # Share of the image's size by which corners of corners.csv may lie outside of it.
 _OUTSIDE = 0.1
 # Number of images with corners that show the printed layout, or how they were turned; and the
