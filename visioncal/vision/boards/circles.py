@@ -200,8 +200,8 @@ class CircleGrid(Board):
         best = seen[0]
         return NotFound(
             f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
-            "and the target is "
-            f" {_article(target.asymmetric)} one of {target.columns} x {target.rows}",
+            f"and the target is {_article(target.asymmetric)} one of "
+            f"{target.columns} x {target.rows}",
             misfit=True,
         )
 
