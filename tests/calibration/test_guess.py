@@ -3,7 +3,7 @@
 import shlex
 import tracemalloc
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import cycle
 from pathlib import Path
 
@@ -130,6 +130,51 @@ def test_a_wrong_mount_is_named_though_poses_are_poor(mount):
     guess = guess_reading(poses.robot, poor, OTHER[mount], is_measured=True)
     assert guess.best.words == f"the camera mounted {mount}", guess.sentence
     assert guess_reading(poses.robot, poor, mount, is_measured=True).stands_out is False
+
+
+def hobby_arm(seed):
+    """24 poses of an arm of five axes by its joints, off by 2 deg, and what its camera sees."""
+    rng = np.random.default_rng(seed)
+    twists = np.zeros((5, 6))
+    # The axes of base, shoulder, elbow, wrist and hand at rest, and a point on each [m].
+    twists[:, :3] = [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]]
+    places = [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.22], [0.13, 0, 0.22], [0.23, 0, 0.22]]
+    twists[:, 3:] = np.cross(places, twists[:, :3])
+
+    def poses(joints):
+        return reduce(
+            np.matmul, [exp(q[:, None] * twist) for q, twist in zip(joints.T, twists, strict=True)]
+        )
+
+    joints = rng.uniform([-0.6, -0.5, -0.4, -0.2, -1.0], [0.6, 0.5, 0.6, 1.2, 1.0], (24, 5))
+    on_flange = exp(np.array([0.2, 1.4, 0.1, 0.03, 0.0, 0.06]))
+    at_base = exp(np.array([0.1, 2.9, 0.3, 0.35, 0.05, 0.0]))
+    camera = invert(poses(joints) @ on_flange) @ at_base
+    told = poses(joints + rng.normal(0.0, np.deg2rad(2.0), joints.shape))
+    return sound(told, camera, "eye-in-hand")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_inverse_poses_of_a_hobby_arm_are_named(seed):
+    poses = hobby_arm(seed)
+    assert not guessed(poses).stands_out
+    planted = MISTAKES["inverse poses"](poses, np.random.default_rng(0))
+    guess = guessed(planted)
+    assert is_named(guess, planted), guess.sentence
+
+
+def test_inverse_poses_of_a_hobby_arm_are_the_first_cause_and_undone(tmp_path):
+    poses = hobby_arm(1)
+    planted = MISTAKES["inverse poses"](poses, np.random.default_rng(0))
+    session = pairs_session(planted)
+    first = visioncal.calibrate(session).verdict.findings[0]
+    assert first.kind == "misread_poses"
+    assert "the robot's poses inverse" in first.words
+    session.save(tmp_path / "cell")
+    done = visioncal_command("convert", tmp_path / "cell", tmp_path / "fixed", "--guess", "--yes")
+    assert done.status == 0, done.err
+    fixed = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "fixed").views]
+    np.testing.assert_allclose(fixed, poses.true_robot, atol=1e-9)
 
 
 @pytest.mark.parametrize(("written", "read"), [("ZYX", "xyz"), ("xyz", "ZYX")])

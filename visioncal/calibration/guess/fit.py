@@ -1,7 +1,10 @@
-"""Robust fit of both unknown edges of the chain, and its closing error without unit.
+"""Robust fit of both unknown edges of the chain, its closing error without unit, its likelihood.
 
 Distances of the target's positions are divided by the typical distance between camera and target,
 and combined with angles in radians. So a reading that makes everything tiny gains nothing.
+
+The likelihood is by which readings are compared: a view is gaussian, with the standard deviations
+of its own fit, or one of a few outliers, with a broad tail.
 """
 
 from dataclasses import dataclass
@@ -23,6 +26,11 @@ _SUBSET = 4
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the equations of a view.
 _UNKNOWNS, _PER_VIEW = 12, 6
+# Standard deviation by axis [rad, or share of the distance]: readings are not distinguished by less
+# than the first, and beyond the second no reading explains the views.
+LEAST_SIGMA, UNEXPLAINED_SIGMA = 5e-4, 0.12
+# Prior probability of an outlier view, and rounds in which outliers are weighted down.
+_OUTLIER_PRIOR, _ROUNDS = 0.05, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +42,7 @@ class Fit:
     shift: FloatArray  # (n,) distance of each view's target from Z, in the poses' units.
     angle: FloatArray  # (n,) its rotation relative to Z [rad].
     lever: float  # Typical distance between camera and target, in the poses' units.
+    lost: int = 0  # Views that have no residual under this reading, and are outliers.
 
     @cached_property
     def residuals(self) -> FloatArray:
@@ -54,6 +63,57 @@ class Fit:
         freedom = max(_PER_VIEW * count - _UNKNOWNS, _PER_VIEW)
         mean_square = float(np.mean(self.residuals[self.kept] ** 2))
         return float(np.sqrt(mean_square * _PER_VIEW * count / freedom))
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Restricted log-likelihood of the views under this reading, at its own noise."""
+        return self._log_likelihood(self._estimate[0]) if np.isfinite(self.score) else -np.inf
+
+    @cached_property
+    def agreeing(self) -> int:
+        """Number of views that are no outliers."""
+        return int((self._estimate[1] > 0.5).sum())
+
+    @cached_property
+    def unexplained(self) -> float:
+        """Log-likelihood of the residuals if positions, or rotations, remain unexplained."""
+        beyond = np.where(np.eye(2), UNEXPLAINED_SIGMA, self._estimate[0])
+        return max(map(self._log_likelihood, beyond))
+
+    @cached_property
+    def _estimate(self) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
+        sigma, squares = np.full(2, UNEXPLAINED_SIGMA), self._squares
+        weights = np.isin(np.arange(len(self.angle)), self.kept) * np.isfinite(self.score)
+        for _ in range(_ROUNDS if np.isfinite(self.score) else 0):
+            # Three equations a view each, less the six unknowns of the edges.
+            freedom = max(3.0 * weights.sum() - 0.5 * _UNKNOWNS, 3.0)
+            sigma = np.clip(np.sqrt(squares @ weights / freedom), LEAST_SIGMA, UNEXPLAINED_SIGMA)
+            inlier, outlier = self._densities(sigma)
+            weights = 1.0 / (1.0 + np.exp(np.clip(outlier - inlier, -500.0, 500.0)))
+        return sigma, weights
+
+    @property
+    def _squares(self) -> FloatArray:
+        """(2, n) squared residuals of position and rotation, without unit."""
+        return np.array([self.shift / self.lever, self.angle]) ** 2
+
+    def _densities(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) log densities of inlier and outlier views, each times its prior probability."""
+        squares = self._squares
+        inlier = -3.0 * np.log(sigma).sum() - 0.5 * (squares.T / sigma**2).sum(axis=1)
+        outlier = -3.0 * np.log1p(squares).sum(axis=0)
+        return inlier + np.log1p(-_OUTLIER_PRIOR), outlier + np.log(_OUTLIER_PRIOR)
+
+    def _log_likelihood(self, sigma: FloatArray) -> float:
+        count = len(self.angle) + self.lost
+        lost = self.lost * (np.log(_OUTLIER_PRIOR) - 6.0 * np.log(2.0))
+        inlier, outlier = self._densities(sigma)
+        # A reading explains most of the views: only the farthest ones may be outliers.
+        views = np.logaddexp(inlier, outlier)
+        views[self.kept] = inlier[self.kept]
+        total = float(views.sum() + lost)
+        return total * max(1.0 - _UNKNOWNS / (_PER_VIEW * max(count, 1)), 0.0)
 
     @property
     def rms(self) -> tuple[float, float]:

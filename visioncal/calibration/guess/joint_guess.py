@@ -17,7 +17,6 @@ from visioncal.calibration.guess.joint_readings import (
     joint_readings,
     with_zero,
 )
-from visioncal.calibration.guess.recording import SCORE_FLOOR, STANDS_OUT
 from visioncal.calibration.guess.search import thinned
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
@@ -32,7 +31,10 @@ FEWEST_JOINT_ROWS = 5
 _MODEL_DEVIATION = 0.03
 # Below these scores the declared reading is right: controllers print their poses more finely.
 # Cameras do not see better, and most mistakes leave more, unless they change nothing.
-_FITS, FITS_SEEN = 3.0 * SCORE_FLOOR, 2e-3
+_FLOOR = 1e-4
+_FITS, FITS_SEEN = 3.0 * _FLOOR, 2e-3
+# Ratio of the declared reading's score to that of one that replaces it.
+_STANDS_OUT = 3.0
 # Ratio to the best score within which readings are equivalent: the one with the fewest mistakes is
 # chosen. Equally simple ones within the second ratio are rivals.
 _EQUIVALENT, _RIVALS = 2.0, 1.5
@@ -56,8 +58,8 @@ class FittedJoints:
 
     @property
     def score(self) -> float:
-        """The fit's score, not below `SCORE_FLOOR`."""
-        return max(self.fit.score, SCORE_FLOOR)
+        """The fit's score, not below a least one."""
+        return max(self.fit.score, _FLOOR)
 
     @property
     def figures(self) -> str:
@@ -153,7 +155,7 @@ def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
     equivalent = [fit for fit in tried if fit.score <= _EQUIVALENT * least_score]
     equivalent.sort(key=lambda fit: (fit.reading.cost, fit.score))
     best, others = equivalent[0], equivalent[1:]
-    if best.score > _MODEL_DEVIATION or start.score <= STANDS_OUT * best.score:
+    if best.score > _MODEL_DEVIATION or start.score <= _STANDS_OUT * best.score:
         return JointGuess(start, start)
     limit, cost = _RIVALS * best.score, best.reading.cost
     rivals = (fit.reading for fit in others if fit.reading.cost == cost and fit.score < limit)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from visioncal.calibration.guess.recording import STANDS_OUT, Recording, Scored
+from visioncal.calibration.guess.recording import CLEAR, Recording, Scored
 from visioncal.calibration.guess.result import Candidate
 
 
@@ -29,7 +29,8 @@ def sentence(
             f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
             "views tilted about different axes."
         )
-    if not declared.closes or any(STANDS_OUT * rival.score < declared.score for rival in rivals):
+    is_beaten = any(rival.log_posterior > declared.log_posterior + CLEAR for rival in rivals)
+    if not declared.closes or is_beaten:
         return (
             "No reading that was tried stands out: as declared, the chain closes to "
             f"{_figures(declared)}{others and f'; {others}'}."
@@ -67,15 +68,12 @@ def _figures(candidate: Candidate) -> str:
     return f"{candidate.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
 
 
-def notes(
-    recording: Recording, best: Scored, *, has_chain: bool, is_declared: bool, is_poor: bool
-) -> Iterator[str]:
+def notes(recording: Recording, best: Scored, *, is_declared: bool, is_poor: bool) -> Iterator[str]:
     """States what residuals cannot show here.
 
     Args:
         recording: The recorded poses.
         best: The chosen reading.
-        has_chain: Whether the joints were compared.
         is_declared: Whether the chosen reading is the declared one.
         is_poor: Whether the views turn about one axis at most.
     """
@@ -106,7 +104,7 @@ def notes(
             "Which axis is mirrored cannot be seen in the views: another one turns the base and "
             "the flange by half a turn. y was taken."
         )
-    if not has_chain:
+    if recording.chain is None:
         yield (
             "A base turned about its z (base_link for base) does not show without joint angles "
             "and the robot's model."

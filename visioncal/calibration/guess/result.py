@@ -21,7 +21,8 @@ class Candidate:
     differences: tuple[str, ...]  # Words for each difference from the declared reading.
     rms_mm: float  # Scatter of the target's position over the kept views [mm].
     rms_deg: float  # Scatter of its orientation [deg].
-    score: float  # Both in one figure without unit, by which readings are compared.
+    score: float  # Both in one figure without unit.
+    log_posterior: float  # By which readings are compared.
     agreeing: int  # Number of views that agree with each other.
     rows: int  # Number of views in the fit.
     is_board: bool = False  # Whether the camera's poses were measured from images.

@@ -30,13 +30,12 @@ from visioncal.calibration.guess.hypothesis import (
     strangeness,
 )
 from visioncal.calibration.guess.recording import (
-    SCORE_FLOOR,
+    CLEAR,
     Recording,
     Scored,
     fitted,
-    is_far_likelier,
     is_likely_unit,
-    likeness,
+    plausibility,
 )
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.transforms import compose, nearest_rotation, rotation_angle
@@ -50,7 +49,7 @@ _RATIO, _PAIRINGS, _TURNED, _LABELLED, _FITTED = 3.0, 32, 24, 80, 12
 # Half a degree, which noisy poses of few views add to any bound.
 _SLACK_RAD = 5e-3
 # Relative penalty of a score per change of the declared reading.
-_PENALTY = 0.3
+_PENALTY, _FLOOR = 0.3, 1e-4
 _STARTS = 12
 
 # Units of poses; micrometres are for instruments. Nobody has a robot in inches and a camera in
@@ -226,7 +225,7 @@ def search(recording: Recording) -> list[Scored]:
     own, classes = _classes(part, robot, camera, turned)
     declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
     others = [_best_label(part, labels, rows) for labels in classes]
-    others.sort(key=lambda other: other.score)
+    others.sort(key=lambda other: -other.log_posterior)
     return [replace(scored, rows=looked_at[scored.rows]) for scored in (declared, *others)]
 
 
@@ -244,6 +243,11 @@ def _classes(
         (float(score), turn, variant)
         for turn in turned
         for score, variant in score_variants(recording, turn)
+        # Misread angles and a left-handed frame, or transposes, are never mistaken together.
+        if not (
+            robot.turns[turn.pairing.robot].written
+            and (variant.signs or turn.transposed[0] != variant.carried)
+        )
     ]
     best = min((score for score, *_ in scored), default=0.0)
     close = [pair for pair in scored if pair[0] <= _RATIO * best + _SLACK_RAD]
@@ -265,7 +269,7 @@ def _classes(
 
 def _penalised(score: float, cost: float) -> float:
     """Score that ranks simple readings before equally good others."""
-    return (score + SCORE_FLOOR) * (1.0 + _PENALTY * cost)
+    return (score + _FLOOR) * (1.0 + _PENALTY * cost)
 
 
 def _cheap_cost(robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant) -> float:
@@ -316,31 +320,27 @@ def _labels(
 
 def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
     """Chooses the reading with the most plausible cell among those of one class."""
-    scored = [fitted(recording, label, rows, _STARTS) for label in labels]
-    chosen = max(
-        scored,
-        key=lambda value: (likeness(recording, value), value.hypothesis.mount == recording.mount),
-    )
+    tried = [fitted(recording, label, rows, _STARTS) for label in labels]
+    likely = {item.hypothesis: plausibility(recording, item) for item in tried}
+    chosen = max(tried, key=lambda item: likely[item.hypothesis])
+    least = likely[chosen.hypothesis] - CLEAR
     as_likely = (
-        item.hypothesis
-        for item in scored
-        if item.hypothesis.mount != chosen.hypothesis.mount
-        and likeness(recording, item) == likeness(recording, chosen)
+        label
+        for label in labels
+        if label.mount != chosen.hypothesis.mount and likely[label] > least
     )
-    cost = recording.cost(chosen.hypothesis)
-    return replace(chosen, labels=tuple(labels), cost=cost, other_mount=next(as_likely, None))
+    return replace(chosen, labels=tuple(labels), other_mount=next(as_likely, None))
 
 
 def _with_likelier(
     recording: Recording, declared: Scored, own: Sequence[Hypothesis], rows: IntArray
 ) -> Scored:
     """Adds the simplest labels of the declared reading's class with a more plausible cell."""
-    unit = declared.hypothesis.robot.unit
-    scored = [fitted(recording, item, rows, _STARTS) for item in own if item.robot.unit == unit]
-    likelier = [item.hypothesis for item in scored if is_far_likelier(recording, item, declared)]
-    costs = [recording.cost(hypothesis) for hypothesis in likelier]
-    least = min(costs, default=0.0)
-    labels = (item for item, cost in zip(likelier, costs, strict=True) if cost == least)
+    unit, limit = declared.hypothesis.robot.unit, plausibility(recording, declared) + CLEAR
+    tried = [fitted(recording, item, rows, _STARTS) for item in own if item.robot.unit == unit]
+    likelier = [item for item in tried if plausibility(recording, item) > limit]
+    most = max((item.log_prior for item in likelier), default=0.0)
+    labels = (item.hypothesis for item in likelier if item.log_prior == most)
     return replace(declared, labels=tuple(labels))
 
 
