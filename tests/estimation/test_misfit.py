@@ -245,7 +245,7 @@ def test_a_lens_beyond_its_model_is_counted_and_named(mount, monkeypatch):
         away.append(error_of(cell, known)[3:6])
         named += any(warning.kind == "lens_field" for warning in known.findings.warnings)
         with monkeypatch.context() as patched:
-            patched.setattr(refine, "with_sizes", lambda _, fitted: fitted)
+            patched.setattr(refine, "with_sizes", lambda _, fitted, *__: (fitted, {}))
             without.append(error_of(cell, calibrated(cell, joints=False))[3:6])
     # 6 components: a mean squared error over the covariance of 3.7 is one in a thousand.
     assert np.mean(squared) / 3 < 3.7

@@ -142,7 +142,7 @@ def test_looks_at_other_postures_err_by_what_is_predicted(errors):
     for seed in range(8):
         problem, fit = fitted(errors, seed)
         found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-        there, predicted = found.far_posture_errors**2
+        there, predicted = left_out_clusters(problem, fit.state, fit.noise, ROBOT, found) ** 2
         ratios.append(there / predicted)
     # Of 8 x 22 looks at three axes each, and errors that look alike in a cluster: known to 0.3.
     assert 0.5 < np.mean(ratios) < 1.6

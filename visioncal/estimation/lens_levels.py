@@ -123,9 +123,8 @@ class _Likelihood:
                 continue
             without = found.logs.copy()
             without[level] = low[level]
-            candidate = self.model.at(without)
-            if candidate.value <= found.value:
-                found = candidate
+            if self.model.at(without, is_sloped=False).value <= found.value:
+                found = self.model.at(without)
         return found
 
     def gain(self, found: MixedEstimate, closed: tuple[int, ...], level: int) -> float:
@@ -213,14 +212,15 @@ def estimate_sizes(
     starts += [error[2] for _ in mine.board_sizes for error in _BOARD_ERRORS]
     logs = np.log(np.concatenate([sizes, starts, np.maximum(noise.robots, 1e-6).ravel()]))
     found = likelihood.minimised(logs, closed)
-    if found.logs[_JITTER] > np.log(2.0 * _LEAST[-1]):
+    if before is None and found.logs[_JITTER] > np.log(2.0 * _LEAST[-1]):
         # A focus that varies may have been taken for errors of the flange: then these are far
         # smaller from above. Else it would only stand in for whatever corners have in common.
         logs[[_BREATHING, _JITTER]] = np.log(0.5 * np.array(_MOST[1:]))
         above, flanges = likelihood.minimised(logs, closed), slice(likelihood.flanges, None)
         if above.value < found.value and np.any(above.logs[flanges] < found.logs[flanges] - 1.0):
             found = above
-    for step in (1, -1) if _FIELD not in closed else ():
+    # The length was sought before, near another fit.
+    for step in (1, -1) if _FIELD not in closed and before is None else ():
         while 0 <= at + step < len(_LENGTHS):
             candidate = _assembled(linearised, _LENGTHS[at + step], count)
             other = candidate.minimised(found.logs, closed, found.value - _GAIN)

@@ -57,12 +57,14 @@ _MOST_ROWS = 360
 _MOST_BLOCKS = 5
 # Most columns that represent the errors of all stops; the remainder counts as noise.
 _MOST_COLUMNS = 360
+# Least information of stops on a combination of these, over its prior, and most combinations.
+_FAINT, _MOST_COMBINED = 0.1, 96
 # Number of posture clusters for cross-validation.
 _CLUSTERS = 5
 # Variances below this share of the total are rounding.
 _FACTORED = 1e-6
-# Start of a process's size in units of the noise, and the size that counts as zero.
-_START_SIZE, _NOTHING = 0.7, 1e-2
+# Start of a process's size in units of the noise, the size that counts as zero, and one near it.
+_START_SIZE, _NOTHING, _LITTLE_SIZE = 0.7, 1e-2, 3e-2
 # Least gain in log-likelihood of a step.
 _LITTLE = 5e-3
 
@@ -147,22 +149,24 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         [process for process in processes if process.lasts is lasts] for lasts in (False, True)
     ]
     most_stops = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
-    by_posture, in_time = (_columns(some, len(posed), observed_rows, most_stops) for some in kinds)
-    left = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
+    noise_sq = sum((weight * model.white**2 for model, weight in pairs), np.zeros(2))
+    by_posture, in_time = (
+        _informative(*_columns(some, len(posed), observed_rows, most_stops), noise_sq)
+        for some in kinds
+    )
+    left = noise_sq + by_posture[1] + in_time[1]
     columns, lasting = np.concatenate([by_posture[0], in_time[0]], axis=2), in_time[0].shape[2]
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[posed] = columns
-    beside = np.sqrt(left)
-    found = ArmErrors(
+    return ArmErrors(
         basis,
         1.0,
         gain,
         of_links=False,
-        white=beside,
+        white=np.sqrt(left),
         fit_sigmas=levels,
         time_correlated_count=lasting,
     )
-    return replace(found, far_posture_errors=left_out_clusters(problem, state, noise, robot, found))
 
 
 def left_out_clusters(
@@ -294,6 +298,29 @@ def _columns(
     return columns, np.maximum(mean.reshape(2, 3).mean(axis=1), 0.0)
 
 
+def _informative(
+    columns: FloatArray, left: FloatArray, noise_sq: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Those combinations of (s, 6, c) columns that stops may distinguish from noise.
+
+    Args:
+        columns: The columns.
+        left: (2,) mean variance that they leave.
+        noise_sq: (2,) variance of the noise.
+
+    Returns:
+        (s, 6, r) combinations, and (2,) the mean variance that these leave.
+    """
+    if not columns.shape[2]:
+        return columns, left
+    scale = np.repeat(np.sqrt(noise_sq + left), 3)[:, None]
+    white = (columns / scale).reshape(-1, columns.shape[2])
+    values, vectors = np.linalg.eigh(white.T @ white)
+    kept = (values > _FAINT) & (np.arange(len(values)) >= len(values) - _MOST_COMBINED)
+    lost = np.sum((columns @ vectors[:, ~kept]) ** 2, axis=2).mean(axis=0)
+    return columns @ vectors[:, kept], left + lost.reshape(2, 3).mean(axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class _StopBlock:
     """Stops with a joint covariance."""
@@ -382,7 +409,11 @@ class _Likelihood:
         )
         start = np.log(np.append(model.white, sizes))
         try:
-            found = mixed.maximised(start, np.log(least), np.log(MOST_SIGMA), little=_LITTLE)
+            # Where the likelihood falls from next to nothing on, a process has no size.
+            little = np.log(np.append(model.white, np.full(len(sizes), _LITTLE_SIZE)))
+            found = mixed.at(little)
+            if not len(sizes) or (found.gradient[2:] < 0.0).any():
+                found = mixed.maximised(start, np.log(least), np.log(MOST_SIGMA), little=_LITTLE)
         except np.linalg.LinAlgError:
             return model
         sigmas = np.exp(found.logs)

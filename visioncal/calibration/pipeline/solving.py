@@ -232,6 +232,9 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
     # that moved must not be taken for outliers.
     solved = start
     for _ in range(_ROUNDS):
+        # Errors of an arm are sought beside the stated lenses and boards, which may hide them.
+        if any(arm.errors and arm.errors.is_significant for arm in solved.arms.values()):
+            solved = replace(solved, linearised_corners=None)
         solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, sizes)
         if solved.cell.mount is None or observed.is_misread:
             break
@@ -275,6 +278,9 @@ def _fit_lenses_and_frames(
     if observed.scenes and not solved.inlier_fit.problem.is_combined:
         model, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
+        if (corners := solved.linearised_corners) is not None:
+            fitted, model = refine_jointly(model, corners.camera_parameters, frames, corners)
+            return solved.with_joint_fit(model, fitted)
         optics = model.camera_parameters(observed.scenes, views)
         if observed.is_misread:
             return solved.with_joint_fit(model, fit_jointly(optics, model, frames))
@@ -347,7 +353,7 @@ def _converge_arms(solved: CellFit) -> CellFit:
             model, corners = solved.frame_model, solved.linearised_corners
             fitted = fit_jointly(corners.camera_parameters, model, solved.frames, None, corners)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                fitted = with_sizes(model, fitted)
+                fitted, _ = with_sizes(model, fitted)
             solved = solved.with_joint_fit(model, fitted)
         problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}

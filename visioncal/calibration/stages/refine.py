@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -52,33 +51,46 @@ def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
 
 
 def refine_jointly(
-    model: CellFrameModel, optics: CameraParameters, frames: Mapping[str, FloatArray]
+    model: CellFrameModel,
+    optics: CameraParameters,
+    frames: Mapping[str, FloatArray],
+    before: LinearisedCorners | None = None,
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits lenses, boards and frames to all corners together, with the sizes of their errors.
 
     A given lens and a printed board have errors of unknown size, a priori zero, in one likelihood
     with those of the robots (`lens_levels`). With these fitted, the residuals determine the noise
-    of each view, and all is fitted once more with that. `optics` has stated lenses and boards,
-    `frames` the initial poses of unknown frames.
+    of each view, and all is fitted once more with that.
+
+    Args:
+        model: Frame part of the fit.
+        optics: Stated lenses and boards, or those of `before`.
+        frames: Initial poses of unknown frames.
+        before: The corners of a fit with other inliers or effects, from which to start, if any.
 
     Returns:
         The fit, and the model with the errors of its arms.
     """
     with diverging():
-        # Sizes are estimated from above: near a wrong size, lines of sight restrain another one.
-        wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
-        stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
+        if before is not None:
+            stated = fit_jointly(optics, model, frames, None, before)
+        else:
+            # Sizes are estimated from above: near a wrong size, lines of sight restrain another.
+            wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
+            stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
         if _is_shrunk(stated):
             stated = fit_jointly(optics, model, frames)
-        fitted = with_sizes(model, stated)
-        new_model = model.with_errors(fitted)
+        fitted, posture = with_sizes(model, stated)
+        new_model, sized = model.with_errors(fitted), fitted
         if any(error.is_significant for error in new_model.errors):
             fitted, new_model = _beside_arms(model, new_model, stated)
         weighed = fitted.camera_parameters.weighed(fitted.linearised)
         stacks = zip(weighed.problems.values(), optics.problems.values(), strict=True)
         if any(problem.stack is not before.stack for problem, before in stacks):
             fitted = _follows(new_model, fitted, weighed) or fitted
-        return with_sizes(new_model, fitted), new_model
+        if fitted is not sized:
+            fitted, _ = with_sizes(new_model, fitted, posture)
+        return fitted, new_model
 
 
 def _beside_arms(
@@ -92,7 +104,7 @@ def _beside_arms(
     """
     under_stated = model.with_errors(stated)
     freeing = (under_stated if under_stated.errors else after).freed(freely=True)
-    sized = with_sizes(freeing, _with_other_effects(freeing, stated))
+    sized, _ = with_sizes(freeing, _with_other_effects(freeing, stated))
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
         return sized, estimating
@@ -111,19 +123,32 @@ def _with_other_effects(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit
     return fit_jointly(fitted.camera_parameters, model, fitted.frames, before=fitted.linearised)
 
 
-def with_sizes(model: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
-    """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges."""
-    sized = _estimated(model, fitted)
+def with_sizes(
+    model: CellFrameModel, fitted: ConvergedFit, posture: Mapping[str, ArmErrors] | None = None
+) -> tuple[ConvergedFit, Mapping[str, ArmErrors]]:
+    """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges.
+
+    Args:
+        model: Frame part of the fit.
+        fitted: The fit.
+        posture: Errors of arms without joint angles beside which sizes are estimated; None to
+            estimate them where they matter.
+
+    Returns:
+        The fit, and these errors.
+    """
+    sized = _estimated(model, fitted, posture or {})
     follows = _follows(model, fitted, sized)
-    if follows is None:
-        return fitted
+    if follows is None or posture is not None or not model.arms_without_joints:
+        return follows or fitted, posture or {}
     scales = [item.scale for item in sized.board_sizes]
     focals = [item.focal for item in sized.lens_sizes.values()]
-    if not model.arms_without_joints or not any((*scales, *focals)):
-        return follows
+    if not any((*scales, *focals)):
+        return follows, {}
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
-    sized = _estimated(model, follows, model.pose_errors(follows))
-    return _follows(model, follows, sized) or follows
+    posture = model.pose_errors(follows)
+    sized = _estimated(model, follows, posture)
+    return _follows(model, follows, sized) or follows, posture
 
 
 def _follows(
@@ -157,7 +182,7 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 def _estimated(
     model: CellFrameModel,
     fitted: ConvergedFit,
-    posture: Mapping[str, ArmErrors] = MappingProxyType({}),
+    posture: Mapping[str, ArmErrors],
 ) -> CameraParameters:
     """Lenses and boards with the sizes of their errors, near a fit.
 
