@@ -246,7 +246,9 @@ def compress_points(
     columns = [projected.by_intrinsics, by_shape]
     shared = projected.by_intrinsics.shape[2] + by_shape.shape[2]
     if levels is not None:
-        breath = breathing_columns(stack, camera, fit.cam_from_target, levels.breathing)
+        breath = breathing_columns(
+            stack, projected.px, camera, fit.cam_from_target, levels.breathing
+        )
         stack.weigh(breath)
         columns += [breath, projected.residuals[:, :, None]]
     all_columns = np.concatenate(columns, axis=2)
@@ -260,7 +262,7 @@ def compress_points(
     if levels is not None and levels.field + levels.breathing > 0.0:
         modes, by_lens = np.zeros((len(stack.px), 0)), np.zeros((0, 0))
         if levels.field > 0.0:
-            modes = levels.field * field_modes(stack.px, camera.resolution, levels.length)
+            modes = levels.field * field_modes(projected.px, camera.resolution, levels.length)
             by_lens = levels.field * lens_part(camera, levels.length)
         following, products = without.with_modes(modes, by_lens)
         # Columns: shared values, breathing, residuals, field. Coefficients: field, then breathing.

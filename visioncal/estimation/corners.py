@@ -322,6 +322,7 @@ class Reprojection:
     """Reprojection of a stack."""
 
     residuals: FloatArray  # (n, 2) predicted minus detected, weighted [px].
+    px: FloatArray  # (n, 2) predicted [px].
     # (n, 2, 6) derivatives by the right perturbation of the view's `cam_from_target`.
     by_pose: FloatArray
     by_intrinsics: FloatArray  # (n, 2, k) derivatives by the intrinsics.
@@ -364,9 +365,10 @@ def reproject(
         (py * bz - pz * by, pz * bx - px * bz, px * by - py * bx, bx, by, bz)
     ):
         by_pose[:, :, at] = column
-    residuals = projection.px - stack.px
+    predicted, residuals = projection.px, projection.px - stack.px
     behind = ~np.isfinite(residuals).all(axis=1)
     if behind.any():
+        predicted[behind] = stack.px[behind]
         residuals[behind] = max(camera.resolution)
         by_pose[behind] = 0.0
         projection.jacobian_intrinsics[behind] = 0.0
@@ -374,7 +376,7 @@ def reproject(
     by_point = by_pose[:, :, 3:].copy() if is_weighed else by_pose[:, :, 3:]
     # In place: these three arrays are local to this call.
     stack.weigh(residuals, by_pose, projection.jacobian_intrinsics)
-    return Reprojection(residuals, by_pose, projection.jacobian_intrinsics, by_point)
+    return Reprojection(residuals, predicted, by_pose, projection.jacobian_intrinsics, by_point)
 
 
 def mean_square_by_view(stack: CornerStack, residuals: FloatArray) -> FloatArray:

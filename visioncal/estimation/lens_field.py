@@ -80,7 +80,7 @@ def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> F
     """Modes of a unit field along one axis of the image; those along the other are equal.
 
     Args:
-        px: (n, 2) corners [px].
+        px: (n, 2) corners, as predicted; see `breathing_columns` [px].
         resolution: (width, height) of the image [px].
         length: The field's length, as a share of the width.
 
@@ -140,9 +140,9 @@ def _grid_modes(extent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     return grid, vectors[:, kept] * np.sign(vectors[0, kept]), values[kept]
 
 
-def zooms(stack: CornerStack, camera: Camera) -> FloatArray:
-    """(n, 2) derivative of the corners by the relative focal length [px]."""
-    return np.asarray(stack.px - camera.matrix[2:])
+def zooms(px: FloatArray, camera: Camera) -> FloatArray:
+    """(n, 2) derivative of corners at (n, 2) pixels by the relative focal length [px]."""
+    return np.asarray(px - camera.matrix[2:])
 
 
 def depths_m(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
@@ -159,13 +159,21 @@ def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
 
 
 def breathing_columns(
-    stack: CornerStack, camera: Camera, cam_from_target: FloatArray, size: float
+    stack: CornerStack,
+    px: FloatArray,
+    camera: Camera,
+    cam_from_target: FloatArray,
+    size: float,
 ) -> FloatArray:
-    """(n, 2, 1) displacement by breathing of some size; (n, 2, 0) for size zero."""
+    """(n, 2, 1) displacement by breathing of some size; (n, 2, 0) for size zero.
+
+    `px` (n, 2) are the corners as predicted: what depends on detected ones contains their noise,
+    and beside the intrinsics explains it.
+    """
     if size == 0.0:
-        return np.zeros((len(stack.px), 2, 0))
+        return np.zeros((len(px), 2, 0))
     far = distances(stack, cam_from_target)[stack.view_of]
-    return (size * far[:, None] * zooms(stack, camera))[:, :, None]
+    return (size * far[:, None] * zooms(px, camera))[:, :, None]
 
 
 def displacements(

@@ -82,6 +82,7 @@ class _Rows:
     """One camera's linearised corners and observations: o observations (chains) of v views."""
 
     stack: CornerStack  # The corners, without effects of the focus.
+    px: FloatArray  # (n, 2) the corners as predicted [px].
     camera: Camera  # The lens.
     # (n, 2, c + 2) columns of lens, board and breathing, of a change of focus, and of the
     # residuals, after elimination of the poses.
@@ -287,7 +288,7 @@ def _rows(
     stack = corners.stack.with_points(corners.stack.points + shape @ optics.values[optics.boards])
     stack, lens = replace(stack, zooms=None), optics.camera(camera)
     now = reproject(stack, lens, poses)
-    focus = zooms(stack, lens)
+    focus = zooms(now.px, lens)
     breath = distances(stack, poses)[stack.view_of][:, None] * focus
     by_board = now.by_point @ shape
     stack.weigh(focus, breath, by_board)
@@ -326,6 +327,7 @@ def _rows(
     gradient -= known[:, own] @ deviation[alone]
     return _Rows(
         stack,
+        now.px,
         lens,
         WithoutPoses.of(stack, now.by_pose, all_columns, corners.shares),
         rows[own_rows] - of_camera.start,
@@ -389,7 +391,7 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     field's modes.
     """
     stack, without, chained = rows.stack, rows.without, rows.chained
-    modes = field_modes(stack.px, rows.camera.resolution, length)
+    modes = field_modes(rows.px, rows.camera.resolution, length)
     by_lens = lens_part(rows.camera, length)
     answer, products = without.with_modes(modes, by_lens)
     # Columns: lens, board, breathing, a change of focus, residuals, and the modes.

@@ -118,7 +118,7 @@ class CornerProblem:
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
         """Returns the problem with lens errors beyond the model."""
-        zoomed = levels.jitter * zooms(self.stack, self.scene.camera)
+        zoomed = levels.jitter * zooms(self.stack.px, self.scene.camera)
         stack = replace(self.stack, zooms=zoomed if levels.jitter > 0.0 else None)
         return replace(self, stack=stack, levels=levels)
 

@@ -192,7 +192,7 @@ def _stack(
     stack = CornerStack.of({corners.view: corners}, positions)
     if eye.jitter == 0.0:
         return stack
-    return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack, eye.camera))
+    return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack.px, eye.camera))
 
 
 def _with_jacobians(
