@@ -104,7 +104,11 @@ def test_an_arm_that_errs_by_posture_does_not_overrule_a_stated_board(real_data)
     # Its motion would have the board 4.5 % smaller; beside such errors that is known to 2.3 %.
     result = visioncal.calibrate(real_data / "sessions/kuka_checkerboard_in_hand")
     assert result.board.shape["scale"] == 0.0
-    assert result.verdict.causes[0].kind == "arm_errors"
+    # The corners of the last four views, which are the nearest, show another lens, too, and nothing
+    # tells which of the two moved the camera.
+    first, second, *_ = result.verdict.causes
+    assert {first.kind, second.kind} == {"arm_errors", "lens_changed"}
+    assert first.probability == second.probability
     away = 1e3 * result.transforms["flange_from_cam"].translation - [14.9, -108.0, -81.5]
     # Six of eight halves are so near by plain least squares.
     assert np.linalg.norm(away) < 1.0

@@ -302,7 +302,7 @@ def test_wrong_rows_are_refused_by_their_place(tmp_path):
 def test_wrong_options_are_refused(tmp_path):
     touches = touched(Job(), 1).touches
     for more, words in (
-        (("--touch-noise-mm", "0"), "millimetres above 0"),
+        (("--touch-noise-mm", "0"), "greater than or equal to 0.0001"),
         (("--name", "My tool"), "cannot name a tool"),
         (("--name", "flange"), "every cell has a frame of that name"),
         (("--robot-unit", "mn"), "There is no unit of length named 'mn'"),

@@ -124,7 +124,7 @@ def pairs(tmp_path: Path) -> Path:
 
 
 def options(session: Path, out: Path) -> CalibrateOptions:
-    return CalibrateOptions(sessions=[session], need=NeedOptions(), work=WorkOptions(), out=out)
+    return CalibrateOptions(session=session, need=NeedOptions(), work=WorkOptions(), out=out)
 
 
 def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):

@@ -173,6 +173,13 @@ class SimulatedCell:
         """The board of that name, or the single one."""
         return next(board for board in self.layout.boards if board.name == name)
 
+    def between(self, first: str, second: str) -> FloatArray:
+        """(4, 4) `first_from_second` of two frames that stand in the cell."""
+        cell_from_first, cell_from_second = (
+            self.mountings.get(frame, np.eye(4)) for frame in (first, second)
+        )
+        return np.asarray(invert(cell_from_first) @ cell_from_second)
+
     def robot_of(self, frame: str) -> str | None:
         """Robot that carries a camera, board or point; None for none."""
         parent = self.parents[frame]

@@ -357,7 +357,10 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
     if LENS_CHANGED in first:
-        feigned |= OF_CHAIN - {LENS_CHANGED}
+        # What the corners alone show explains what is less evident.
+        evidence = first[LENS_CHANGED].mahalanobis_sq
+        others = (OF_CHAIN - {LENS_CHANGED}) & first.keys()
+        feigned |= {name for name in others if first[name].mahalanobis_sq <= evidence}
     if "lens" in first and first["lens"].mahalanobis_sq:
         feigned |= {"board_size", "board_shape", "arm_errors"}
     return feigned

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Condition
 
 import cv2
@@ -235,7 +235,7 @@ def _search(
     name = session.board_of(view)
     earlier = session.images.search_of(view.image, name)
     if earlier is not None:
-        return earlier
+        return replace(earlier, found=replace(earlier.found, view=view.number))
     absence = session.images.absence(view.image)
     if absence:
         return Searched(Rejection(view.number, f"{view.image} {absence}"), None)
