@@ -285,16 +285,16 @@ class _ArmLikelihood:
 
     def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
         """The same without a block, and the logarithms of the other sizes."""
-        noughts = {HARMONICS, _SECOND} if name == HARMONICS else {name}
+        dropped = {HARMONICS, _SECOND} if name == HARMONICS else {name}
         waves = None if name == HARMONICS else self.waves
         bases = {other: basis for other, basis in self.bases.items() if other != name}
-        kept = [True] * self.nominal.before.size + [other not in noughts for other in self.names]
+        kept = [True] * self.nominal.before.size + [other not in dropped for other in self.names]
         return replace(self, bases=bases, waves=waves), logs[np.array(kept)]
 
     def sized(self, best: MixedEstimate) -> ArmSizes:
         """The sizes without blocks that have no evidence, and without negative compliances."""
         arm: _ArmLikelihood = self
-        while (lesser := arm._without_nought(best)) is not None:
+        while (lesser := arm._without_least_likely(best)) is not None:
             arm, best = lesser
         while (negative := arm._compliances(best) < 0.0).any():
             bases = {**arm.bases, COMPLIANCE: arm.bases[COMPLIANCE] * ~negative}
@@ -302,7 +302,7 @@ class _ArmLikelihood:
             best = arm.most_likely(best.logs)
         return arm._sizes(best)
 
-    def _without_nought(self, best: MixedEstimate) -> tuple[Self, MixedEstimate] | None:
+    def _without_least_likely(self, best: MixedEstimate) -> tuple[Self, MixedEstimate] | None:
         """Without the block that has the least evidence; None where all have enough."""
         has_process = HARMONICS in self.names
         # Eccentricity carries the first harmonics of the process.
