@@ -357,10 +357,11 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
     if LENS_CHANGED in first:
-        # What the corners alone show explains what is less evident.
-        evidence = first[LENS_CHANGED].mahalanobis_sq
-        others = (OF_CHAIN - {LENS_CHANGED}) & first.keys()
-        feigned |= {name for name in others if first[name].mahalanobis_sq <= evidence}
+        feigned |= OF_CHAIN - {LENS_CHANGED}
+        # Errors of the arm that are more evident are no effect of what the corners alone show.
+        arm = first.get("arm_errors")
+        if arm and arm.mahalanobis_sq > first[LENS_CHANGED].mahalanobis_sq:
+            feigned.discard("arm_errors")
     if "lens" in first and first["lens"].mahalanobis_sq:
         feigned |= {"board_size", "board_shape", "arm_errors"}
     return feigned
