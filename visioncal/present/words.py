@@ -16,15 +16,22 @@ def said(name: str, *about: object) -> list[str]:
     return [" ".join(part.split()) for part in text.split("\n\n") if part.strip()]
 
 
-@cache
-def _templates() -> Any:  # noqa: ANN401 - a module of macros
+def templates_of(folder: str, **options: Any) -> Environment:  # noqa: ANN401 - jinja2's own
+    """The environment of the templates in a folder of the package, in which no name is unknown."""
     environment = Environment(
-        loader=PackageLoader("visioncal", "present"),
+        loader=PackageLoader("visioncal", folder),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        **options,
     )
     environment.filters["significant"] = significant
+    return environment
+
+
+@cache
+def _templates() -> Any:  # noqa: ANN401 - a module of macros
+    environment = templates_of("present")
     environment.globals |= {
         "chance": SIGNIFICANT,
         "frame_words": facts.frame_words,

@@ -18,7 +18,7 @@ from visioncal.core.types import FloatArray, IntArray, Mount
 # With fewer views too many readings agree.
 FEWEST_ROWS = 4
 # Share of the log-likelihood that counts: the errors of an arm, a lens and a board are common to
-# the views, which are worth half as many independent ones.
+# the views, which count as half as many independent ones.
 EVIDENCE = 0.5
 # Log prior odds against a change of the declared reading, and against a cell that cannot be; and
 # the log posterior odds from which one reading is preferred to another.

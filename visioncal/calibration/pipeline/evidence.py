@@ -16,18 +16,18 @@ from visioncal.vision.targets import first_corners
 
 def view_evidence(state: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
-    solved, fit_state = state.cell_fit, state.assessment.state
-    held, looks = held_back(solved, state), solved.camera_parameters
-    problems = [(solved.cell.rows, solved.poses, solved.inlier_fit.problem)]
+    cell_fit, fit_state = state.cell_fit, state.assessment.state
+    held, parameters = held_back(cell_fit, state), cell_fit.camera_parameters
+    problems = [(cell_fit.cell.rows, cell_fit.poses, cell_fit.inlier_fit.problem)]
     problems += [] if held is None else [(held.rows, held.views, held.problem)]
     evidence = dict[int, ViewEvidence]()
     for cell_rows, views, problem in problems:
         poses = zip(problem.measured(fit_state), problem.predicted(fit_state), strict=True)
         for row, view, (measured, predicted) in zip(cell_rows, views, poses, strict=True):
             corners, px = view.corners, None
-            if corners is not None and looks is not None and row.seer in looks.problems:
-                camera = looks.camera(row.seer)
-                px = predict_corners(camera, predicted, looks.points[corners.ids])
+            if corners is not None and parameters is not None and row.seer in parameters.problems:
+                camera = parameters.camera(row.seer)
+                px = predict_corners(camera, predicted, parameters.points[corners.ids])
             evidence[row.view] = ViewEvidence(row.view, view.corners, px, None, measured)
     rows = {observation.view.number: observation for observation in state.timed.observations}
     return tuple(

@@ -1,6 +1,7 @@
 """Solves a cell: alternates between inliers, the fit of lenses, boards and frames, and arms."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -278,12 +279,14 @@ def _fit_lenses_and_frames(
     if observed.scenes and not solved.inlier_fit.problem.is_combined:
         model, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
-        if (corners := solved.linearised_corners) is not None:
-            fitted, model = refine_jointly(model, corners.camera_parameters, frames, corners)
-            return solved.with_joint_fit(model, fitted)
         optics = model.camera_parameters(observed.scenes, views)
         if observed.is_misread:
             return solved.with_joint_fit(model, fit_jointly(optics, model, frames))
+        if (corners := solved.linearised_corners) is not None:
+            # Where other inliers are too far from the last fit, it starts anew.
+            with suppress(ConvergenceError):
+                fitted, model = refine_jointly(model, corners.camera_parameters, frames, corners)
+                return solved.with_joint_fit(model, fitted)
         try:
             fitted, model = refine_jointly(model, optics, frames)
         except ConvergenceError:

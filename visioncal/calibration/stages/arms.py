@@ -430,13 +430,13 @@ class RobotArm:
         q, loads = used.joints_rad, used.loads
         if self.matched is None or self.joints_rad is None or q is None or not len(q):
             return self
+        if functions and not allows_functions(asked, len(q)):
+            return self
         model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, loads)
         blocks = blocks_of(model.nominal, self.loads)
         bases = {name: self._block_jacobian(model, name) for name in blocks}
         harmonics = None
         if functions:
-            if not allows_functions(asked, len(q)):
-                return self
             jacobian = model.robot.harmonic_jacobian(self.joints_rad, most_orders())
             columns = self._by_stop(jacobian.reshape(len(jacobian), 6, -1))
             harmonics = columns.reshape(len(columns), 6, model.nominal.joint_count, -1, 2)

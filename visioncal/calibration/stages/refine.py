@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -124,27 +125,29 @@ def _with_other_effects(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit
 
 
 def with_sizes(
-    model: CellFrameModel, fitted: ConvergedFit, posture: Mapping[str, ArmErrors] | None = None
+    model: CellFrameModel,
+    fitted: ConvergedFit,
+    posture: Mapping[str, ArmErrors] = MappingProxyType({}),
 ) -> tuple[ConvergedFit, Mapping[str, ArmErrors]]:
     """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges.
 
     Args:
         model: Frame part of the fit.
         fitted: The fit.
-        posture: Errors of arms without joint angles beside which sizes are estimated; None to
-            estimate them where they matter.
+        posture: Errors of arms without joint angles beside which sizes are estimated; where there
+            are none, they are estimated if they matter.
 
     Returns:
         The fit, and these errors.
     """
-    sized = _estimated(model, fitted, posture or {})
+    sized = _estimated(model, fitted, posture)
     follows = _follows(model, fitted, sized)
-    if follows is None or posture is not None or not model.arms_without_joints:
-        return follows or fitted, posture or {}
+    if follows is None or posture or not model.arms_without_joints:
+        return follows or fitted, posture
     scales = [item.scale for item in sized.board_sizes]
     focals = [item.focal for item in sized.lens_sizes.values()]
     if not any((*scales, *focals)):
-        return follows, {}
+        return follows, posture
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
     posture = model.pose_errors(follows)
     sized = _estimated(model, follows, posture)

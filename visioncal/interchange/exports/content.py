@@ -27,7 +27,7 @@ _MOST_COEFFICIENTS = 14
 # Share of the image about its centre in which both lenses are compared: at the rim neither is known
 # well where no view looked.
 _INNER = 0.5
-# Smallest rms of a lens's field that is told [px].
+# Smallest rms of a lens's field that a note names [px].
 _NOTICED_PX = 0.01
 # Largest error of an inverted distortion [px]: far less than any lens is known to.
 _SAME_PX = 1e-3

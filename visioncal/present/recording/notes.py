@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import rerun as rr
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from visioncal.core.number_format import significant
@@ -18,7 +17,7 @@ from visioncal.present import advice, arms, details, facts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.present.tables import Fact, Table
-from visioncal.present.words import said
+from visioncal.present.words import said, templates_of
 from visioncal.results import Calibration, ViewResult
 from visioncal.session import View
 
@@ -143,12 +142,9 @@ def result_markdown(
 
 @cache
 def _documents() -> Any:  # noqa: ANN401 - a module of macros
-    environment = Environment(
-        loader=PackageLoader("visioncal", "present/recording"),
+    environment = templates_of(
+        "present/recording",
         autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
         finalize=lambda value: value if isinstance(value, Markup) else Markup(plain(str(value))),
     )
     environment.globals |= vars(facts) | vars(arms) | vars(details) | vars(advice)

@@ -4,10 +4,10 @@ import platform
 from functools import cache
 from importlib import metadata
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, Template
 
-from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
+from visioncal.present.words import templates_of
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 
@@ -30,14 +30,7 @@ def template(name: str, *, has_result: bool = True) -> Template:
 @cache
 def _environment(*, has_result: bool) -> Environment:
     # Cached, as compiling the templates takes longer than rendering a page.
-    environment = Environment(
-        loader=PackageLoader("visioncal", "present/report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["significant"] = significant
+    environment = templates_of("present/report", autoescape=True)
     environment.globals |= {"software": _software, "version": __version__}
     if not has_result:
         return environment

@@ -101,12 +101,14 @@ class BoardKind(ABC):
     side: ClassVar[str] = "side of a square"
     sides: ClassVar[str] = "squares"
     unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
-    # Whether it has markers, whose bits are told apart from their mirror image.
+    # Whether it has markers, whose bits differ from those of their mirror image.
     has_markers: ClassVar[bool] = False
     # Whether some of its corners can be detected without the others.
     is_seen_in_part: ClassVar[bool] = False
     # Whether its markers are in the light squares of a checkerboard.
     marks_squares: ClassVar[bool] = False
+    # Whether tags stand alone, and need white around them that is as wide as one module.
+    has_lone_tags: ClassVar[bool] = False
     fewest: ClassVar[int] = 6  # Corners that a view needs, or all of fewer.
     # Whether its squares alternate over the whole board, for the fit to all pixels.
     is_dense: ClassVar[bool] = False
@@ -167,8 +169,7 @@ class BoardKind(ABC):
 
     def quiet_m(self, cells: Sequence[Cells]) -> float:
         """Width of the white that it needs around its cells [m]."""
-        del cells
-        return _QUIET_M
+        return max(grid.cell_m for grid in cells) if self.has_lone_tags else _QUIET_M
 
     def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
         """The description of a requested board with sides of `square_mm`."""

@@ -49,7 +49,7 @@ class MarkerKind(BoardKind):
     size_key = "size_m"
     side, sides = "side of the dark square", "a side"
     unit = "side"
-    has_markers = True
+    has_markers = has_lone_tags = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads size_m, square_sigma_m, dictionary and id."""
@@ -73,10 +73,6 @@ class MarkerKind(BoardKind):
         dark = marker_cells(target.dictionary, target.marker_id)
         side = target.square_m
         return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)
-
-    def quiet_m(self, cells: Sequence[Cells]) -> float:
-        """One module."""
-        return max(grid.cell_m for grid in cells)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""

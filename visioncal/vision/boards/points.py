@@ -45,7 +45,7 @@ class Rig(BoardKind):
     name: ClassVar[TargetKind] = "points"
     unit = "side"
     fewest = 4
-    is_seen_in_part = True
+    is_seen_in_part = has_lone_tags = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads points, the columns of the rig's table as lists, and dictionary."""
@@ -126,10 +126,6 @@ class Rig(BoardKind):
             turn = np.stack([x_side, y_side], axis=1) / side_m
             grids.append(Cells(quad[0], side_m / len(cells), cells, turn))
         return tuple(grids)
-
-    def quiet_m(self, cells: Sequence[Cells]) -> float:
-        """One module."""
-        return max(grid.cell_m for grid in cells)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
