@@ -150,13 +150,14 @@ def check_usable(verdict: "Verdict", what: str, *, force: bool) -> tuple[str, ..
     """
     if verdict.status != "bad":
         return ()
-    words = f"The verdict of {what} is bad: {' '.join(verdict.reasons[:1])}"
-    if len(verdict.reasons) > 1:
-        words += f" All {len(verdict.reasons)} reasons are in its report."
+    found = verdict.ordered
+    count = f" (all {len(found)} reasons are in its report)" if len(found) > 1 else ""
+    words = f"The verdict of {what} is bad{count}:"
     if force:
-        return (words,)
+        return (" ".join([words, *(finding.reason for finding in found[:1])]),)
     raise VerdictError(
-        words,
+        # The advice is the next step.
+        " ".join([words, *(finding.words for finding in found[:1])]),
         culprits=[what],
         next_step=" ".join([*map(str, verdict.next_steps[:1]), "To use it as it is, say --force."]),
     )

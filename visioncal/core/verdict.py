@@ -189,9 +189,14 @@ class Verdict:
     @property
     def reasons(self) -> tuple[str, ...]:
         """All findings with advice, the most likely cause first."""
+        return tuple(finding.reason for finding in self.ordered)
+
+    @property
+    def ordered(self) -> tuple[Finding, ...]:
+        """All findings, the most likely cause first."""
         likeliest = (cause for cause in self.causes[:1] if cause.kind not in SOURCES)
         distinct = {id(finding): finding for finding in (*likeliest, *self.findings)}
-        return tuple(finding.reason for finding in distinct.values())
+        return tuple(distinct.values())
 
     @property
     def causes(self) -> tuple[Finding, ...]:
