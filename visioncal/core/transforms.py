@@ -76,7 +76,7 @@ def log(matrices: FloatArray) -> FloatArray:
     which takes five times as long.
     """
     flat = matrices.reshape(-1, 4, 4)
-    vector, scalar = _quaternions(flat[:, :3, :3])
+    vector, scalar = quaternions(flat[:, :3, :3])
     sine = np.sqrt(np.sum(vector**2, axis=1))
     half = np.arctan2(sine, np.abs(scalar))
     scale = 2.0 * half / np.maximum(sine, np.finfo(float).tiny)
@@ -92,8 +92,11 @@ def log(matrices: FloatArray) -> FloatArray:
     return np.concatenate([rotation, result], axis=1).reshape(*matrices.shape[:-2], 6)
 
 
-def _quaternions(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Vector parts (m, 3) and scalars (m,) of the rotations' quaternions, not normalised."""
+def quaternions(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Vector parts (m, 3) and scalars (m,) of the quaternions of (m, 3, 3) rotations.
+
+    They are not normalised.
+    """
     diagonal = np.diagonal(rotations, axis1=1, axis2=2)
     trace = diagonal.sum(axis=1)
     after, before = [2, 0, 1], [1, 2, 0]
@@ -177,7 +180,7 @@ def mean_transform(matrices: FloatArray) -> FloatArray:
 def rotation_angle(matrices: FloatArray) -> FloatArray:
     """Angles [rad] of (..., 3, 3) or (..., 4, 4) rotations, accurate near 0 and near pi."""
     flat = matrices[..., :3, :3].reshape(-1, 3, 3)
-    vector, scalar = _quaternions(flat)
+    vector, scalar = quaternions(flat)
     angles = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(scalar))
     return np.asarray(angles.reshape(matrices.shape[:-2]))
 
