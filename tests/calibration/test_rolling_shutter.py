@@ -13,8 +13,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.effects import EFFECTS
-from visioncal.estimation.effects.delays import delayed_points, shares_of, target_twists
+from visioncal.estimation.effects.rolling_shutter import delayed_points, target_twists
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
 from visioncal.session import Session
@@ -71,16 +70,11 @@ def test_corners_move_with_the_readout_as_differences_say():
         {view_corners.view: view_corners for view_corners in moved.corners},
         numbered_positions([target]),
     )
-    shares = shares_of(EFFECTS, stack, camera)
-    # Rows from the first to the last.
-    assert -0.5 <= shares.min() < -0.3
-    assert 0.3 < shares.max() <= 0.5
     twists = np.random.default_rng(1).normal(size=(len(stack.views), 6))
     step_s = 1e-6
-    _, jacobian = delayed_points(stack, shares, twists, np.array([READOUT_S]))
+    _, jacobian = delayed_points(stack, camera, twists, READOUT_S)
     ahead, behind = (
-        delayed_points(stack, shares, twists, np.array([READOUT_S + value]))[0]
-        for value in (step_s, -step_s)
+        delayed_points(stack, camera, twists, READOUT_S + value)[0] for value in (step_s, -step_s)
     )
     # Places of 0.3 m at rounding over the step.
     np.testing.assert_allclose(jacobian[:, :, 0], (ahead - behind) / (2 * step_s), atol=1e-8)
@@ -106,11 +100,11 @@ def test_the_simulation_takes_every_row_at_its_own_time():
 def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     moved = swept(seed, mount=mount)
     known = calibrated_sweep(moved)
-    (found,) = next(iter(known.clocks.values())).clock.delays
-    assert found.is_clear
+    found = next(iter(known.clocks.values())).clock.shutter
+    assert found.kind == "rolling"
     # Four sigma, of which none is so large that this were easy: a hundredth of the readout.
-    assert abs(found.time_s - READOUT_S) < 4.0 * found.sigma_s
-    assert found.sigma_s < 0.01 * READOUT_S
+    assert abs(found.readout_s - READOUT_S) < 4.0 * found.readout_sigma_s
+    assert found.readout_sigma_s < 0.01 * READOUT_S
     error, covariance = x_error(moved, known), known.assessment.covariance[:6, :6]
     # Six degrees of freedom: one in ten thousand is beyond.
     assert distance(error, covariance) < 27.9
@@ -120,9 +114,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
 
 def test_a_global_shutter_is_not_mistaken():
     known = calibrated_sweep(swept(3, replace(HURRIED, readout_s=0.0)))
-    (found,) = next(iter(known.clocks.values())).clock.delays
-    assert not found.is_clear
-    shutter = next(iter(known.clocks.values())).clock.result().shutter
+    shutter = next(iter(known.clocks.values())).clock.shutter
     assert shutter.kind == "global"
     assert abs(shutter.readout_s) < 4.0 * shutter.readout_sigma_s
     assert not any("rolling" in note for note in known.notes)

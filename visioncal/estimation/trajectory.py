@@ -7,8 +7,10 @@ gaps, and no extrapolation.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -34,7 +36,7 @@ class Samples:
         return float(np.median(np.diff(self.stamps_s)))
 
     def covers(self, at_s: FloatArray, margin_s: float = 0.0) -> Mask:
-        """Mask of the times (m,) that lie between samples without a gap, including a margin."""
+        """Mask of the times (...,) that lie between samples without a gap, including a margin."""
         low, high = at_s - margin_s, at_s + margin_s
         inside = (low >= self.stamps_s[0]) & (high <= self.stamps_s[-1])
         breaks = np.concatenate([[0], np.cumsum(~self._joined)])
@@ -48,15 +50,15 @@ class Samples:
         neighbours = values[np.clip(before[:, None] + _NODES, 0, last)]
         return np.asarray(np.einsum("mi,mik->mk", self._weights(before, at_s), neighbours))
 
-    @property
+    @cached_property
     def _joined(self) -> Mask:
         """(n - 1,) mask of the intervals without a gap."""
         steps = np.diff(self.stamps_s)
-        limit_s = min(max(_GAP_RATIO * float(np.median(steps)), _SHORT_GAP_S), LONGEST_GAP_S)
+        limit_s = min(max(_GAP_RATIO * self.step_s, _SHORT_GAP_S), LONGEST_GAP_S)
         return np.asarray((steps <= limit_s) & (steps < LONGEST_GAP_S))
 
     def _before(self, at_s: FloatArray) -> IntArray:
-        """(m,) the samples at or before some times that have a successor."""
+        """(...,) the samples at or before some times that have a successor."""
         before = np.searchsorted(self.stamps_s, at_s, side="right") - 1
         return np.clip(before, 0, len(self.stamps_s) - 2)
 
@@ -67,14 +69,10 @@ class Samples:
         present[:, 0] = (before > 0) & joined[np.maximum(before - 1, 0)]
         present[:, 3] = (before + 2 <= last) & joined[np.minimum(before + 1, last - 1)]
         nodes_s = self.stamps_s[np.clip(before[:, None] + _NODES, 0, last)]
-        weights = present.astype(float)
-        for node in range(4):
-            for other in range(4):
-                if other != node:
-                    both = present[:, node] & present[:, other]
-                    span = np.where(both, nodes_s[:, node] - nodes_s[:, other], 1.0)
-                    weights[:, node] *= np.where(both, (at_s - nodes_s[:, other]) / span, 1.0)
-        return weights
+        counted = present[:, :, None] & present[:, None, :] & ~np.eye(4, dtype=bool)
+        spans = np.where(counted, nodes_s[:, :, None] - nodes_s[:, None, :], 1.0)
+        ways = np.where(counted, (at_s[:, None] - nodes_s)[:, None, :], 1.0)
+        return np.asarray(present * (ways / spans).prod(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +96,24 @@ class Trajectory(Samples):
                 pose = self.poses[np.clip(before + node, 0, last)]
                 twists += weight[:, None] * log(invert(start) @ pose)
         return np.asarray(start @ exp(twists))
+
+    def rotations(self, at_s: FloatArray) -> tuple[FloatArray, Mask]:
+        """(..., 4) quaternions about linear between samples, and a mask of the covered times."""
+        before, covered = self._before(at_s), self.covers(at_s)
+        share = (
+            np.where(covered, at_s - self.stamps_s[before], 0.0) / np.diff(self.stamps_s)[before]
+        )
+        mixed = self._quaternions[before] * (1.0 - share)[..., None]
+        mixed += self._quaternions[before + 1] * share[..., None]
+        return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True), covered
+
+    @cached_property
+    def _quaternions(self) -> FloatArray:
+        """(n, 4) of the samples' rotations, each on the side of the one before."""
+        found = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
+        turned = np.einsum("ni,ni->n", found[:-1], found[1:]) < 0.0
+        signs = np.concatenate([[1.0], np.where(np.cumsum(turned) % 2, -1.0, 1.0)])
+        return np.asarray(found * signs[:, None])
 
     def speeds(self, at_s: FloatArray) -> FloatArray:
         """(m, 6) twists per second at (m,) times, in the moving frame [rad/s, m/s].

@@ -26,8 +26,7 @@ from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arms import IdentifiedArm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.clock_offset import ClockOffset
-from visioncal.calibration.stages.clock_sweep import ClockPair
+from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
@@ -38,7 +37,6 @@ from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residua
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
-from visioncal.estimation.clock import DelayEstimate
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.poses import fit_poses
@@ -51,6 +49,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.arm import UnseenView
+from visioncal.results.sections import ClockResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,31 +106,21 @@ class FitAssessment:
         last = (version.frame for version in self.versions.values() if version.is_last)
         return {frame: self.edges[frame] for frame in last}
 
-    def clocks(self, observed: Observed) -> dict[ClockPair, ClockOffset]:
+    def clocks(self, observed: Observed) -> dict[ClockPair, ClockResult]:
         """Clock offsets, from the fit where it estimates them."""
-        return {
-            pair: self._fitted_clock(pair, clocked.clock)
-            for pair, clocked in observed.clocks.items()
-        }
-
-    def _fitted_clock(self, pair: ClockPair, clock: ClockOffset) -> ClockOffset:
-        correction = self._fitted_time(pair.effect)
-        if correction is None:
-            return clock
-        shift_s, sigma_s = correction
-        return replace(
-            clock,
-            camera_minus_robot_s=clock.camera_minus_robot_s + shift_s,
-            sigma_s=sigma_s,
-            delays=tuple(self._fitted_delay(pair, delay) for delay in clock.delays),
-        )
-
-    def _fitted_delay(self, pair: ClockPair, delay: DelayEstimate) -> DelayEstimate:
-        correction = self._fitted_time(pair.delay(delay.of))
-        if correction is None:
-            return delay
-        shift_s, sigma_s = correction
-        return replace(delay, time_s=delay.time_s + shift_s, sigma_s=sigma_s)
+        clocks = {}
+        for pair, clocked in observed.clocks.items():
+            clock = clocked.clock
+            offset, readout = self._fitted_time(pair.effect), self._fitted_time(pair.readout)
+            if offset is not None:
+                ahead_s, shutter = clock.camera_minus_robot_s + offset[0], clock.shutter
+                if shutter is not None and readout is not None:
+                    shutter = shutter.corrected(*readout)
+                clock = replace(
+                    clock, camera_minus_robot_s=ahead_s, sigma_s=offset[1], shutter=shutter
+                )
+            clocks[pair] = clock
+        return clocks
 
     def _fitted_time(self, effect: str) -> tuple[float, float] | None:
         """Estimated correction of a time, and its sigma [s]; None where the fit has none."""

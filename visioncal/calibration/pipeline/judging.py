@@ -259,7 +259,7 @@ def _clock_words(run: RunState) -> Iterator[str]:
             yield (
                 f"{pair.words}: the fit of the whole cell has the camera's clock "
                 f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
-                f"{figure(1e3 * clock.sigma_s)} ms)."
+                f"{figure(1e3 * (clock.sigma_s or 0.0))} ms)."
             )
 
 

@@ -121,7 +121,7 @@ def _complete_pair(
         validation=Validation.of(run.assessment.held_out.method, run.assessment.views),
         camera=next(iter(cameras_of(run).values()), None),
         robot=run.robot,
-        clock=next((clocked.clock.result() for clocked in run.clocks.values()), None),
+        clock=next((clocked.clock for clocked in run.clocks.values()), None),
         instrument=None if run.readings is None else _instrument(run.readings),
         points=tuple(_points(run)),
         board=next(iter(calibration.boards.values()), None) if is_unnamed else None,
@@ -369,9 +369,7 @@ def cell_of(run: RunState) -> CellResult:
             UnconnectedFrame(name, connection_advice(cell, name)) for name in solved.unconnected
         ),
         weakest=weakest_link(solved.cell, answer.last_edges),
-        details=CellDetails(
-            {pair.words: clock.result() for pair, clock in answer.clocks(run).items()}
-        ),
+        details=CellDetails({pair.words: clock for pair, clock in answer.clocks(run).items()}),
         joint_fit=fit_section(run),
         uncertainty=CellUncertainty(
             budget_mm={edges[frame]: mm for frame, mm in answer.budget_mm.items()},

@@ -1,32 +1,58 @@
 """Robot poses, from streams, for rows with a time and no pose.
 
 Every pair of a camera and a robot has its own clock offset, estimated from the motion that both
-observed.
+observed: where they turn alike, then by the whole chain of frames.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.clock_offset import ClockOffset
-from visioncal.calibration.stages.clock_sweep import (
-    CameraSweep,
+from visioncal.calibration.stages.clock_offset import (
+    FEWEST_VIEWS,
+    LARGEST_SIGMA_S,
+    LEAST_CORRELATION,
     ClockedViews,
     ClockPair,
-    misread_joints,
-    set_clock,
+    change_doubt,
+    check_shared_stamps,
+    motion_notes,
+    offset_doubts,
+    speed_words,
+    undetermined_error,
+    why_undetermined,
 )
-from visioncal.calibration.stages.motion import lacks_robot_state, motion_of, stream_of
+from visioncal.calibration.stages.motion import (
+    RobotMotion,
+    is_standing_still,
+    lacks_robot_state,
+    motion_of,
+    slow_and_new,
+    stream_of,
+)
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.errors import DataError, DegenerateError, VisioncalError
-from visioncal.core.types import Rejection
+from visioncal.core.errors import VisioncalError
+from visioncal.core.number_format import counted
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
+from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
+from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects.clock import clock_effect
+from visioncal.estimation.effects.rolling_shutter import (
+    compress_delayed,
+    delayed_points,
+    target_twists,
+)
+from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
+from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import ClockTable
@@ -34,6 +60,19 @@ from visioncal.session.kinds import is_camera_observation
 from visioncal.vision.targets import numbered_positions
 
 T = TypeVar("T", bound=Observed)
+
+# Assumed sigma of a stated offset [s].
+_STATED_SIGMA_S = 1e-3
+_SHOW_OFFSET = Remedy(
+    "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
+)
+_SPARED = "not needed: slower views stand for it, at the same places"
+_NO_TIME = "no pose of the robot: neither a pose nor a time is there"
+_BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
+_IN_A_GAP = "no pose of the robot: samples of its stream are missing around that time"
+_IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
+# Up to this number all views are used; of more, slow ones.
+_MANY_VIEWS = 60
 
 
 def waits_for_clock(session: Session) -> bool:
@@ -74,19 +113,24 @@ def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
     # A single pair needs no name, and cannot do without its clock.
     is_only = max(len(session.cameras), len(session.robots)) < 2
     of = "" if is_only else pair.words
+    declared = session.declaration
+    tables: dict[str, ClockTable] = {
+        frame_name("camera", name): clock for name, clock in declared.clocks.items()
+    }
+    table = tables.get(pair.camera, declared.clock)
     on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
-    model = None if document is None else Robot.from_document(document)
     try:
-        motion = motion_of(session, model, stream_of(session, pair.robot))
-        sweep = CameraSweep(
-            motion,
+        model = None if document is None else Robot.from_document(document)
+        sweep = _Sweep(
+            motion_of(session, model, stream_of(session, pair.robot)),
             "eye-in-hand" if on_flange else "eye-to-hand",
             tuple(rows),
-            _stated_s(session, pair.camera),
+            seen.poses,
+            table.camera_minus_robot_s if table.model_fields_set else None,
             None if lens is None else lens.camera,
             numbered_positions(tuple(session.boards.values())),
         )
-        clocked = _set_clock(sweep, seen.poses, model)
+        clocked = _clocked(sweep)
     except VisioncalError as error:
         if is_only:
             raise
@@ -104,55 +148,276 @@ def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
     return seen.noting(clocked.rejections, (warning.of(of) for warning in clocked.warnings))
 
 
-def _set_clock(
-    sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """Observations of one camera while one robot moved."""
+
+    motion: RobotMotion  # The robot's stream.
+    mount: Mount  # Mount of the camera.
+    # The rows; those that have a time and no pose of the robot wait for the clock.
+    views: tuple[View, ...]
+    poses: Mapping[int, ViewPoses]  # The target's pose by view.
+    stated_s: float | None  # The stated offset [s]; None without one.
+    camera: Camera | None  # The camera's intrinsics; None where unknown.
+    positions: FloatArray  # (c, 3) corners of all boards, numbered consecutively [m].
+
+    @property
+    def waiting(self) -> list[View]:
+        """The views that wait for a pose, sorted by time."""
+        views = [
+            view for view in self.views if lacks_robot_state(view) and view.number in self.poses
+        ]
+        return sorted(views, key=lambda view: view.stamp_s or 0.0)
+
+    def frames(self, views: Sequence[View]) -> ImageTimes:
+        """The camera's observations over time, by the best pose of each view."""
+        seen = [self.poses[view.number] for view in views]
+        corners = {pose.view: pose.corners for pose in seen if pose.corners}
+        measured = bool(seen) and len(corners) == len(seen)
+        stacked = measured and self.camera is not None
+        return ImageTimes(
+            self.mount,
+            np.array([view.stamp_s for view in views], dtype=float),
+            np.array([pose.cam_from_target[0] for pose in seen]).reshape(-1, 4, 4),
+            np.array([pose.covariance[0] for pose in seen]) if measured else None,
+            CornerStack.of(corners, self.positions) if stacked else None,
+        )
+
+    def fitted_frames(self, views: Sequence[View]) -> ImageTimes:
+        """Frames of the board seen most often, without ambiguous poses where enough are clear."""
+        free = [view for view in views if not view.holdout]
+        boards = [self.poses[view.number].board for view in free]
+        most = max(sorted(set(boards)), key=boards.count, default=0)
+        free = [view for view, board in zip(free, boards, strict=True) if board == most]
+        clear = [view for view in free if len(self.poses[view.number].cam_from_target) == 1]
+        return self.frames(clear if 2 * len(clear) > len(free) else free)
+
+
+def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
+    """Gives views their poses at the best available offset; `change` is what was corrected."""
+    flange, stated_s, views = sweep.motion.flange, sweep.stated_s, sweep.waiting
+    frames = sweep.fitted_frames(views)
+    matches = turning_matches(flange, frames, stated_s or 0.0)
+    sound = [
+        match for match in matches if match.correlation >= LEAST_CORRELATION and not match.at_end
+    ]
+    starts = [match.offset_s for match in sound] + ([] if stated_s is None else [stated_s])
+    fits = fit_offset(flange, frames, starts) if sound else ()
+    fit = clear_fit(fits, stated_s)
+    changed = None if fit is None or change else clock_change(flange, frames, fit)
+    if changed is not None:
+        stamped = tuple(
+            view
+            if view.stamp_s is None
+            else replace(
+                view,
+                numbers={
+                    **view.numbers, "stamp_s": changed.corrected(np.array([view.stamp_s])).item()
+                },
+            )
+            for view in sweep.views
+        )  # fmt: skip
+        return _clocked(replace(sweep, views=stamped), change_doubt(changed, views))
+    correlation = max((match.correlation for match in matches), default=None)
+    clock = ClockResult(
+        camera_minus_robot_s=stated_s or 0.0,
+        method="rest",
+        stated_s=stated_s,
+        correlation=correlation,
+    )
+    warnings = () if change is None else (change,)
+    if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
+        delayed = fit_readout(flange, frames, sweep.camera, fit)
+        shutter = None if delayed is None else delayed.shutter
+        is_rolling = shutter is not None and shutter.is_rolling
+        fit = delayed if delayed is not None and is_rolling else fit
+        offset_s = fit.offset_s
+        nearby = min(sound, key=lambda match: abs(match.offset_s - offset_s))
+        clock = replace(
+            clock,
+            camera_minus_robot_s=offset_s,
+            sigma_s=fit.sigma_s,
+            method="motion",
+            frames=fit.frames,
+            correlation=nearby.correlation,
+            shutter=shutter,
+        )
+        notes = tuple(motion_notes(clock, sweep.motion.name))
+        clocked = _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings), notes)
+        return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
+    if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        # By rotation alone, where the chain of frames does not close.
+        (match,) = sound
+        clock = replace(
+            clock,
+            camera_minus_robot_s=match.offset_s,
+            sigma_s=match.sigma_s,
+            method="turning",
+            correlation=match.correlation,
+        )
+        return _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings))
+    return _undetermined(sweep, clock, why_undetermined(fits, matches))
+
+
+def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
+    """Gives views their poses without an estimate: at the stated offset, or for views at rest."""
+    views, offset_s = sweep.waiting, clock.camera_minus_robot_s
+    stamps_s = np.array([view.stamp_s for view in views], dtype=float)
+    resting = is_standing_still(sweep.motion.flange, stamps_s - offset_s)
+    if resting.all() and len(views):
+        note = (
+            f"The clocks of camera and robot are taken to be {1e3 * offset_s:+.4g} ms apart, "
+            f"{'as nothing is stated' if clock.stated_s is None else 'as stated'}: the views were "
+            "taken at rest, where this does not count."
+        )
+        return _at_offset(sweep, clock, (), (note,))
+    check_shared_stamps(views, sweep.poses)
+    if clock.stated_s is not None:
+        words = (
+            f"[clock] camera_minus_robot_s is taken as stated, {1e3 * offset_s:+.4g} ms, to "
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
+        )
+        clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
+        return _at_offset(sweep, clock, (Finding("clock", words, _SHOW_OFFSET),))
+    if resting.sum() < FEWEST_VIEWS:
+        raise undetermined_error(sweep.motion, views, resting, why)
+    moving = {view.number for view, is_still in zip(views, resting, strict=True) if not is_still}
+    words = (
+        f"{counted(len(moving), 'view', ('that was', 'that were'))} taken in motion "
+        f"{'is' if len(moving) == 1 else 'are'} left out, as the offset between the clocks is not "
+        f"known: {why}."
+    )
+    kept = tuple(view for view in sweep.views if view.number not in moving)
+    warnings = (Finding("clock", words, _SHOW_OFFSET),)
+    clocked = _at_offset(replace(sweep, views=kept), clock, warnings)
+    rejected = (Rejection(view, _IN_MOTION) for view in sorted(moving))
+    return replace(clocked, rejections=(*clocked.rejections, *rejected))
+
+
+def _at_offset(
+    sweep: _Sweep,
+    clock: ClockResult,
+    warnings: tuple[Finding, ...] = (),
+    notes: tuple[str, ...] = (),
 ) -> ClockedViews:
-    try:
-        return set_clock(sweep, poses)
-    except (DataError, DegenerateError) as error:
-        misread = None if model is None else misread_joints(sweep, poses, model)
-        if misread is None:
-            raise
-        raise misread from error
-
-
-def _stated_s(session: Session, camera: str) -> float | None:
-    """Stated clock offset of a camera [s], its own or that of all; None without one."""
-    declared = session.declaration
-    tables: dict[str, ClockTable] = {
-        frame_name("camera", name): clock for name, clock in declared.clocks.items()
+    """Gives views their poses at an offset, and selects among very many."""
+    flange, views = sweep.motion.flange, sweep.waiting
+    at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
+    covered = flange.covers(at_s)
+    inside = [view for view, is_covered in zip(views, covered, strict=True) if is_covered]
+    poses, speeds = flange.at(at_s[covered]), flange.speeds(at_s[covered])
+    selected = np.arange(len(inside))
+    if len(inside) > _MANY_VIEWS:
+        # Of many, slow ones and those held back.
+        held = np.array([view.holdout for view in inside])
+        free = selected[~held]
+        selected = np.sort([*free[slow_and_new(poses[free], speeds[free])], *selected[held]])
+    taken = [inside[at].number for at in selected]
+    rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][selected]), strict=True))
+    if clock.method != "rest":
+        notes = (*notes, speed_words(clock, speeds[selected], len(inside)))
+    first_s, last_s = flange.stamps_s[[0, -1]]
+    outside = zip(views, at_s, covered, strict=True)
+    lost = {
+        view.number: _IN_A_GAP if first_s <= view_s <= last_s else _BEYOND
+        for view, view_s, is_covered in outside
+        if not is_covered
     }
-    clock = tables.get(camera, declared.clock)
-    return clock.camera_minus_robot_s if clock.model_fields_set else None
+    # Of a sweep that is longer than the stream, the rest is no loss.
+    beyond = {key for key, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
+    spared = {view.number: _SPARED for view in inside if view.number not in rows}
+    untimed = {
+        view.number
+        for view in sweep.views
+        if view.stamp_s is None and view.base_from_flange() is None and view.joints_rad is None
+    }
+    lost |= dict.fromkeys(untimed, _NO_TIME)
+    return ClockedViews(
+        clock,
+        tuple(
+            replace(view, numbers={**view.numbers, **rows.get(view.number, {})})
+            for view in sweep.views
+            if view.number in rows or not (lacks_robot_state(view) or view.number in untimed)
+        ),
+        {} if clock.method == "rest" else dict(zip(taken, speeds[selected], strict=True)),
+        tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
+        spared | dict.fromkeys(beyond, _BEYOND),
+        warnings,
+        notes,
+    )
+
+
+def _with_shutter(sweep: _Sweep, clocked: ClockedViews, fit: ClockFit) -> ClockedViews:
+    """Moves the corners of all views that the stream covers to where they were at the stamp.
+
+    Ambiguous poses stay as they are.
+    """
+    flange, clock, camera = sweep.motion.flange, clocked.clock, sweep.camera
+    views = [view for view in sweep.waiting if sweep.poses[view.number].corners is not None]
+    at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
+    covered = flange.covers(at_s)
+    views, at_s = [view for view, ok in zip(views, covered, strict=True) if ok], at_s[covered]
+    frames = sweep.frames(views)
+    stack, readout_s = frames.stack, 0.0 if fit.shutter is None else fit.shutter.readout_s
+    if stack is None or camera is None:
+        return clocked
+    with one_blas_thread():
+        twists = target_twists(
+            sweep.mount,
+            flange.at(at_s),
+            fit.fit.state.edges[0],
+            frames.cam_from_target,
+            flange.speeds(at_s),
+        )
+        found = compress_delayed(stack, camera, twists, readout_s, frames.cam_from_target)
+        sigma_px = floored_sigma_px(stack.sigma_px(found.residuals, 6 * len(views) + 1))
+        plain = replace(stack, weights=None)
+        delayed = plain.with_points(delayed_points(stack, camera, twists, readout_s)[0])
+        at_stamp_px, delayed_px = (
+            reproject(corners, camera, found.cam_from_target, lens=False).residuals
+            for corners in (plain, delayed)
+        )
+        px = stack.px + at_stamp_px - delayed_px
+    covariance = sigma_px**2 * covariance_from(found.information)
+    poses = {}
+    for at, view in enumerate(views):
+        pose = sweep.poses[view.number]
+        if pose.corners is not None:
+            pose = replace(pose, corners=replace(pose.corners, px=px[stack.view_of == at]))
+        if len(pose.cam_from_target) == 1:
+            cam_from_target = found.cam_from_target[at][None]
+            pose = replace(pose, cam_from_target=cam_from_target, covariance=covariance[at][None])
+        poses[view.number] = pose
+    by_readout = dict(zip(poses, found.by_shared[:, :, 0], strict=True))
+    return replace(clocked, by_readout=by_readout, poses=poses)
 
 
 def clock_effects(
     cell: Cell, clocks: Mapping[ClockPair, ClockedViews], erring: Collection[str] = ()
 ) -> tuple[Effect, ...]:
-    """Errors of clock offsets and delays [s], as effects on the cell's rows.
+    """Errors of clock offsets and readout times [s], as effects on the cell's rows.
 
     Args:
         cell: The cell.
         clocks: The clocks of pairs.
         erring: Names in the problem of robots whose arm errors are unknowns of the fit.
     """
-    views = [row.view for row in cell.rows]
     effects: list[Effect] = []
     for pair, clocked in clocks.items():
-        clock, robot = clocked.clock, robot_key(pair.robot)
-        if clock.speeds and robot in cell.poses:
-            sigma_s = clock.prior_sigma_s(erring=robot in erring)
-            effects.append(_offset_effect(cell, pair, clock, sigma_s))
-            clear = (delay for delay in clock.delays if delay.is_clear)
-            effects += [delay.effect(views, pair.delay(delay.of)) for delay in clear]
+        speeds, robot = clocked.speeds, robot_key(pair.robot)
+        if not speeds or robot not in cell.poses:
+            continue
+        twists, none = np.zeros((len(cell.poses[robot]), 6)), np.zeros(6)
+        for row in cell.rows:
+            if row.view in speeds:
+                twists[row.station] = speeds[row.view]
+        sigma_s = clocked.prior_sigma_s(erring=robot in erring)
+        effect = clock_effect(twists, sigma_s, pair.effect, robot)
+        concerned = np.array([row.view in speeds for row in cell.rows], dtype=bool)
+        effects.append(replace(effect, rows_concerned=concerned))
+        shutter = clocked.clock.shutter
+        if shutter is not None and shutter.is_rolling:
+            jacobian = np.array([clocked.by_readout.get(row.view, none) for row in cell.rows])
+            prior = PriorInformation(np.array([[shutter.readout_sigma_s**-2.0]]), np.zeros(1))
+            effects.append(Effect.free(pair.readout, prior, jacobian.reshape(-1, 6, 1)))
     return tuple(effects)
-
-
-def _offset_effect(cell: Cell, pair: ClockPair, clock: ClockOffset, sigma_s: float) -> Effect:
-    speeds, robot = clock.speeds, robot_key(pair.robot)
-    concerned = np.array([row.view in speeds for row in cell.rows], dtype=bool)
-    twists = np.zeros((len(cell.poses[robot]), 6))
-    for row in cell.rows:
-        if row.view in speeds:
-            twists[row.station] = speeds[row.view]
-    return replace(clock_effect(twists, sigma_s, pair.effect, robot), rows_concerned=concerned)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Self
 
-from visioncal.calibration.stages.clock_sweep import ClockedViews, ClockPair
+from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.turned_images import ImageTurn

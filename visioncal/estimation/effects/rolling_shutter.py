@@ -1,16 +1,22 @@
-"""Effect of a rolling shutter: the rows of an image are exposed one after the other."""
+"""Effect of a rolling shutter: the rows of an image are exposed one after the other.
+
+A corner's delay from its image's stamp is its row's share of the readout. A corner p delayed by t
+lies at `exp(t w) p` in the target's frame, w being the target's right twist per second in the
+camera's view.
+"""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray
-from visioncal.estimation.effects.delays import Delay
+from visioncal.core.transforms import adjoint, apply_each, exp, invert
+from visioncal.core.types import Camera, FloatArray, Mount
+from visioncal.estimation.appearance import Compressed, compress_points
+from visioncal.estimation.corners import CornerStack
 
-# Typical readout time of an image [s].
-_READOUT_SIGMA_S = 0.02
+# Prior of the readout time of an image, about zero [s].
+READOUT_SIGMA_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -22,25 +28,70 @@ class Shutter:
     readout_sigma_s: float  # Its standard deviation [s].
     line_s: float  # Delay of each row behind the one before it [s].
 
+    @property
+    def is_rolling(self) -> bool:
+        """Whether the readout is significant, and was corrected."""
+        return self.kind == "rolling"
 
-def _shares(px: FloatArray, resolution: tuple[int, int]) -> FloatArray:
-    """Delays of corners as shares of the readout; the middle row has the stamp."""
-    return np.asarray(px[:, 1] / (resolution[1] - 1) - 0.5)
-
-
-def _result(
-    readout_s: float, sigma_s: float, is_clear: bool, resolution: tuple[int, int]
-) -> dict[str, Any]:
-    kind: Literal["rolling", "global"] = "rolling" if is_clear else "global"
-    return {"shutter": Shutter(kind, readout_s, sigma_s, readout_s / (resolution[1] - 1))}
-
-
-def _words(readout_s: float, sigma_s: float) -> str:
-    late = "after" if readout_s > 0.0 else "before"
-    return (
-        f"The camera has a rolling shutter, which is taken into account: the image's last line is "
-        f"taken {1e3 * abs(readout_s):.2f} ms {late} the first (sigma {figure(1e3 * sigma_s)} ms)."
-    )
+    def corrected(self, change_s: float, sigma_s: float) -> "Shutter":
+        """The shutter by a correction of the readout, with a sigma [s]."""
+        readout_s = self.readout_s + change_s
+        line_s = self.line_s * readout_s / self.readout_s
+        return Shutter(self.kind, readout_s, sigma_s, line_s)
 
 
-ROLLING_SHUTTER = Delay("rolling shutter", _READOUT_SIGMA_S, _shares, _result, _words)
+def target_twists(
+    mount: Mount, base_from_flange: FloatArray, x: FloatArray, poses: FloatArray, speeds: FloatArray
+) -> FloatArray:
+    """Twists of the views' targets relative to the camera.
+
+    Args:
+        mount: Mounting of the camera.
+        base_from_flange: (v, 4, 4).
+        x: (4, 4) the camera's edge.
+        poses: (v, 4, 4) `cam_from_target`.
+        speeds: (v, 6) twists per second of the flange, in its own frame.
+
+    Returns:
+        (v, 6) twists per second, in the target's frame.
+    """
+    hand = mount == "eye-in-hand"
+    flange_from_target = x @ poses if hand else invert(base_from_flange) @ x @ poses
+    twists = (adjoint(invert(flange_from_target)) @ speeds[:, :, None])[:, :, 0]
+    return np.asarray(-twists if hand else twists)
+
+
+def delayed_points(
+    stack: CornerStack, camera: Camera, twists: FloatArray, readout_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Target positions of the corners at the time of their exposure; the middle row has the stamp.
+
+    Args:
+        stack: The corners of v views.
+        camera: The intrinsics.
+        twists: (v, 6) of `target_twists`.
+        readout_s: The readout time [s].
+
+    Returns:
+        (n, 3) positions on the target [m], and (n, 3, 1) their derivatives by the readout [m/s].
+    """
+    shares, of_corner = stack.px[:, 1] / (camera.resolution[1] - 1) - 0.5, twists[stack.view_of]
+    points = apply_each(exp((readout_s * shares)[:, None] * of_corner), stack.points)
+    speeds = np.cross(of_corner[:, :3], points) + of_corner[:, 3:]
+    return points, (speeds * shares[:, None])[:, :, None]
+
+
+def compress_delayed(
+    stack: CornerStack, camera: Camera, twists: FloatArray, readout_s: float, starts: FloatArray
+) -> Compressed:
+    """Compresses corners to normal equations in each view's pose and the readout time.
+
+    Args:
+        stack: The corners of v views.
+        camera: The intrinsics, held.
+        twists: (v, 6) of `target_twists`.
+        readout_s: Linearisation point [s].
+        starts: (v, 4, 4) starts of `cam_from_target`.
+    """
+    points, jacobian = delayed_points(stack, camera, twists, readout_s)
+    return compress_points(stack.with_points(points), camera, starts, jacobian, lens=False)
