@@ -82,7 +82,7 @@ def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(fold
     done = visioncal("calibrate", wrong, "-o", tmp_path / "out")
     assert done.status == 2
     assert "that is the size of camera right's" in done.err
-    assert "Where left and right are exchanged in the column camera of views.csv" in done.err
+    assert "Exchange left and right in the column camera of views.csv" in done.err
 
 
 def test_what_was_detected_lies_over_the_image_of_the_camera_that_saw_it(folder, out):

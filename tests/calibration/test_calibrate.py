@@ -224,7 +224,7 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     assert set(unused) == {1, 4, 7, 9}
     assert "640 x 400 px, and the camera's images are 1280 x 800" in unused[9]
     assert any(
-        reason.startswith("1 image is of another size, and not used: images/")
+        reason.startswith("1 of the images of another size, and not used: images/")
         and "view 9." in reason
         for reason in calibration.verdict.reasons
     )

@@ -1,6 +1,5 @@
 """Corners, intrinsics and target poses of each camera."""
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,18 +8,18 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.detect import Detections, detect, image_of
-from visioncal.calibration.stages.image_size import other_images
-from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
+from visioncal.calibration.stages.image_size import other_images, other_size_findings
+from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import listed, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.number_format import figure, some_of
-from visioncal.core.types import Camera, Corners, FloatArray, Rejection
-from visioncal.core.verdict import EMPTY_IMAGE, OTHER_SIZE, Finding, Remedy
+from visioncal.core.number_format import figure
+from visioncal.core.types import Corners, Rejection, Target
+from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
 from visioncal.results import CameraResult
-from visioncal.session import Session, View, frame_name
+from visioncal.session import View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import kind_of
@@ -56,28 +55,41 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     Raises:
         DataError: See `detect`.
     """
-    session, images = seen.session, _images(seen.session)
+    session, several = seen.session, len(seen.session.cameras) > 1
+    boards = session.boards
+    starts = dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
     # A single camera need not be declared.
     for name, table in (session.cameras or {"": CameraTable()}).items():
-        frame = frame_name("camera", name)
-        views, corners, resolution = images.get(frame, []), given or {}, table.size
+        views = [
+            view
+            for view in session.views
+            if (view.image or view.has_corners)
+            and name_of(session.declaration, "camera", view) == name
+        ]
+        corners, resolution, frame = given or {}, table.size, frame_name("camera", name)
         if not views:
             continue
         if given is None:
-            with _naming_camera(session, frame):
-                detections = detect(
+            with _naming(frame if several else ""):
+                found = detect(
                     session,
                     seen.progress,
                     among=views,
                     threads=seen.threads,
                     pictures=seen.pictures,
                 )
-            seen = replace(seen, searches={**seen.searches, **detections.searches})
+            seen = replace(seen, searches={**seen.searches, **found.searches})
             if seen.dense is not None:
-                seen, detections = _with_dense(seen, views, detections)
-            corners, resolution = detections.corners, detections.resolution
-            seen = seen.noting(detections.rejections, _other_size_findings(session, detections))
-        numbered = _numbered_through(session, views, corners)
+                seen, found = _with_dense(seen, views, found)
+            corners, resolution = found.corners, found.resolution
+            others = other_size_findings(session, resolution, found.other_sizes)
+            seen = seen.noting(found.rejections, others)
+        # The corners of several boards are numbered through.
+        numbered = {
+            view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
+            for view in views
+            if (at := corners.get(view.number)) is not None
+        }
         seen = seen.with_camera(frame, CameraObservations(table, numbered, resolution))
     return without_repeats(seen)
 
@@ -94,39 +106,36 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         and view.number not in detections.other_sizes
         and kind_of(session.boards[session.board_of(view)]).is_dense
     ]
-
     found: dict[int, DenseCorners] = {}
     for count, view in enumerate(refused, start=1):
         image = image_of(session, view)
-        dense = (
-            None
-            if isinstance(image, Rejection)
-            else find_densely(image, session.boards[session.board_of(view)])
-        )
-        if dense is not None:
-            found[view.number] = dense
+        if not isinstance(image, Rejection):
+            dense = find_densely(image, session.boards[session.board_of(view)])
+            found |= {} if dense is None else {view.number: dense}
         if seen.progress is not None:
             seen.progress("dense", count, len(refused))
     if not found:
         return seen, detections
     # Weights are relative to corners of the template, where it has some.
+    sigmas = [dense.sigma_px for dense in found.values()]
     sample = [rows[view] for view in list(detections.corners)[:_SAMPLE] if rows[view].image]
-    sigmas = [found[view].sigma_px for view in found]
     if sample:
-        sigmas = [
-            _template_sigma_px(session, view, detections.corners[view.number]) for view in sample
-        ]
+        sigmas = []
+    for view in sample:
+        image, board = image_of(session, view), session.boards[session.board_of(view)]
+        if not isinstance(image, Rejection):
+            at = detections.corners[view.number]
+            sigmas.append(kind_of(board).refine(image, board, at.ids, at.px).sigma_px)
     typical_px = float(np.nanmedian(np.concatenate(sigmas)))
-    corners = {
+    corners = dict(detections.corners) | {
         view: Corners(view, at.ids, at.px, at.width_px, typical_px / at.sigma_px)
         for view, at in found.items()
-    } | dict(detections.corners)
-    widest = max(found, key=lambda view: found[view].width_px)
-    moved_px = float(np.hypot(*found[widest].motion_px))
+    }
+    worst = max(found, key=lambda view: found[view].width_px)
     note = (
-        f"The corners of {len(found)} view{'s' if len(found) > 1 else ''} are by all pixels of "
-        f"their images (--dense), as these are blurred: {listed(tuple(found))}; most in view "
-        f"{widest}, by edges of {found[widest].width_px:.1f} px and a motion of {moved_px:.1f} px."
+        f"The corners of view {listed(tuple(found))} are by all pixels of their images (--dense), "
+        f"as these are blurred: most in view {worst}, by edges of {found[worst].width_px:.1f} px "
+        f"and a motion of {float(np.hypot(*found[worst].motion_px)):.1f} px."
     )
     dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
     return dense_seen, replace(
@@ -134,15 +143,6 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         corners={view.number: corners[view.number] for view in views if view.number in corners},
         rejections=tuple(lost for lost in detections.rejections if lost.view not in found),
     )
-
-
-def _template_sigma_px(session: Session, view: View, corners: Corners) -> FloatArray:
-    """(n,) standard deviations of a view's corners by the template; none where it has no image."""
-    image = image_of(session, view)
-    if isinstance(image, Rejection):
-        return np.zeros(0)
-    board = session.boards[session.board_of(view)]
-    return kind_of(board).refine(image, board, corners.ids, corners.px).sigma_px
 
 
 def estimate_lenses(seen: T) -> T:
@@ -153,23 +153,22 @@ def estimate_lenses(seen: T) -> T:
         DegenerateError: The views do not determine a focal length at all.
         ConvergenceError: No start converges.
     """
-    session, targets = seen.session, tuple(seen.session.boards.values())
+    targets, several = tuple(seen.session.boards.values()), len(seen.session.cameras) > 1
     for frame, look in seen.cameras.items():
         fitted = {view: px for view, px in look.corners.items() if view not in seen.held_back}
         if not fitted or look.resolution is None:
             continue
-        stated = look.table.stated
-        if stated is not None:
-            lens = CameraResult(stated, estimated=False)
+        if look.table.stated is not None:
+            lens = CameraResult(look.table.stated, estimated=False)
         else:
-            with _naming_camera(session, frame):
+            of = frame if several else ""
+            with _naming(of):
                 try:
                     fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
                 except VisioncalError:
                     _refuse_mirrored(seen, frame, fitted, np.inf)
                     raise
             lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
-            of = frame if len(session.cameras) > 1 else ""
             seen = seen.noting(fit.rejections, (_about(warning, of) for warning in fit.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
@@ -177,12 +176,10 @@ def estimate_lenses(seen: T) -> T:
 
 def _about(warning: Finding, frame: str) -> Finding:
     """A finding about a lens, naming the camera's frame where it is not empty."""
-    finding = warning.of(frame)
-    if not frame or finding.do is None or finding.kind != EMPTY_IMAGE:
-        return finding
-    # Each of several cameras has its own empty parts of the image.
-    words = finding.do.words
-    return replace(finding, do=Remedy(f"{frame}: {words[0].lower()}{words[1:]}"))
+    if frame and warning.kind == EMPTY_IMAGE and warning.do is not None:
+        # Each of several cameras has its own empty parts of the image.
+        warning = replace(warning, do=Remedy(f"{frame}: {warning.do.words}"))
+    return warning.of(frame)
 
 
 def locate_targets(seen: T) -> T:
@@ -198,22 +195,20 @@ def locate_targets(seen: T) -> T:
     session, targets = seen.session, tuple(seen.session.boards.values())
     stated = stated_poses(session).items()
     poses = {**seen.poses, **{view: pose for view, pose in stated if view not in seen.repeats}}
-    for frame in seen.cameras:
-        look = seen.cameras[frame]
+    for frame, look in seen.cameras.items():
         corners = {view: px for view, px in look.corners.items() if view not in seen.reasons}
         fitted = {view: px for view, px in corners.items() if view not in seen.held_back}
-        lens = look.lens
+        lens, of = look.lens, frame if len(session.cameras) > 1 else ""
         if lens is None or not fitted:
             continue
-        with _naming_camera(session, frame):
-            fit = estimate_poses(
-                fitted, targets, lens.camera, 0 if lens.covariance is None else len(lens.covariance)
-            )
+        with _naming(of):
+            free = 0 if lens.covariance is None else len(lens.covariance)
+            fit = estimate_poses(fitted, targets, lens.camera, free)
         if fit.sigma_px > _DOUBTFUL_PX:
-            other = None if lens.estimated else _other_lens(seen, frame, fitted, fit.sigma_px)
+            other = None if lens.estimated else _other_lens(look, targets, fitted, fit.sigma_px)
             if other is not None:
                 lens, fit, finding = other
-                seen = seen.noting((), (finding,))
+                seen = seen.noting((), (finding.of(of),))
             elif fit.sigma_px > _WRONG_LENS_PX:
                 _refuse_mirrored(seen, frame, fitted, fit.sigma_px)
         holdout = {view: px for view, px in corners.items() if view in seen.held_back}
@@ -227,48 +222,44 @@ def locate_targets(seen: T) -> T:
 
 
 def _other_lens(
-    seen: Observed, frame: str, corners: Mapping[int, Corners], stated_px: float
+    look: CameraObservations,
+    targets: Sequence[Target],
+    corners: Mapping[int, Corners],
+    stated_px: float,
 ) -> tuple[CameraResult, Poses, Finding] | None:
     """The lens estimated from the images, where the stated one cannot be this camera's."""
-    look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
-    if look.resolution is None:
+    stated = look.table.stated
+    if look.resolution is None or stated is None:
         return None
     try:
         lens = estimate_intrinsics(corners, targets, look.resolution, look.table.model)
     except VisioncalError:
         # The images do not determine a lens, or show another board than the stated one.
         return None
-    stated = seen.lenses[frame].camera
-    if not _is_another(lens, stated, stated_px):
-        return None
-    poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
-    words = (
-        f"The stated matrix and distortion are not this camera's: by them corners deviate by "
-        f"{figure(stated_px)} px from any pose of the target, by a lens estimated of these images "
-        f"by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy = "
-        f"{', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
-    )
-    step = Remedy(
-        "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
-        "fx, fy, cx, cy in pixels."
-    )
-    resized, do = other_images(stated, lens.camera.matrix)
-    if resized:
-        words, step = f"{resized} The lens was estimated of these images.", Remedy(do)
-    finding = Finding("other_lens", words, step)
-    result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
-    several = len(seen.session.cameras) > 1
-    return result, poses, finding.of(frame if several else "")
-
-
-def _is_another(lens: Intrinsics, stated: Camera, stated_px: float) -> bool:
-    """Whether the estimated lens differs by more than the stated one can have changed."""
-    if stated_px > _WRONG_LENS_PX and lens.sigma_px <= _MUCH_BETTER * stated_px:
-        return True
+    # The estimated lens differs by more than the stated one can have changed.
     change = np.abs(lens.camera.matrix[:2] - stated.matrix[:2])
     sigma = np.sqrt(np.diag(lens.covariance)[:2])
     is_far = np.all((change > _OTHER_FOCAL * stated.matrix[:2]) & (change > _OTHER_SIGMAS * sigma))
-    return bool(is_far) and lens.sigma_px <= _CLEARLY_BETTER * stated_px
+    is_wrong = stated_px > _WRONG_LENS_PX and lens.sigma_px <= _MUCH_BETTER * stated_px
+    if not (is_wrong or (is_far and lens.sigma_px <= _CLEARLY_BETTER * stated_px)):
+        return None
+    poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
+    words, do = other_images(stated, lens.camera.matrix)
+    if words:
+        words += " The lens was estimated of these images."
+    else:
+        words = (
+            "The stated matrix and distortion are not this camera's: by them corners deviate by "
+            f"{figure(stated_px)} px from any pose of the target, by a lens estimated of these "
+            f"images by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy "
+            f"= {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
+        )
+        do = (
+            "In session.toml, delete matrix and distortion, or give those of this camera: matrix "
+            "is fx, fy, cx, cy in pixels."
+        )
+    result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
+    return result, poses, Finding("other_lens", words, Remedy(do))
 
 
 def _refuse_mirrored(
@@ -279,13 +270,10 @@ def _refuse_mirrored(
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
         return
-    width = look.resolution[0]
+    last = look.resolution[0] - 1.0
     mirrored = {
-        view: replace(
-            view_corners,
-            px=np.stack([width - 1.0 - view_corners.px[:, 0], view_corners.px[:, 1]], axis=1),
-        )
-        for view, view_corners in corners.items()
+        view: replace(at, px=np.stack([last - at.px[:, 0], at.px[:, 1]], axis=1))
+        for view, at in corners.items()
     }
     try:
         fit = estimate_intrinsics(mirrored, targets, look.resolution, look.table.model)
@@ -294,74 +282,27 @@ def _refuse_mirrored(
     if fit.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
         return
     has_images = any(view.image for view in seen.session.views if view.number in corners)
-    # A rig whose table is left-handed appears mirrored, too.
-    rig = any(target.is_rig for target in targets)
-    left_handed = " Or one axis of the rig's table has the wrong sign." if rig else ""
+    step = (
+        "Turn the images back (a flip in the camera's driver, or a mirror before the lens), and "
+        "calibrate anew."
+        if has_images
+        else COUNTED_BACKWARDS
+    )
+    if any(target.is_rig for target in targets):
+        step += " Or one axis of the rig's table has the wrong sign."
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "
         f"{figure(fit.sigma_px)} px with left and right exchanged.",
-        next_step=(
-            "Turn the images back (a flip in the camera's driver, or a mirror before the "
-            "lens), and calibrate anew."
-            if has_images
-            else COUNTED_BACKWARDS
-        )
-        + left_handed,
+        next_step=step,
     )
-
-
-def _images(session: Session) -> dict[str, list[View]]:
-    """The views with images or corners, by the frame of the camera that took them."""
-    views = defaultdict(list)
-    for view in session.views:
-        if view.image or view.has_corners:
-            camera = name_of(session.declaration, "camera", view)
-            views[frame_name("camera", camera)].append(view)
-    return views
-
-
-def _numbered_through(
-    session: Session, views: Sequence[View], corners: Mapping[int, Corners]
-) -> dict[int, Corners]:
-    """The corners of some views, numbered consecutively over all boards."""
-    starts = dict(
-        zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
-    )
-    first = {
-        view.number: starts[session.board_of(view)] for view in views if view.number in corners
-    }
-    return {
-        view: replace(corners[view], ids=corners[view].ids + start) for view, start in first.items()
-    }
-
-
-def _other_size_findings(session: Session, detections: Detections) -> Iterator[Finding]:
-    """Finding about images of another size than the camera's."""
-    if not detections.other_sizes:
-        return
-    views, (wide, high) = tuple(detections.other_sizes), detections.resolution
-    names = {view.number: view.image for view in session.views}
-    shown = [f"{names[view]} ({w} x {h} px)" for view, (w, h) in detections.other_sizes.items()]
-    one = len(views) == 1
-    is_turned = {*detections.other_sizes.values()} == {(high, wide)}
-    words = (
-        f"{len(views)} image{' is' if one else 's are'} "
-        f"{'turned by 90 degrees' if is_turned else 'of another size'}, and not used: "
-        f"{some_of(shown)}; the camera's are {wide} x {high} px."
-    )
-    rows = f"the row{'' if one else 's'} of view{'' if one else 's'} {listed(views)}"
-    these = names[views[0]] if one else "these images"
-    mend = f"Turn {these} back" if is_turned else f"Take {these} again at the camera's full size"
-    step = Remedy(f"{mend}; or in views.csv, delete {rows}.")
-    yield Finding(OTHER_SIZE, words, step, views, until_mm=0.0)
 
 
 @contextmanager
-def _naming_camera(session: Session, frame: str) -> Iterator[None]:
-    """Adds the camera's frame to errors where there are several cameras."""
+def _naming(frame: str) -> Iterator[None]:
+    """Adds the camera's frame, where it is not empty, to errors."""
     try:
         yield
     except VisioncalError as error:
-        if len(session.cameras) < 2:
+        if not frame:
             raise
         raise error.within(frame) from error

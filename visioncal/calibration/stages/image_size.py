@@ -1,100 +1,163 @@
-"""Intrinsics of resized, cropped or turned images."""
+"""Size of a camera's images, and the lens of images that were resized or turned."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
 
 from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import some_of
 from visioncal.core.types import Camera, Corners, FloatArray, Target
+from visioncal.core.verdict import OTHER_SIZE, Finding, Remedy
+from visioncal.session import Session, View
+from visioncal.session.kinds import name_of
 
+Size = tuple[int, int]
 # Largest relative difference of the scales of both sides for resized images; others were cropped.
 _SAME_SHAPE = 0.02
 # Least scale of resized images, the largest denominator of the usual ratios, and the relative
 # accuracy of focal lengths by images.
 _LEAST_SCALE, _LARGEST_DENOMINATOR, _SAME_SCALE = 1.1, 8, 0.02
-# A half turn of images shifts the principal point by more than the first [px], to its prediction
-# within the second share of the shift; focal lengths change by less than the third share.
-_LEAST_TURN_PX, _SAME_TURN, _SAME_FOCUS = 3.0, 0.15, 0.005
 
 
-def other_size_step(
-    stated: Camera, size: tuple[int, int], corners: Mapping[int, Corners], target: Target
-) -> tuple[str, str]:
-    """Explains images of another size than stated, by the corners of some of them.
+def stated_size(session: Session, views: Sequence[View]) -> Size | None:
+    """Stated (width, height) of the images of some views [px]; None without one."""
+    names = {name_of(session.declaration, "camera", view) for view in views}
+    sizes = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
+    return sizes.pop() if len(sizes) == 1 else None
 
-    Returns:
-        What happened to the images, empty where unknown; and what to write in [camera].
+
+def common_size(
+    session: Session,
+    views: Sequence[View],
+    sizes: Mapping[int, Size],
+    sample: Callable[[], Mapping[int, Corners]],
+) -> Size:
+    """The stated (width, height) of images [px], else the most common one.
+
+    Args:
+        session: The session.
+        views: The views with images, of one camera.
+        sizes: (width, height) of each image that can be read, by view [px]; one or more.
+        sample: Finds the corners in a few of the images.
+
+    Raises:
+        DataError: Half of the images or more have another size.
     """
-    step = f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
-    scales = size[0] / stated.resolution[0], size[1] / stated.resolution[1]
+    found, stated = [*sizes.values()], stated_size(session, views)
+    size = stated or max(set(found), key=found.count)
+    line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
+    culprits = [
+        f"views.csv line {line_of[view.number]}, column image: {view.image} is {width} x {height} "
+        "px"
+        for view in views
+        for width, height in [sizes.get(view.number, size)]
+        if (width, height) != size
+    ]
+    if 2 * len(culprits) < len(found):
+        return size
+    if len(set(found)) == 1:
+        words, step = _other_size(session, views[0], found[0], sample)
+        message = (
+            f"All {len(found)} images are {found[0][0]} x {found[0][1]} px, but session.toml has "
+            f"resolution = [{size[0]}, {size[1]}]{words and f': {words}'}."
+        )
+    else:
+        source = "the camera's resolution is" if stated else "most other images are"
+        message = (
+            f"{culprits[0]}, but {source} {size[0]} x {size[1]} px ({len(culprits)} of "
+            f"{len(found)} images)."
+        )
+        step = "Correct [camera] resolution in session.toml, or take out these views."
+    raise DataError(message, culprits=culprits, next_step=step)
+
+
+def _other_size(
+    session: Session, view: View, size: Size, sample: Callable[[], Mapping[int, Corners]]
+) -> tuple[str, str]:
+    """What all images of another size than the camera's are, and what to type."""
+    mine = name_of(session.declaration, "camera", view)
+    stated = session.cameras[mine].stated
+    write = f"write resolution = [{size[0]}, {size[1]}]"
+    other = next((name for name, at in session.cameras.items() if at.size == size), None)
+    if other is not None:
+        return (
+            f"that is the size of camera {other}'s",
+            f"Exchange {mine} and {other} in the column camera of views.csv; or, where they are "
+            f"not exchanged, {write} of {mine} in session.toml.",
+        )
+    write = f"In session.toml, {write}"
+    if stated is None:
+        return "", f"{write}."
     if size == stated.resolution[::-1]:
-        how, lens = _direction_of_turn(stated, corners, target)
+        how, lens = _quarter_turn(stated, sample(), session.boards[session.board_of(view)])
         if not how:
-            return "", step
-        step += f" and {_written('matrix', lens.matrix, '.2f')}"
-        if np.any(stated.distortion[2:4]) and stated.model == "brown":
-            step += f" and {_written('distortion', lens.distortion, '.6g')}"
+            return "", f"{write}."
+        if np.any(stated.distortion != lens.distortion):
+            write += f" and {_entry('distortion', lens.distortion, '.6g')}"
         return (
             f"the images were turned by 90 degrees {how} after the matrix was made",
-            f"{step}; the camera's frame turns with them",
+            f"{write} and {_entry('matrix', lens.matrix)}; the camera's frame turns with them.",
         )
+    scales = size[0] / stated.resolution[0], size[1] / stated.resolution[1]
     if abs(scales[0] / scales[1] - 1.0) < _SAME_SHAPE:
-        matrix = scaled_matrix(stated.matrix, scales[0])
-        return "", f"{step} and {_written('matrix', matrix, '.2f')}"
-    return "", f"{step}, and delete matrix and distortion: they are of other images"
+        return "", f"{write} and {_entry('matrix', scaled_matrix(stated.matrix, scales[0]))}."
+    return "", f"{write}, and delete matrix and distortion: they are of other images."
 
 
-def _written(key: str, values: FloatArray, form: str) -> str:
-    return f"{key} = [{', '.join(format(value, form) for value in values.tolist())}]"
-
-
-def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
-    """Camera matrix fx, fy, cx, cy of resized images; pixel centres are at integers."""
-    return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
+def other_size_findings(
+    session: Session, resolution: Size, others: Mapping[int, Size]
+) -> Iterator[Finding]:
+    """Finding about images of another size than the camera's, by view [px]."""
+    if not others:
+        return
+    wide, high = resolution
+    names = {view.number: view.image for view in session.views}
+    shown = [f"{names[view]} ({w} x {h} px)" for view, (w, h) in others.items()]
+    is_turned = {*others.values()} == {(high, wide)}
+    mend = "Turn them back" if is_turned else "Take them again at the camera's full size"
+    views = tuple(others)
+    yield Finding(
+        OTHER_SIZE,
+        f"{len(views)} of the images {'turned by 90 degrees' if is_turned else 'of another size'}, "
+        f"and not used: {some_of(shown)}; the camera's are {wide} x {high} px.",
+        Remedy(f"{mend}; or in views.csv, delete the rows of view {', '.join(map(str, views))}."),
+        views,
+        until_mm=0.0,
+    )
 
 
 def other_images(stated: Camera, matrix: FloatArray) -> tuple[str, str]:
-    """Explains a stated matrix that is for images of another size, or turned by 180 degrees.
+    """Explains a stated matrix that is for images of another size.
 
     Args:
         stated: The stated lens, with the size of the images.
         matrix: (4,) estimated fx, fy, cx, cy of these images [px].
 
     Returns:
-        What is wrong, and what to write; both empty where neither explains the difference.
+        What is wrong, and what to write; both empty where that does not explain the difference.
     """
-    half_turned = turned_lens(turned_lens(stated, clockwise=True), clockwise=True)
-    shift_px = np.linalg.norm(half_turned.matrix[2:] - stated.matrix[2:])
-    residual_px = np.linalg.norm(half_turned.matrix[2:] - matrix[2:])
-    same_focus = np.abs(matrix[:2] / stated.matrix[:2] - 1.0).max() < _SAME_FOCUS
-    if same_focus and shift_px > _LEAST_TURN_PX and residual_px < _SAME_TURN * shift_px:
-        entries = _written("matrix", half_turned.matrix, ".2f")
-        if np.any(stated.distortion != half_turned.distortion):
-            entries += f" and {_written('distortion', half_turned.distortion, '.6g')}"
-        return (
-            "The images were turned by 180 degrees after the matrix was made: cx and cy are "
-            f"{matrix[2]:.1f} and {matrix[3]:.1f} px by these images.",
-            f"In session.toml, write {entries}; the camera's frame turns with the images.",
-        )
     scale = float(np.sqrt(np.prod(matrix[:2] / stated.matrix[:2])))
     if max(scale, 1.0 / scale) < _LEAST_SCALE:
         return "", ""
     ratio = float(Fraction(scale).limit_denominator(_LARGEST_DENOMINATOR))
-    if abs(ratio / scale - 1.0) < _SAME_SCALE:
-        scale = ratio
-    residuals = np.abs(scaled_matrix(stated.matrix, scale) - matrix)
-    limits = [_SAME_SCALE * scale * stated.matrix[0]] * 2 + [_SAME_SHAPE * stated.resolution[0]] * 2
-    if np.any(residuals > limits):
+    scale = ratio if abs(ratio / scale - 1.0) < _SAME_SCALE else scale
+    scaled, (width, height) = scaled_matrix(stated.matrix, scale), stated.resolution
+    limits = np.repeat([_SAME_SCALE * scale * stated.matrix[0], _SAME_SHAPE * width], 2)
+    if np.any(np.abs(scaled - matrix) > limits):
         return "", ""
-    width, height = stated.resolution
     return (
         f"The stated matrix is for images of {width / scale:.0f} x {height / scale:.0f} px, and "
         f"these are {width} x {height} px: fx is {stated.matrix[0]:.1f} px there, and "
         f"{matrix[0]:.1f} px by these images ({scale:.3g} times as large).",
-        f"In session.toml, write {_written('matrix', scaled_matrix(stated.matrix, scale), '.2f')}.",
+        f"In session.toml, write {_entry('matrix', scaled)}.",
     )
+
+
+def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
+    """Camera matrix fx, fy, cx, cy of resized images; pixel centres are at integers."""
+    return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
 
 
 def turned_lens(camera: Camera, *, clockwise: bool) -> Camera:
@@ -108,25 +171,25 @@ def turned_lens(camera: Camera, *, clockwise: bool) -> Camera:
     return Camera(camera.model, (height, width), np.array(matrix), distortion)
 
 
-def _direction_of_turn(
+def _quarter_turn(
     stated: Camera, corners: Mapping[int, Corners], target: Target
 ) -> tuple[str, Camera]:
     """Direction in which images were turned, and their lens; empty where the stated matrix fits."""
-    upright = Camera(stated.model, stated.resolution[::-1], stated.matrix, stated.distortion)
     lenses = {
-        "": upright,
+        "": Camera(stated.model, stated.resolution[::-1], stated.matrix, stated.distortion),
         "clockwise": turned_lens(stated, clockwise=True),
         "counterclockwise": turned_lens(stated, clockwise=False),
     }
 
-    def misfit(direction: tuple[str, Camera]) -> float:
-        lens = direction[1]
-        if not corners:
-            # The principal point is near the centre.
-            return float(np.linalg.norm(lens.matrix[2:] - np.array(lens.resolution) / 2))
+    def misfit_px(how: str) -> float:
         try:
-            return estimate_poses(corners, [target], lens).sigma_px
+            return estimate_poses(corners, [target], lenses[how]).sigma_px
         except DataError:
             return np.inf
 
-    return min(lenses.items(), key=misfit)
+    best = min(lenses, key=misfit_px)
+    return best, lenses[best]
+
+
+def _entry(key: str, values: FloatArray, form: str = ".2f") -> str:
+    return f"{key} = [{', '.join(format(value, form) for value in values.tolist())}]"
