@@ -25,9 +25,9 @@ _ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
 # Least relative gain of the rational model, of views in the fit and of held-out ones.
-_LEAST_GAIN = 0.02
-_FOLDS = 5
-# Limits of the warnings: the focal length as a share, the principal point in pixels.
+_LEAST_GAIN, _FOLDS = 0.02, 5
+# Limits of the warnings: the focal length as a share, the principal point [px], tilt [deg] and
+# ratio of distances of the views; the parts of the image along each side.
 _FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
 _TILT_SPREAD_DEG, _DISTANCE_SPREAD, _GRID = 10.0, 1.2, 3
 
@@ -75,10 +75,9 @@ def estimate_intrinsics(
             culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )
-    stack = CornerStack.of(corners, numbered_positions(targets))
+    full = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
-        first, full = _first_fit(stack, model, resolution), stack
-        stack, fit, reasons = _gated(full, first)
+        stack, fit, reasons = _gated(full, _first_fit(full, model, resolution))
         if reasons:
             # With a wrong initial focal length a pose may tilt the other way and stay there: the
             # most tilted views, which determine the lens best, then seem outliers.
@@ -88,7 +87,17 @@ def estimate_intrinsics(
                 stack, fit, reasons = restarted
         if model == "brown":
             fit = _with_rational_terms(stack, fit)
-    _check(fit)
+    relative = np.sqrt(np.diag(fit.covariance)[:2]) / fit.camera.matrix[:2]
+    if not fit.settled or not np.all(np.isfinite(relative)) or np.any(fit.camera.matrix[:2] <= 0):
+        raise ConvergenceError(
+            "intrinsics: the estimate does not come to rest.",
+            next_step="Give matrix and distortion in [camera], or add tilted views.",
+        )
+    if relative.max() > 0.2:
+        raise DegenerateError(
+            f"intrinsics: the views leave the focal length open to {100 * relative.max():.0f} %.",
+            next_step="Add views tilted by 30 to 45 degrees, or give matrix and distortion.",
+        )
     rejections = tuple(Rejection(*item) for item in reasons.items())
     warnings = tuple(_warnings(stack, fit))
     return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections, warnings)
@@ -117,39 +126,28 @@ def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
 
 def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int]) -> BundleFit:
     """Fits from Zhang's start and further focal lengths until a fit is good."""
-    best: BundleFit | None = None
-    coefficients = 4 if model == "fisheye" else 5
-    for focal in _focal_starts(stack, resolution):
-        width, height = resolution
+    (width, height), fits = resolution, list[BundleFit]()
+    starts = [share * width for share in _FOCAL_WIDTHS]
+    # Zhang's start takes boards in their plane z = 0.
+    if not stack.points[:, 2].any():
+        points = np.split(stack.points.astype(np.float32), stack.starts[1:])
+        px = np.split(stack.px.astype(np.float32), stack.starts[1:])
+        zhang = float(cv2.initCameraMatrix2D(points, px, resolution)[0, 0])
+        starts = [zhang] * bool(0.1 * width < zhang < 20 * width) + starts
+    for focal in starts:
         matrix = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
-        camera = Camera(model, resolution, matrix, np.zeros(coefficients))
-        fit = _fit(stack, camera, planar_poses(stack, camera).first)
-        if best is None or fit.sigma_px < best.sigma_px:
-            best = fit
+        camera = Camera(model, resolution, matrix, np.zeros(4 if model == "fisheye" else 5))
+        fits.append(_fit(stack, camera, planar_poses(stack, camera).first))
+        best = min(fits, key=lambda fit: fit.sigma_px)
         # Corners are found to a few tenths of a pixel; a wrong minimum is off by many pixels.
         if best.sigma_px < 1.0 and best.settled:
             break
-    if best is None or not np.isfinite(best.sigma_px):
+    if not np.isfinite(best.sigma_px):
         raise ConvergenceError(
             "intrinsics: no focal length explains the views.",
             next_step="Check the target's description against the print.",
         )
     return best
-
-
-def _focal_starts(stack: CornerStack, resolution: tuple[int, int]) -> Iterator[float]:
-    if _is_flat(stack):
-        points = np.split(stack.points.astype(np.float32), stack.starts[1:])
-        px = np.split(stack.px.astype(np.float32), stack.starts[1:])
-        zhang = cv2.initCameraMatrix2D(points, px, resolution)[0, 0]
-        if np.isfinite(zhang) and 0.1 * resolution[0] < zhang < 20 * resolution[0]:
-            yield float(zhang)
-    yield from (share * resolution[0] for share in _FOCAL_WIDTHS)
-
-
-def _is_flat(stack: CornerStack) -> bool:
-    """Whether all targets are in the plane z = 0, as printed ones are."""
-    return not stack.points[:, 2].any()
 
 
 def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
@@ -180,35 +178,35 @@ def _held_out(stack: CornerStack, fit: BundleFit) -> FloatArray:
     return squares
 
 
-def _check(fit: BundleFit) -> None:
-    relative = np.sqrt(np.diag(fit.covariance)[:2]) / fit.camera.matrix[:2]
-    if not fit.settled or not np.all(np.isfinite(relative)) or np.any(fit.camera.matrix[:2] <= 0):
-        raise ConvergenceError(
-            "intrinsics: the estimate does not come to rest.",
-            next_step="Give matrix and distortion in [camera], or add tilted views.",
-        )
-    if relative.max() > 0.2:
-        raise DegenerateError(
-            f"intrinsics: the views leave the focal length open to {100 * relative.max():.0f} %.",
-            next_step="Add views tilted by 30 to 45 degrees, or give matrix and distortion.",
-        )
-
-
 def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     """States what the views do not determine, and why."""
-    sigma = np.sqrt(np.diag(fit.covariance))
+    sigma, poses = np.sqrt(np.diag(fit.covariance)), fit.cam_from_target
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
-    causes = list(_causes(fit)) if _is_flat(stack) else []
-    why = "".join(f" {cause.words}" for cause in causes)
-    step = causes[0].do if causes else Remedy("Add views, tilted and near the image's edges.")
-    weak = [f"the focal length to {100 * focal:.1f} %"] * bool(focal > _FOCAL_LIMIT)
-    weak += [f"the image centre to {centre:.1f} px"] * bool(centre > _CENTRE_LIMIT_PX)
-    if weak:
-        words = f"The corners alone determine {' and '.join(weak)} only.{why}"
-        yield Finding("weak_lens", words, step, until_mm=0.0)
-    else:
-        yield from causes
-    empty = _unvisited(stack, fit.camera.resolution)
+    tilt_deg = np.rad2deg(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0.0, 1.0))).max()
+    distances = np.linalg.norm(poses[:, :3, 3], axis=1)
+    spread = distances.max() / distances.min()
+    words, step = [], Remedy("Add views, tilted and near the image's edges.")
+    if focal > _FOCAL_LIMIT:
+        words.append(f"The corners alone determine the focal length to {100 * focal:.1f} % only.")
+    if centre > _CENTRE_LIMIT_PX:
+        words.append(f"The corners alone determine the image centre to {centre:.1f} px only.")
+    is_flat = not stack.points[:, 2].any()
+    if is_flat and spread < _DISTANCE_SPREAD and tilt_deg < 2 * _TILT_SPREAD_DEG:
+        words.append(f"All views are from one distance (within {100 * (spread - 1):.0f} %).")
+        step = Remedy("Vary the distance of the views.")
+    if is_flat and tilt_deg < _TILT_SPREAD_DEG:
+        words.append(f"All views are frontal (tilted by at most {tilt_deg:.0f} degrees).")
+        step = TILTED
+    if words:
+        yield Finding("weak_lens", " ".join(words), step, until_mm=0.0)
+    cell = np.minimum((stack.px / np.array(fit.camera.resolution) * _GRID).astype(int), _GRID - 1)
+    visited, ends = set(map(tuple, cell.tolist())), (0, _GRID - 1)
+    empty = [
+        f"{edge} {side}"
+        for y, edge in zip(ends, ("upper", "lower"), strict=True)
+        for x, side in zip(ends, ("left", "right"), strict=True)
+        if (x, y) not in visited
+    ]
     if empty:
         yield Finding(
             EMPTY_IMAGE,
@@ -216,30 +214,3 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
             "extrapolated there.",
             Remedy(f"In some views, move the target into the {listed(empty)} of the image."),
         )
-
-
-def _causes(fit: BundleFit) -> Iterator[Finding]:
-    poses = fit.cam_from_target
-    tilt = np.rad2deg(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0.0, 1.0)))
-    if tilt.max() < _TILT_SPREAD_DEG:
-        words = f"All views are frontal (tilted by at most {tilt.max():.0f} degrees)."
-        yield Finding("weak_lens", words, TILTED, until_mm=0.0)
-    distance = np.linalg.norm(poses[:, :3, 3], axis=1)
-    spread = distance.max() / distance.min()
-    if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
-        words = f"All views are from one distance (within {100 * (spread - 1):.0f} %)."
-        yield Finding("weak_lens", words, Remedy("Vary the distance of the views."), until_mm=0.0)
-
-
-def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:
-    """Names the corners of the image in which no corner of the target was seen."""
-    cell = np.minimum((stack.px / (np.array(resolution) / _GRID)).astype(int), _GRID - 1)
-    last = _GRID - 1
-    names = {
-        (0, 0): "upper left",
-        (last, 0): "upper right",
-        (0, last): "lower left",
-        (last, last): "lower right",
-    }
-    visited = set(map(tuple, cell.tolist()))
-    return [name for place, name in names.items() if place not in visited]
