@@ -22,8 +22,8 @@ def measured(nominal, order, rng, noise_m=NOISE_M):
 
 ORDERS = {
     "swapped": (lambda n: [1, 0, *range(2, n)], "P0 and P1 are exchanged"),
-    "shifted": (lambda n: [*range(1, n), 0], "all numbers are shifted by 1: P0 is P1"),
-    "reversed": (lambda n: [*range(n)][::-1], "the order is reversed: P0 is P"),
+    "shifted": (lambda n: [*range(1, n), 0], "points are exchanged: P0 is P1"),
+    "reversed": (lambda n: [*range(n)][::-1], "points are exchanged: P0 is P"),
     "anyhow": (lambda n: [2, 0, 1, *range(4, n), 3], "points are exchanged: P0 is P2, P1 is P0"),
 }
 
@@ -79,7 +79,7 @@ def test_a_point_that_was_skipped_is_found_in_a_longer_drawing(drawn):
     found = find_numbering(measured(nominal, order, rng), nominal)
     assert found.is_wrong
     assert found.assignment.tolist() == order
-    assert found.words(NAMES[:drawn]) == "numbers are shifted by 1: P2 is P3, P3 is P4, P4 is P5"
+    assert found.words(NAMES[:drawn]) == "points are exchanged: P2 is P3, P3 is P4, P4 is P5"
 
 
 def test_what_is_known_of_the_noise_counts_in_its_favour():

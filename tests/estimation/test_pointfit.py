@@ -117,7 +117,7 @@ def test_the_covariance_is_the_bound_where_the_noise_is_known():
 
 def test_shifted_numbers_are_refused():
     _, pairs = measured_part(6, 9)
-    with pytest.raises(DataError, match="all numbers are shifted by 1: P0 is P1"):
+    with pytest.raises(DataError, match="points are exchanged: P0 is P1"):
         fit_points(replace(pairs, measured=np.roll(pairs.measured, -1, axis=0)))
 
 

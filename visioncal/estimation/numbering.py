@@ -62,21 +62,13 @@ class Numbering:
 
         `labels` are the (m,) names of the drawn points; the first n are the stated ones.
         """
-        moved, count, drawn = self.moved, len(self.assignment), len(labels)
+        moved = self.moved
         if not len(moved):
             return ""
         if len(moved) == 2 and set(moved) == set(self.assignment[moved]):
             return f"{labels[moved[0]]} and {labels[moved[1]]} are exchanged"
-        pairs = [f"{labels[index]} is {labels[self.assignment[index]]}" for index in moved]
-        listing = ", ".join(pairs)
-        if count == drawn and np.array_equal(self.assignment, np.arange(count)[::-1]):
-            return f"the order is reversed: {listing}"
-        steps = np.unique((self.assignment - np.arange(count))[moved] % drawn)
-        if len(steps) == 1:
-            by = int(steps[0]) if steps[0] <= drawn // 2 else int(steps[0]) - drawn
-            what = "all numbers are" if len(moved) == count else "numbers are"
-            return f"{what} shifted by {by}: {listing}"
-        return f"points are exchanged: {listing}"
+        pairs = (f"{labels[index]} is {labels[self.assignment[index]]}" for index in moved)
+        return f"points are exchanged: {', '.join(pairs)}"
 
 
 def find_numbering(

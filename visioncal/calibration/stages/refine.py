@@ -11,8 +11,8 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.appearance import Appearance, Compressed, LensBoardParameters, compress
+from visioncal.core.types import FloatArray
+from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
@@ -27,7 +27,6 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.problem_parts import State
 
 # Size of a board's scale error at the start: prints are scaled to fit a page.
@@ -103,25 +102,21 @@ def _beside_arms(
     hides a part of it. Errors of any arm's shape decide the sizes of the others, but not all are
     estimated.
     """
+
+    def beside(other: FrameModel, fit: ConvergedFit) -> ConvergedFit:
+        return fit_jointly(fit.camera_parameters, other, fit.frames, before=fit.linearised)
+
     under_stated = model.with_errors(stated)
     freeing = (under_stated if under_stated.errors else after).freed(freely=True)
-    sized, _ = with_sizes(freeing, _with_other_effects(freeing, stated))
+    sized, _ = with_sizes(freeing, beside(freeing, stated))
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
         return sized, estimating
-    fitted = _with_other_effects(estimating, sized)
+    fitted = beside(estimating, sized)
     new_model = estimating.with_errors(fitted)
     # Errors that were not significant under the stated lenses may be so under these.
-    if [error.is_estimated for error in new_model.errors] != [
-        error.is_estimated for error in estimating.errors
-    ]:
-        fitted = _with_other_effects(new_model, fitted)
-    return fitted, new_model
-
-
-def _with_other_effects(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
-    """Fits again with other effects beside lenses and boards, which start at their own values."""
-    return fit_jointly(fitted.camera_parameters, model, fitted.frames, before=fitted.linearised)
+    now, earlier = ([error.is_estimated for error in at.errors] for at in (new_model, estimating))
+    return (fitted if now == earlier else beside(new_model, fitted)), new_model
 
 
 def with_sizes(
@@ -140,18 +135,17 @@ def with_sizes(
     Returns:
         The fit, and these errors.
     """
-    sized = _estimated(model, fitted, posture)
-    follows = _follows(model, fitted, sized)
+    follows = _follows(model, fitted, _estimated(model, fitted, posture))
     if follows is None or posture or not model.arms_without_joints:
         return follows or fitted, posture
+    sized = follows.camera_parameters
     scales = [item.scale for item in sized.board_sizes]
-    focals = [item.focal for item in sized.lens_sizes.values()]
-    if not any((*scales, *focals)):
+    if not any((*scales, *(item.focal for item in sized.lens_sizes.values()))):
         return follows, posture
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
     posture = model.pose_errors(follows)
-    sized = _estimated(model, follows, posture)
-    return _follows(model, follows, sized) or follows, posture
+    again = _follows(model, follows, _estimated(model, follows, posture))
+    return again or follows, posture
 
 
 def _follows(
@@ -168,11 +162,8 @@ def _follows(
     except ConvergenceError:
         return None
     sigmas = zip(refit.linearised.sigmas_px, fitted.linearised.sigmas_px, strict=True)
-    return (
-        refit
-        if all(sigma <= FOLLOWS * floored_sigma_px(before) for sigma, before in sigmas)
-        else None
-    )
+    is_followed = all(sigma <= FOLLOWS * floored_sigma_px(before) for sigma, before in sigmas)
+    return refit if is_followed else None
 
 
 def _is_shrunk(fitted: ConvergedFit) -> bool:
@@ -183,29 +174,21 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 
 
 def _estimated(
-    model: CellFrameModel,
-    fitted: ConvergedFit,
-    posture: Mapping[str, ArmErrors],
+    model: CellFrameModel, fitted: ConvergedFit, posture: Mapping[str, ArmErrors]
 ) -> CameraParameters:
     """Lenses and boards with the sizes of their errors, near a fit.
 
     `posture` are errors of arms without joint angles, by robot, beside which they are estimated.
     """
     optics = fitted.linearised.camera_parameters
-    seen = replace(fitted.linearised, is_flat=True)
+    seen, noise = replace(fitted.linearised, is_flat=True), fitted.fit.noise
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
     problem = model.problem(seen)
     problem = replace(problem, priors=with_loose_positions(problem.priors))
-    noise, values = (
-        fitted.fit.noise,
-        {
-            LENSES: np.append(optics.values, np.zeros(seen.by_field.shape[2])),
-            **{
-                effect.name: fitted.problem.values_of(effect.name, fitted.fit.state)
-                for effect in problem.effects[1:]
-            },
-        },
-    )
+    values = {
+        effect.name: fitted.problem.values_of(effect.name, fitted.fit.state)
+        for effect in problem.effects[1:]
+    } | {LENSES: np.append(optics.values, np.zeros(seen.by_field.shape[2]))}
     for robot, errors in posture.items():
         effect = errors.effect(robot)
         others = [other for other in problem.effects if other.name != effect.name]
@@ -215,10 +198,8 @@ def _estimated(
             robots = noise.robots.copy()
             robots[problem.robots.index(robot)] = errors.white
             noise = replace(noise, robots=robots)
-    state = State(
-        fitted.fit.state.edges,
-        np.concatenate([values[effect.name] for effect in problem.effects]),
-    )
+    in_order = [values[effect.name] for effect in problem.effects]
+    state = State(fitted.fit.state.edges, np.concatenate(in_order))
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
         rows, uneven = model.rows(seen), UNEVEN_LINKS if model.has_links else 1.0
@@ -239,26 +220,18 @@ def recompute_poses(
     """
     if not views:
         return ()
-    stack = CornerStack.of(_corners(views), free.positions)
+    corners = {view.view: view.corners for view in views if view.corners is not None}
     starts = np.array([view.cam_from_target[0] for view in views])
     with one_blas_thread():
+        stack = CornerStack.of(corners, free.positions)
         compressed = compress(stack, free.basis, free.appearance, starts)
+    covariances = floored_sigma_px(sigma_px) ** 2 * compressed.covariance
     return tuple(
-        _remade_view(view, compressed, free.columns, sigma_px, at) for at, view in enumerate(views)
-    )
-
-
-def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
-    return {view.view: view.corners for view in views if view.corners is not None}
-
-
-def _remade_view(
-    view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
-) -> ViewPoses:
-    covariance = floored_sigma_px(sigma_px) ** 2 * covariance_from(compressed.information[at])
-    return replace(
-        view,
-        cam_from_target=compressed.cam_from_target[at][None],
-        covariance=covariance[None],
-        shared_jacobian=compressed.by_shared[at][None, :, columns],
+        replace(
+            view,
+            cam_from_target=compressed.cam_from_target[at][None],
+            covariance=covariances[at][None],
+            shared_jacobian=compressed.by_shared[at][None, :, free.columns],
+        )
+        for at, view in enumerate(views)
     )
