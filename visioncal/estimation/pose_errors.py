@@ -51,10 +51,9 @@ _PRIOR = {
 _NO_WEIGHT = 1e-4
 # Fewer stops have hardly more residuals than edges and noise have parameters.
 _FEWEST_STOPS = 6
-# Most rows of a block with joint covariance: the work grows with their cube.
-_MOST_ROWS = 360
-# Most blocks, spread over the session, that determine the sizes; others count as known noise.
-_MOST_BLOCKS = 5
+# Rows of a session that is one block, and of the blocks of a longer one: the work grows with the
+# square of these. Most stops that tie its blocks by the posture.
+_ONE_BLOCK, _BLOCK, _MOST_TIES = 200, 96, 16
 # Most columns that represent the errors of all stops; the remainder counts as noise.
 _MOST_COLUMNS = 360
 # Least information of stops on a combination of these, over its prior, and most combinations.
@@ -255,7 +254,8 @@ def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterato
         process = _Process(kernel, flange, _START_SIZE, lasts=True)
         yield _Model("time", _PRIOR["time"] / len(_MEMORIES), (process,), white)
     centred_order = (order - observed.mean()) / observed.std()
-    process = _Process(np.outer(centred_order, centred_order), both, _START_SIZE, lasts=True)
+    moving = centred_order[:, None, None] * both
+    process = _Process(np.ones((len(poses),) * 2), moving, _START_SIZE, lasts=True)
     yield _Model("drift", _PRIOR["drift"], (process,), white)
 
 
@@ -322,29 +322,16 @@ def _informative(
 
 
 @dataclass(frozen=True, eq=False)
-class _StopBlock:
-    """Stops with a joint covariance."""
-
-    stops: IntArray  # (u,) the stop of each unit, among those with a pose.
-    rows: Units  # All their n rows as one unit; its sizes are the robot's two noise levels.
-    by_flange: FloatArray  # (u, n / u, 6) Jacobian by the robot's flange.
-
-    def with_processes(self, processes: Sequence[_Process]) -> Units:
-        """The rows with the covariance of each process as one more part."""
-        parts = [*self.rows.parts]
-        for process in processes:
-            flange_covariance = replace(process, size=1.0).between(self.stops, self.stops)
-            covariance = self.by_flange[:, None] @ flange_covariance
-            covariance = covariance @ np.swapaxes(self.by_flange, 1, 2)
-            parts.append(np.swapaxes(covariance, 1, 2).reshape(self.rows.known.shape))
-        return replace(self.rows, parts=np.array(parts), sizes=np.arange(len(parts)))
-
-
-@dataclass(frozen=True, eq=False)
 class _Likelihood:
-    """The restricted likelihood of one robot's errors."""
+    """The restricted likelihood of one robot's errors.
 
-    blocks: tuple[_StopBlock, ...]  # Its stops; different blocks count as independent.
+    Consecutive stops form blocks, each with its joint covariance; blocks share the errors at some
+    stops, and are independent beside these (Quinonero-Candela and Rasmussen 2005, section 6).
+    """
+
+    stops: IntArray  # (u,) the stop of each of u units, among those with a pose.
+    units: Units  # They; their sizes are the robot's two noise levels.
+    by_flange: FloatArray  # (u, d, 6) Jacobian by the robot's flange.
     rest: CommonRows  # Everything else that is known of the unknowns.
 
     @classmethod
@@ -355,58 +342,87 @@ class _Likelihood:
         index, count = problem.robots.index(robot), len(problem.poses[robot])
         likelihood = robot_likelihood(problem, state, noise)
         (every,), (rest,) = likelihood.model.units, likelihood.model.common
-        members, stops, width = likelihood.members, likelihood.stops, every.residuals.shape[1]
-        mine = (members == index).any(axis=1)
-        by_flange = np.zeros((len(members), width, 6))
-        by_flange[mine] = likelihood.moved(index, np.broadcast_to(np.eye(6), (count, 6, 6)))
-        levels = noise.robots.copy()
+        mine = (likelihood.members == index).any(axis=1)
+        levels, own = noise.robots.copy(), likelihood.reduced.covariance
         levels[index] = 0.0
-        others = problem.error_covariance(replace(noise, robots=levels))
-        known = likelihood.reduced.covariance + others
-        units = np.flatnonzero(mine)
-        units = units[np.argsort(stops[units], kind="stable")]
-        split = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
-        spread = np.linspace(0, len(split) - 1, min(len(split), _MOST_BLOCKS)).round().astype(int)
-        chosen = [split[at] for at in spread]
-        others_rows = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
-        total = likelihood.reduced.covariance + problem.error_covariance(noise)
-        jacobian = every.jacobian[others_rows]
-        weighted = np.linalg.solve(total[others_rows], jacobian)
+        known = own + problem.error_covariance(replace(noise, robots=levels))
+        total = own + problem.error_covariance(noise)
+        weighted = np.linalg.solve(total[~mine], every.jacobian[~mine])
         rest = CommonRows(
-            rest.information + gram(weighted, jacobian),
-            rest.gradient + gram(weighted, every.residuals[others_rows]),
+            rest.information + gram(weighted, every.jacobian[~mine]),
+            rest.gradient + gram(weighted, every.residuals[~mine]),
+        )
+        units = np.flatnonzero(mine)
+        order = np.argsort(likelihood.stops[units], kind="stable")
+        parts, units = every.parts[2 * index : 2 * index + 2], units[order]
+        by_flange = likelihood.moved(index, np.broadcast_to(np.eye(6), (count, 6, 6)))
+        return cls(
+            np.searchsorted(posed, likelihood.stops[units]),
+            Units(
+                every.residuals[units],
+                every.jacobian[units],
+                known[units],
+                parts[:, units],
+                np.arange(2),
+            ),
+            by_flange[order],
+            rest,
         )
 
-        def joined(covariance: FloatArray) -> FloatArray:
-            return np.asarray(block_diag(*covariance))[None]
-
-        blocks = [
-            _StopBlock(
-                np.searchsorted(posed, stops[rows]),
+    def model(self, processes: Sequence[_Process]) -> MixedModel:
+        """The mixed model, with a size for each process after those of the noise."""
+        rows = self.units.residuals.size
+        blocks = np.array_split(
+            np.arange(len(self.stops)), 1 if rows <= _ONE_BLOCK else -(-rows // _BLOCK)
+        )
+        processes = [replace(process, size=1.0) for process in processes]
+        ties = [self._ties(process, blocks) for process in processes]
+        columns = [self.by_flange @ tied[self.stops] for tied in ties]
+        jacobian = np.concatenate([self.units.jacobian, *columns], axis=2)
+        shares = [np.ones((tied.shape[2], 1)) for tied in ties]
+        units = []
+        for block in blocks:
+            own, stops = replace(self.units, parts=self.units.parts[:, block]), self.stops[block]
+            parts = [block_diag(*part) for part in own.parts]
+            for process, tied in zip(processes, ties, strict=True):
+                covariance = process.between(stops, stops)
+                covariance -= np.tensordot(tied[stops], tied[stops], (2, 2)).swapaxes(1, 2)
+                moved = self.by_flange[block]
+                seen = moved[:, None] @ covariance @ np.swapaxes(moved, 1, 2)
+                parts.append(np.swapaxes(seen, 1, 2).reshape(parts[0].shape))
+            units.append(
                 Units(
-                    every.residuals[rows].reshape(1, -1),
-                    every.jacobian[rows].reshape(1, -1, every.jacobian.shape[2]),
-                    joined(known[rows]),
-                    np.array([joined(every.parts[2 * index + axes, rows]) for axes in (0, 1)]),
-                    np.arange(2),
-                ),
-                by_flange[rows],
+                    self.units.residuals[block].reshape(1, -1),
+                    jacobian[block].reshape(1, -1, jacobian.shape[2]),
+                    block_diag(*self.units.known[block])[None],
+                    np.array(parts)[:, None],
+                    np.arange(len(parts)),
+                )
             )
-            for rows in chosen
-        ]
-        return cls(tuple(blocks), rest)
+        count = len(self.rest.gradient)
+        return MixedModel(
+            tuple(units),
+            (self.rest.beside(jacobian.shape[2] - count),),
+            np.asarray(block_diag(np.zeros((count, 2)), *shares)),
+            ratio_prior([0], 2 + len(processes)),
+        )
+
+    def _ties(self, process: _Process, blocks: Sequence[IntArray]) -> FloatArray:
+        """(s, 6, c) columns of a process at the stops that tie blocks."""
+        count = len(process.kernel)
+        if len(blocks) == 1:
+            return np.zeros((count, 6, 0))
+        if not process.lasts:
+            return _columns([process], count, np.unique(self.stops), _MOST_TIES)[0]
+        # What was before a stop, and is behind it, is independent given a process there.
+        first = np.unique([self.stops[block[0]] for block in blocks])
+        return _columns([process], count, first, len(first))[0]
 
     def maximised(self, model: _Model) -> _Model:
         """The model with maximum-likelihood sizes, searched from its present ones."""
         sizes = np.array([process.size for process in model.processes])
         least = np.append([LEAST_SIGMA] * 2, np.full(len(sizes), _NOTHING))
-        count, unknowns = 2 + len(sizes), len(self.rest.gradient)
-        mixed = MixedModel(
-            tuple(block.with_processes(model.processes) for block in self.blocks),
-            (self.rest,),
-            np.zeros((unknowns, count)),
-            ratio_prior([0], count),
-        )
+        mixed = self.model(model.processes)
         start = np.log(np.append(model.white, sizes))
         try:
             # Where the likelihood falls from next to nothing on, a process has no size.
