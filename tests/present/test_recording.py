@@ -66,6 +66,16 @@ def test_recording_gives_the_session_back(sample: Sample, recorded: Path) -> Non
     assert_same(sample.session, Session.load(recorded))
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted by Linux")
+def test_writing_leaves_no_threads(sample: Sample, tmp_path: Path) -> None:
+    counts = []
+    for index in range(4):
+        write_session(tmp_path / f"{index}.rrd", sample.session)
+        counts.append(len(os.listdir("/proc/self/task")))
+    # The last stream's threads may end with the next one.
+    assert max(counts[1:]) <= counts[0]
+
+
 def test_results_do_not_change_the_session(sample: Sample, tmp_path: Path) -> None:
     alone = write_session(tmp_path / "session.rrd", sample.session)
     assert_same(sample.session, read_session(alone))

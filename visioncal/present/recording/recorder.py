@@ -10,6 +10,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 import rerun as rr
 from rerun.blueprint import BlueprintLike
+from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
@@ -88,7 +89,7 @@ class Recorder:
         Raises:
             OSError: The file could not be written.
         """
-        ending = Thread(target=self.stream.disconnect, daemon=True)
+        ending = Thread(target=_end, args=(self.stream,), daemon=True)
         ending.start()
         ending.join(0.0 if self._is_lost else _WRITTEN_S)
         if ending.is_alive():
@@ -103,6 +104,15 @@ class Recorder:
             raise OSError("its end is missing; the disk may be full") from error
         with self._path.open("r+b") as file:
             os.fsync(file.fileno())
+
+
+def _end(stream: rr.RecordingStream) -> None:
+    """Ends a stream, and the threads of streams to which nobody refers any more.
+
+    Rerun keeps two threads a stream until the process ends: thousands in a fleet's.
+    """
+    stream.disconnect()
+    flush_and_cleanup_orphaned_recordings()
 
 
 def send_rows(
