@@ -71,7 +71,7 @@ def test_writing_leaves_no_threads(sample: Sample, tmp_path: Path) -> None:
     counts = []
     for index in range(4):
         write_session(tmp_path / f"{index}.rrd", sample.session)
-        counts.append(len(os.listdir("/proc/self/task")))
+        counts.append(len([*Path("/proc/self/task").iterdir()]))
     # The last stream's threads may end with the next one.
     assert max(counts[1:]) <= counts[0]
 
