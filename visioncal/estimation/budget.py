@@ -10,8 +10,8 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_among, gram
-from visioncal.estimation.normal_equations import fisher_information
-from visioncal.estimation.problem import Linear, Problem
+from visioncal.estimation.normal_equations import Whitening, fisher_information
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 
 
@@ -29,40 +29,76 @@ class Sources:
     priors: str = "priors"  # The source of hand-measured frames.
 
 
+@dataclass(frozen=True, eq=False)
+class _Gain:
+    """Jacobian of some unknowns' estimates by all errors: V^-1 X C."""
+
+    rows: FloatArray  # (n, 6, c) by the observations.
+    units: FloatArray  # (u, 6 w, c) by the errors that the observations of a unit share.
+    columns: FloatArray  # (p, c) covariance of all unknowns with these.
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, noise: Noise, count: int | None = None) -> "_Gain":
+        """The gain of the first `count` unknowns, or of all."""
+        fisher = fisher_information(problem, state, noise)
+        columns = covariance_among(fisher, problem.counted)[:, :count]
+        linear = problem.linear(state, ideal=True)
+        jacobian, white = linear.jacobian @ columns, Whitening.of(problem, noise, linear.by_errors)
+        rows, shared = white.weights @ jacobian, white.units >= 0
+        units, taken = white.units[shared], white.taken[shared]
+        by_unit = np.zeros((white.count, white.taken.shape[1], columns.shape[1]))
+        np.add.at(by_unit, units, taken @ jacobian[shared])
+        rows[shared] -= np.swapaxes(taken, 1, 2) @ by_unit[units]
+        unit_of, errors = problem.units[0], np.zeros_like(by_unit)
+        own = unit_of >= 0
+        by_errors = np.swapaxes(linear.by_errors[own], 1, 2)
+        np.add.at(errors, unit_of[own], by_errors @ rows[own])
+        return cls(rows, errors, columns)
+
+    def of_flange(self, problem: Problem, robot: int, variances: FloatArray) -> FloatArray:
+        """(c, c) contribution of a robot's flange errors of (2,) variances [rad^2, m^2]."""
+        units, slots = np.nonzero(problem.units[1] == robot)
+        gain = self.units[units[:, None], 6 * slots[:, None] + np.arange(6)]
+        return gram(gain, np.repeat(variances, 3)[:, None] * gain)
+
+
 def covariance_by_source(
     problem: Problem, state: State, noise: Noise, sources: Sources
 ) -> dict[str, FloatArray]:
     """Splits the covariance of the edges into contributions (6 e, 6 e) of the sources.
 
     The estimate is linear in the errors of observations, flanges, effects and priors: each
-    contributes its own covariance through the same gain, and the parts add up to the total. Priors
-    of effects may be correlated, as of lens and board that are known from the same corners: each
-    takes half of the cross terms, which may make one contribution negative where they compensate
-    each other.
+    contributes its own covariance through the same gain, C X' V^-1 V_k V^-1 X C, and the parts add
+    up to the total. Priors of effects may be correlated, as of lens and board that are known from
+    the same corners: each takes half of the cross terms, which may make one contribution negative
+    where they compensate each other.
     """
-    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
-    linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
-    gain = _weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
-    parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
+    edges = 6 * len(problem.unknown)
+    gain, own = _Gain.of(problem, state, noise, edges), problem.covariance(noise)
+    parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros((edges, edges)))
+    observers = np.array(problem.observations.observers)
     for frame in dict.fromkeys(problem.observations.observers):
-        rows = np.array([observer == frame for observer in problem.observations.observers])
+        rows = observers == frame
         # If the observations' own noise is unknown, the robot's noise includes it.
         if own[rows].any():
-            parts[sources.sensors[frame]] += gram(gain[rows], own[rows] @ gain[rows])
-    for name, part in _by_errors(problem, linear, gain, noise, sources):
-        parts[name] += part
-    edge_columns = fitted[:, : 6 * len(problem.unknown)]
+            parts[sources.sensors[frame]] += gram(gain.rows[rows], own[rows] @ gain.rows[rows])
+    for index, robot in enumerate(problem.robots):
+        parts[sources.robots[robot]] += gain.of_flange(problem, index, noise.robots[index] ** 2)
+    errors, first = problem.error_covariance(noise), len(gain.units) - len(problem.repeats)
+    for unit, repeated in enumerate(problem.repeats, start=first):
+        by_unit = gain.units[unit]
+        parts[sources.sensors[observers[repeated[0]]]] += by_unit.T @ errors[unit] @ by_unit
     prior_info = problem.prior_information(state).information
-    owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for prior in problem.priors:
         _, jacobian = problem.prior_rows(prior, state)
         prior_info = prior_info - jacobian.T @ jacobian
-        response = jacobian @ edge_columns
+        response = jacobian @ gain.columns
         parts[sources.priors] += response.T @ response
+    owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for name, columns in sources.columns.items():
         share = np.where(np.isin(owned, columns), 0.5, 0.0)
         part = (share[:, None] + share) * prior_info[np.ix_(owned, owned)]
-        parts[name] += edge_columns[owned].T @ part @ edge_columns[owned]
+        parts[name] += gain.columns[owned].T @ part @ gain.columns[owned]
     return dict(parts)
 
 
@@ -74,74 +110,9 @@ def less_noise(
     `noise` is that of the weights, and `white` (2,) the robot's, of rotation [rad] and position
     [m].
     """
-    fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
-    linear, index = problem.linear(state, ideal=True), problem.robots.index(robot)
-    gain = _weighted_jacobian(problem, linear, problem.covariance(noise), noise) @ fitted
-    robot_gain = _of_flange(problem, linear, gain, index)
-    change = np.repeat(white**2 - noise.robots[index] ** 2, 3)
-    return gram(robot_gain, change[:, None] * robot_gain)
-
-
-def _weighted_jacobian(
-    problem: Problem, linear: Linear, own: FloatArray, noise: Noise
-) -> FloatArray:
-    """Inverse covariance (n, 6, p) of all residuals times their Jacobian."""
-    weighted_jacobian, alone, (unit_of, _) = linear.jacobian, problem.alone, problem.units
-    total = problem.total_covariance(linear, noise)
-    weighted_jacobian[alone] = np.linalg.solve(total[alone], weighted_jacobian[alone])
-    rest = np.flatnonzero(~alone)
-    if not len(rest):
-        return weighted_jacobian
-    weights = np.linalg.inv(own[rest])
-    weighted_jacobian[rest] = weights @ weighted_jacobian[rest]
-    errors = problem.error_covariance(noise)
-    shared, units = rest[unit_of[rest] >= 0], unit_of[rest][unit_of[rest] >= 0]
-    jacobian = linear.by_errors[shared]
-    transposed = np.swapaxes(jacobian, 1, 2)
-    weighted = weights[unit_of[rest] >= 0] @ jacobian
-    shape = errors.shape
-    information, right = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
-    np.add.at(information, units, transposed @ weighted)
-    np.add.at(right, units, transposed @ weighted_jacobian[shared])
-    correction = np.linalg.solve(np.eye(shape[1]) + errors @ information, errors @ right)
-    weighted_jacobian[shared] -= weighted @ correction[units]
-    return weighted_jacobian
-
-
-def _by_errors(
-    problem: Problem, linear: Linear, gain: FloatArray, noise: Noise, sources: Sources
-) -> list[tuple[str, FloatArray]]:
-    """Contributions of the flanges' errors, and of errors that repeats share, by source."""
-    _, members = problem.units
-    errors = problem.error_covariance(noise)
-    parts = []
-    for index, robot in enumerate(problem.robots):
-        robot_gain = _of_flange(problem, linear, gain, index)
-        variances = np.repeat(noise.robots[index] ** 2, 3)
-        parts.append((sources.robots[robot], gram(robot_gain, variances[:, None] * robot_gain)))
-    by_unit = _by_unit(problem, linear, gain)
-    first = len(members) - len(problem.repeats)
-    for unit, repeated in enumerate(problem.repeats, start=first):
-        frame = problem.observations.observers[repeated[0]]
-        part = by_unit[unit].T @ errors[unit] @ by_unit[unit]
-        parts.append((sources.sensors[frame], part))
-    return parts
-
-
-def _of_flange(problem: Problem, linear: Linear, gain: FloatArray, robot: int) -> FloatArray:
-    """(u, 6, c) gain of a robot's flange error at each unit that contains it."""
-    units, slots = np.nonzero(problem.units[1] == robot)
-    columns = 6 * slots[:, None] + np.arange(6)
-    return np.asarray(_by_unit(problem, linear, gain)[units[:, None], columns])
-
-
-def _by_unit(problem: Problem, linear: Linear, gain: FloatArray) -> FloatArray:
-    """(u, 6 w, c) gain of the errors that the observations of a unit share."""
-    unit_of, members = problem.units
-    rows = unit_of >= 0
-    gains = np.zeros((len(members), linear.by_errors.shape[2], gain.shape[2]))
-    np.add.at(gains, unit_of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
-    return gains
+    index = problem.robots.index(robot)
+    change = white**2 - noise.robots[index] ** 2
+    return _Gain.of(problem, state, noise).of_flange(problem, index, change)
 
 
 def radius95(covariance: FloatArray) -> float:

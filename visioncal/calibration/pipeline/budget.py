@@ -1,5 +1,6 @@
 """Left-out residuals of a fit, and its uncertainty budget by source."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -56,26 +57,22 @@ def _covariances_of_edges(
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
     size = 6 * len(part.unknown)
     parts |= {name: array[:size, :size] for name, array in beside.items()}
-    parts["total"] = sum(parts.values(), np.zeros((size, size)))
-    return parts
+    return parts | {"total": sum(parts.values(), np.zeros((size, size)))}
+
+
+def _sigma_mm(covariance: FloatArray) -> float:
+    # Of two sources that compensate each other, one may have a negative trace.
+    return 1e3 * float(max(np.trace(covariance), 0.0) ** 0.5)
 
 
 def budget_mm(solved: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
     """Standard deviations of unknown frames' positions in their parents, by source, in all [mm]."""
     parts, part = _covariances_of_edges(solved, beside), solved.inlier_problem
-    budget: dict[str, dict[str, float]] = {}
-    for key in part.unknown:
-        first = part.edge_columns(key).start + 3
-        budget[key] = {
-            name: 1e3 * _root_trace(covariance[first : first + 3, first : first + 3])
-            for name, covariance in parts.items()
-        }
-    return budget
-
-
-def _root_trace(covariance: FloatArray) -> float:
-    # Of two sources that compensate each other, one may have a negative trace.
-    return float(max(np.trace(covariance), 0.0) ** 0.5)
+    firsts = {key: part.edge_columns(key).start + 3 for key in part.unknown}
+    return {
+        key: {name: _sigma_mm(array[at : at + 3, at : at + 3]) for name, array in parts.items()}
+        for key, at in firsts.items()
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +102,8 @@ def work_accuracy(
     """
     part, state = solved.inlier_problem, solved.inlier_fit.fit.state
     middles = middles_of(solved.cell)
-    target_points = np.array(
-        [middles.get(name, np.zeros(3)) for name in part.observations.observed]
-    )
-    points_cam = apply_each(part.measured(state), target_points)
+    points = np.array([middles.get(name, np.zeros(3)) for name in part.observations.observed])
+    points_cam = apply_each(part.measured(state), points)
     distances_m, point_cam = np.linalg.norm(points_cam, axis=1), points_cam.mean(axis=0)
     covariances = {
         name: point_covariance(state.edges[0], edge[:6, :6], point_cam)
@@ -119,7 +114,7 @@ def work_accuracy(
     return WorkAccuracy(
         point_cam,
         np.array([distances_m.min(), distances_m.max()]),
-        {name: 1e3 * _root_trace(covariance) for name, covariance in covariances.items()},
+        {name: _sigma_mm(covariance) for name, covariance in covariances.items()},
         1e3 * radius95(covariances["total"]),
         np.sqrt(np.maximum(values, 0.0)),
     )
@@ -135,47 +130,52 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
 
 def _sources(solved: CellFit) -> Sources:
     """Sources of uncertainty by camera, robot and board; without names for a single pair."""
-    problem, is_pair = solved.inlier_fit.problem, solved.cell.mount is not None
-    of_corners = (
-        () if solved.camera_parameters is None else tuple(solved.camera_parameters.problems)
-    )
-    columns: dict[str, IntArray] = {}
+    problem, optics, mount = solved.inlier_fit.problem, solved.camera_parameters, solved.cell.mount
+    columns = defaultdict[str, list[int]](list)
     for name, column in problem.effect_columns.items():
         if name != LENSES:
-            source = name
-            if is_pair:
-                source = name.partition(" of ")[0]
-                source = source if source in _SOURCES else "clock"
-            columns[source] = np.append(
-                columns.get(source, np.zeros(0, np.int64)), np.arange(column.start, column.stop)
-            )
-    if len(solved.field_columns):
-        columns["lens_field"] = solved.field_columns
-    if is_pair:
-        kind = "instrument" if solved.cell.mount == "instrument" else "pixels"
-        robot = "poses" if problem.is_combined else "robot"
-        sensors = dict.fromkeys(problem.observations.observers, kind)
+            kind = name.partition(" of ")[0]
+            source = name if mount is None else kind if kind in _SOURCES else "clock"
+            columns[source] += range(column.start, column.stop)
+    for name, indices in {"lens_field": solved.field_columns, **_shape_columns(solved)}.items():
+        columns[name if mount is None else name.partition(" ")[0]] += indices.tolist()
+    by_source = {name: np.array(indices) for name, indices in columns.items() if indices}
+    observers = problem.observations.observers
+    if mount is not None:
+        kind, robot = "pixels", "poses" if problem.is_combined else "robot"
+        kind = "instrument" if mount == "instrument" else kind
         return Sources(
-            sensors, dict.fromkeys(problem.robots, robot), columns | _appearance_columns(solved)
+            dict.fromkeys(observers, kind), dict.fromkeys(problem.robots, robot), by_source
         )
     # A sensor that moved remains one sensor.
-    seers = {observer: observer.partition("@")[0] for observer in problem.observations.observers}
+    seers = {observer: observer.partition("@")[0] for observer in observers}
+    of_corners = () if optics is None else optics.problems
     return Sources(
         {
-            key: f"pixels of {frame}" if frame in of_corners else f"readings of {frame}"
+            key: f"{'pixels' if frame in of_corners else 'readings'} of {frame}"
             for key, frame in seers.items()
         },
         {robot: f"robot {robot}" for robot in problem.robots},
-        columns | _appearance_columns(solved),
+        by_source,
     )
+
+
+def _shape_columns(solved: CellFit) -> dict[str, IntArray]:
+    """The problem's columns of the free values of each lens and board."""
+    seen, optics = solved.linearised_corners, solved.camera_parameters
+    if seen is None or optics is None:
+        return {}
+    boards = solved.cell.session.boards
+    slices = {f"intrinsics of {name}": lens for name, lens in optics.lenses.items()}
+    shapes = shape_slices(tuple(boards.values()), optics.boards.start)
+    slices |= {f"board {name}".strip(): at for name, at in zip(boards, shapes, strict=True)}
+    return {name: solved.columns_of(within(seen.free, at)) for name, at in slices.items()}
 
 
 def columns_of_boards(solved: CellFit) -> IntArray:
     """The problem's columns of the free values of boards' shapes."""
-    boards = (
-        columns for name, columns in _appearance_columns(solved).items() if name.startswith("board")
-    )
-    return np.concatenate([np.zeros(0, dtype=np.int64), *boards])
+    columns = (at for name, at in _shape_columns(solved).items() if name.startswith("board"))
+    return np.concatenate([np.zeros(0, dtype=np.int64), *columns])
 
 
 def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
@@ -191,23 +191,3 @@ def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
         jacobian[:, values] = shape_basis(target).mean(axis=0)
         jacobians[frame_name("target", name)] = jacobian[:, free]
     return jacobians
-
-
-def _appearance_columns(solved: CellFit) -> dict[str, IntArray]:
-    """The problem's columns of the free values of each lens and board."""
-    seen, optics = solved.linearised_corners, solved.camera_parameters
-    if seen is None or optics is None:
-        return {}
-    boards, is_pair = solved.cell.session.boards, solved.cell.mount is not None
-    slices = {
-        "intrinsics" if is_pair else f"intrinsics of {name}": lens
-        for name, lens in optics.lenses.items()
-    }
-    if is_pair:
-        slices["board"] = optics.boards
-        boards = {}
-    board_slices = shape_slices(tuple(boards.values()), optics.boards.start)
-    for name, values in zip(boards, board_slices, strict=True):
-        slices[f"board {name}".strip()] = values
-    free = {name: within(seen.free, values) for name, values in slices.items()}
-    return {name: solved.columns_of(indices) for name, indices in free.items() if len(indices)}
