@@ -8,7 +8,8 @@ from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.estimation.chain import FLANGE
 from visioncal.estimation.observability import (
     Direction,
-    check_observability,
+    chain_words,
+    check_determined,
     directions,
     refuse_too_few,
 )
@@ -66,6 +67,8 @@ def solved(problem: Problem, solver: str = "joint") -> Solved:
         state = closed_form_state(problem, solver, start, mount)
         noise = starting_noise(problem)
         fit = Solution(state, estimate_noise(problem, state, noise, from_above=True))
-    check_observability(problem, fit.state, fit.noise, mount)
+    words = chain_words(problem, mount)
+    check_determined(problem, fit.state, fit.noise, words)
     covariance = covariance_of(problem, fit)
-    return Solved(problem, fit, covariance, directions(problem, fit.state, covariance, mount))
+    worst = directions(problem, fit.state, covariance, words.names)
+    return Solved(problem, fit, covariance, tuple(direction for _, direction in worst))

@@ -1,4 +1,4 @@
-"""Identifiability of an arm's errors: by given stops, and by any postures.
+"""Identifiability of an arm's errors: by given stops, and by any postures; in numbers and words.
 
 Jacobians are in units of the noise by rows and of the errors' prior size by columns, and the frames
 at both ends of the chain, without a prior, are projected out. A singular value is then the ratio of
@@ -6,28 +6,35 @@ prior to measurement sigma of a direction: over one, it is determined. Observabi
 the same singular values.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import svd
 
+from visioncal.core.number_format import listed
 from visioncal.core.types import FloatArray
+from visioncal.estimation.parameters import Parameter
+from visioncal.estimation.workspace import turning_range
+from visioncal.robot import Robot, parallel_axes
 
-# Directions whose singular value is below this share of the largest are unidentifiable.
-LEAST_SHARE = 1e-7
-
-
-@dataclass(frozen=True, eq=False)
-class Identifiability:
-    """Identifiable and determined errors of an arm."""
-
-    columns: int  # Number of unknowns: of the frames and of the arm's errors.
-    # Number of them, or of their combinations, that any postures could determine.
-    identifiable: int
-    determined: int  # Number of them that the stops determine better than the prior.
-    values: FloatArray  # (L,) singular values of the determined directions of the arm, descending.
-    # (p, k) the k directions of the arm's errors identifiable but not determined.
-    missing: FloatArray
+# Directions whose singular value is below this share of the largest are unidentifiable; entries of
+# a null direction below the second share of its largest are rounding.
+_LEAST_SHARE, _NOTHING = 1e-7, 1e-6
+# Least share of the largest change for a parameter to be named, and most named.
+_NAMED_SHARE, _MOST_NAMED = 0.5, 3
+# Tried ranges of a joint; of prismatic ones in metres.
+_SPANS_RAD = tuple(np.deg2rad([30.0, 60.0, 120.0, 240.0]).tolist())
+_WORDS = {
+    "theta": "offset",
+    "d": "length d",
+    "a": "length a",
+    "alpha": "twist alpha",
+    "beta": "twist beta",
+    "ratio": "gear ratio",
+    "sine": "eccentricity (sine)",
+    "cosine": "eccentricity (cosine)",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,47 +50,21 @@ class Jacobians:
         Both are exact where the frames have no prior.
         """
         scale = np.linalg.norm(self.frames, axis=0)
-        shown = scale > LEAST_SHARE * scale.max()
+        shown = scale > _LEAST_SHARE * scale.max()
         basis, sizes, _ = np.linalg.svd(self.frames[:, shown] / scale[shown], full_matrices=False)
-        basis = basis[:, sizes > LEAST_SHARE * sizes[0]]
+        basis = basis[:, sizes > _LEAST_SHARE * sizes[0]]
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
 
+    def spectrum(self) -> tuple[int, FloatArray, FloatArray]:
+        """Rank of the frames; singular values (p,) and directions (p, p) of the arm's errors."""
+        rank, free = self.free()
+        padded = np.vstack([free, np.zeros((free.shape[1],) * 2)])
+        return rank, *_singular(np.asarray(np.linalg.qr(padded, mode="r")))[1:]
 
-def identifiability(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
-    """Counts the directions that stops determine, and that postures over the workspace could."""
-    frame_rank, free = anywhere.free()
-    sizes, vectors = right_vectors(free)
-    shown = vectors[sizes > LEAST_SHARE * sizes[0]]
-    frames_determined, values, determined = _determined(stops)
-    # The identifiable space without the determined one; both have orthonormal bases.
-    missing = _singular(shown.T - determined.T @ (determined @ shown.T))[0]
-    return Identifiability(
-        columns=stops.frames.shape[1] + stops.arm.shape[1],
-        identifiable=frame_rank + len(shown) + stops.frames.shape[1] - anywhere.frames.shape[1],
-        determined=frames_determined + len(values),
-        values=values,
-        missing=missing[:, : max(len(shown) - len(values), 0)],
-    )
-
-
-def count_determined(jacobian: Jacobians) -> int:
-    """Number of directions determined better than the prior."""
-    frame_rank, values, _ = _determined(jacobian)
-    return frame_rank + len(values)
-
-
-def _determined(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
-    """Rank of the frames, and singular values and directions (k, p) of determined arm errors."""
-    frame_rank, free = jacobian.free()
-    sizes, vectors = right_vectors(free)
-    return frame_rank, sizes[sizes > 1.0], vectors[sizes > 1.0]
-
-
-def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Singular values (k,) of an (r, k) matrix, including zeros, and (k, k) right vectors."""
-    padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
-    _, sizes, vectors = _singular(np.asarray(np.linalg.qr(padded, mode="r")))
-    return sizes, vectors
+    def count_determined(self) -> int:
+        """Number of directions determined better than the prior."""
+        rank, sizes, _ = self.spectrum()
+        return rank + int(np.sum(sizes > 1.0))
 
 
 def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -91,6 +72,36 @@ def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     # Divide and conquer, which numpy has, does not converge on some of these.
     left, sizes, right = svd(matrix, full_matrices=False, lapack_driver="gesvd")
     return left, sizes, right
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiability:
+    """Identifiable and determined errors of an arm."""
+
+    columns: int  # Number of unknowns: of the frames and of the arm's errors.
+    # Number of them, or of their combinations, that any postures could determine.
+    identifiable: int
+    determined: int  # Number of them that the stops determine better than the prior.
+    values: FloatArray  # (L,) singular values of the determined directions of the arm, descending.
+    # (p, k) the k directions of the arm's errors identifiable but not determined.
+    missing: FloatArray
+
+    @classmethod
+    def of(cls, stops: Jacobians, anywhere: Jacobians) -> "Identifiability":
+        """Counts the directions that stops determine, and that postures anywhere could."""
+        frame_rank, sizes, vectors = anywhere.spectrum()
+        shown = vectors[sizes > _LEAST_SHARE * sizes[0]]
+        frames_determined, values, vectors = stops.spectrum()
+        determined, values = vectors[values > 1.0], values[values > 1.0]
+        # The identifiable space without the determined one; both have orthonormal bases.
+        missing = _singular(shown.T - determined.T @ (determined @ shown.T))[0]
+        return cls(
+            columns=stops.frames.shape[1] + stops.arm.shape[1],
+            identifiable=frame_rank + len(shown) + stops.frames.shape[1] - anywhere.frames.shape[1],
+            determined=frames_determined + len(values),
+            values=values,
+            missing=missing[:, : max(len(shown) - len(values), 0)],
+        )
 
 
 @dataclass(frozen=True)
@@ -116,11 +127,154 @@ class Indices:
     def of(cls, values: FloatArray, stops: int) -> "Indices":
         """Computes the indices from (L,) nonzero singular values, and the number of stops."""
         least, greatest = float(values.min()), float(values.max())
-        mean = float(np.exp(np.mean(np.log(values))))
-        return cls(
-            o1=mean / float(np.sqrt(stops)),
-            o2=least / greatest,
-            o3=least,
-            o4=least**2 / greatest,
-            o5=1.0 / float(np.sum(1.0 / values)),
-        )
+        mean = float(np.exp(np.mean(np.log(values))) / np.sqrt(stops))
+        total = float(np.sum(1.0 / values))
+        return cls(mean, least / greatest, least, least**2 / greatest, 1.0 / total)
+
+
+def null_words(jacobian: Jacobians, named: Sequence[Parameter], robot: Robot) -> Iterator[str]:
+    """Yields what no stops can determine, by Jacobians at postures all over the workspace."""
+    _, sizes, vectors = jacobian.spectrum()
+    directions = _echelon(vectors[sizes <= _LEAST_SHARE * sizes[0]])
+    for rows, involved in _connected(directions):
+        parameters = [named[index] for index in involved]
+        if len(parameters) == 1:
+            moved = jacobian.arm @ directions[rows[0]]
+            frames = np.linalg.lstsq(jacobian.frames, moved, rcond=_LEAST_SHARE)[0]
+            base, tool = np.linalg.norm(frames.reshape(2, 6), axis=1)
+            end = "tool" if tool > base else "base"
+            yield f"{_thing(parameters[0], robot)} cannot be separated from the {end} frame"
+        elif _is_sum(directions[rows][:, involved], parameters):
+            yield f"{_summed(parameters, robot)}: only their sum is determined"
+        else:
+            left = len(parameters) - len(rows)
+            of_them = "one combination" if left == 1 else f"{left} combinations"
+            words = listed([_thing(parameter, robot) for parameter in parameters])
+            yield f"{words}: only {of_them} of them {'is' if left == 1 else 'are'} determined"
+
+
+def _echelon(rows: FloatArray) -> FloatArray:
+    """Reduced row echelon form of (r, k) independent rows, largest pivots first."""
+    rows = rows.copy()
+    for pivot in range(len(rows)):
+        magnitudes = np.abs(rows[pivot:])
+        row, column = divmod(int(np.argmax(magnitudes)), magnitudes.shape[1])
+        rows[[pivot, pivot + row]] = rows[[pivot + row, pivot]]
+        rows[pivot] /= rows[pivot, column]
+        others = np.arange(len(rows)) != pivot
+        rows[others] -= np.outer(rows[others, column], rows[pivot])
+    return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
+
+
+def _connected(directions: FloatArray) -> list[tuple[list[int], list[int]]]:
+    """Groups of rows with parameters in common, and these, in the order of their first ones."""
+    groups: list[tuple[list[int], set[int]]] = []
+    for row, numbers in enumerate(directions):
+        rows, columns = [row], set(np.flatnonzero(numbers).tolist())
+        for group in [group for group in groups if group[1] & columns]:
+            rows, columns = [*group[0], *rows], group[1] | columns
+            groups.remove(group)
+        groups.append((rows, columns))
+    ordered = sorted(groups, key=lambda pair: min(pair[1]))
+    return [(rows, sorted(columns)) for rows, columns in ordered]
+
+
+def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
+    """Whether the null directions preserve the sum alone, of parameters of one kind."""
+    is_one_kind = len({parameter.kind for parameter in named}) == 1
+    is_preserved = np.abs(directions.sum(axis=1)).max() < _NOTHING
+    return is_one_kind and len(directions) == len(named) - 1 and bool(is_preserved)
+
+
+def _summed(named: Sequence[Parameter], robot: Robot) -> str:
+    joints = [parameter.joint for parameter in named]
+    first, *rest = _WORDS[named[0].kind].split(" ")
+    things = " ".join([f"{first}s", *rest])
+    why = " (parallel axes)" if parallel_axes(robot)[joints[0] : joints[-1]].all() else ""
+    return f"the {things} of joints {', '.join(str(joint + 1) for joint in joints)}{why}"
+
+
+def joint_words(joint: int, robot: Robot) -> str:
+    """A joint by its number and its name."""
+    return f"joint {joint + 1} ({robot.joint_names[joint]})"
+
+
+def _thing(parameter: Parameter, robot: Robot) -> str:
+    return f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+
+
+def missing_parameters(
+    by_parameters: Jacobians,
+    by_errors: Jacobians,
+    directions: FloatArray,
+    named: Sequence[Parameter],
+    robot: Robot,
+) -> str:
+    """Names the parameters that change most along (p, n) directions of the arm's errors.
+
+    Both Jacobians, by the table's parameters and by the arm's errors, are at the same postures.
+    """
+    (_, left), (_, right) = by_parameters.free(), by_errors.free()
+    changes = np.linalg.lstsq(left, right @ directions, rcond=_LEAST_SHARE)[0]
+    sizes = np.linalg.norm(changes, axis=1)
+    largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED].tolist()
+    kept = sorted(index for index in largest if sizes[index] >= _NAMED_SHARE * sizes.max())
+    words = [_thing(named[index], robot) for index in kept]
+    return listed([*words, "others"] if len(words) < changes.shape[1] else words)
+
+
+@dataclass(frozen=True)
+class Move:
+    """A joint that has to move over a wider range."""
+
+    joint: int  # Index from 0.
+    moved: float  # Its range over the stops [rad or m].
+    wanted: float  # Sufficient range, all other joints unchanged [rad or m].
+
+
+def joints_to_move(
+    robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], missing: int
+) -> tuple[Move, ...]:
+    """Finds joints whose wider range would determine what is missing.
+
+    A joint is moved evenly over a wider range, in an order independent of the other joints. The
+    joint that determines everything with the least range is chosen; else the best one, and then
+    another.
+
+    Args:
+        robot: The arm.
+        q: (m, n) joint angles of the stops [rad].
+        count: Number of directions that stops at given joint angles determine.
+        missing: Number of further directions to determine.
+
+    Returns:
+        The joints; none where no joint alone would help.
+    """
+    moves: list[Move] = []
+    determined = count(q)
+    wanted = determined + missing
+    while determined < wanted:
+        moved = np.ptp(q, axis=0)
+        tried: dict[Move, int] = {}
+        for span in _SPANS_RAD:
+            for joint in np.flatnonzero(moved < span).tolist():
+                move = Move(joint, float(moved[joint]), span)
+                tried[move] = count(_range_of(robot, q, move))
+            if max(tried.values(), default=0) >= wanted:
+                break
+        # Ties: the least wanted range, then the least present range.
+        ranked = sorted(tried, key=lambda value: (-tried[value], value.wanted, value.moved))
+        if not ranked or tried[ranked[0]] <= determined:
+            break
+        moves.append(ranked[0])
+        q, determined = _range_of(robot, q, ranked[0]), tried[ranked[0]]
+    return tuple(moves)
+
+
+def _range_of(robot: Robot, q: FloatArray, move: Move) -> FloatArray:
+    lower, upper = (limit[move.joint] for limit in turning_range(robot))
+    middle = 0.5 * (q[:, move.joint].min() + q[:, move.joint].max())
+    evenly = np.clip(middle + move.wanted * np.linspace(-0.5, 0.5, len(q)), lower, upper)
+    widened = q.copy()
+    widened[:, move.joint] = evenly[np.random.default_rng(move.joint).permutation(len(q))]
+    return widened

@@ -19,7 +19,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.linalg import covariance_from, spectrum
-from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, axis_words, turn_axis
+from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, Turning
 from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_noise_m, worst_of
 from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.readings import readings_that_close
@@ -33,7 +33,6 @@ _NO_NOISE = Noise.of_robot(0.0, 0.0)
 _NULL_RATIO = 1e-8
 # Largest scatter of careful touches [m]: beyond, the motion alone is not at fault.
 CARELESS_M = 1e-3
-_STILL_RAD = float(np.deg2rad(0.5))
 FEWEST_TOUCHES = 3
 _ADVICE = (
     "Touch the same point 3 or more times with the flange tilted by 20 to 45 degrees about "
@@ -341,20 +340,10 @@ def _motion(used: Touches) -> str:
     poses = tips.base_from_flange
     relative = invert(poses[second[same]]) @ poses[first[same]]
     turns = np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
-    angles = np.linalg.norm(turns, axis=1)
-    largest, count = np.rad2deg(angles.max()), len(tips)
-    if angles.max() < _STILL_RAD:
+    turning, count = Turning.by(turns), len(tips)
+    if turning.is_still:
         return (
             f"the {count} used touches are all from one orientation of the flange (largest "
-            f"rotation between two of them: {figure(largest)} deg)"
+            f"rotation between two of them: {figure(np.rad2deg(turning.largest_rad))} deg)"
         )
-    main, aside, is_lone = turn_axis(turns)
-    if is_lone:
-        return (
-            f"all {count} used touches turn about the flange's {axis_words(main)} to within "
-            f"{figure(max(aside, 0.01))} deg"
-        )
-    return (
-        f"the {count} used touches turn by at most {figure(largest)} deg, and by {figure(aside)} "
-        "deg about a second axis"
-    )
+    return turning.words(poses, f"{count} used touches", "the flange")

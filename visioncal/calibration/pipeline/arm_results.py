@@ -17,8 +17,8 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
+from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State

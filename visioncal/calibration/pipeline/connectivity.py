@@ -11,12 +11,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
-from visioncal.estimation.observability import (
-    FEWEST_VIEWS,
-    motion_words,
-    open_offset,
-    turns_about_two_axes,
-)
+from visioncal.estimation.observability import FEWEST_VIEWS, Turning
 
 
 def refuse_unconnected_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
@@ -87,13 +82,14 @@ def _undetermined(cell: Cell, base: str) -> str:
     stations = _stations(cell, base)
     if len(stations) < 2:
         return ""
-    return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
+    turning = Turning.of(invert(cell.poses[_robot_on(cell, base)][stations]))
+    return turning.open_offset(base, base)
 
 
 def tilting_advice(cell: Cell, base: str) -> str:
     """Advice to tilt a robot that was observed often, but never tilted; empty otherwise."""
     stations, robot = _stations(cell, base), _robot_on(cell, base)
-    if len(stations) < FEWEST_VIEWS or turns_about_two_axes(invert(cell.poses[robot][stations])):
+    if len(stations) < FEWEST_VIEWS or Turning.of(invert(cell.poses[robot][stations])).is_enough:
         return ""
     flange = cell.tree.flanges[robot]
     words = (
@@ -116,7 +112,7 @@ def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
         who = "the robot"
     if len(stations) < 2:
         return f"{who} was observed at {counted(len(stations), 'stop')}"
-    return motion_words(invert(poses), poses, f"{len(stations)} stops of {who}", base)
+    return Turning.of(invert(poses)).words(poses, f"{len(stations)} stops of {who}", base)
 
 
 def _stations(cell: Cell, base: str) -> IntArray:

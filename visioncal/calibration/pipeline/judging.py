@@ -47,8 +47,8 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.observability import (
     CellWords,
     Direction,
+    chain_words,
     check_determined,
-    check_observability,
     directions,
     edge_directions,
     too_little_motion,
@@ -188,7 +188,9 @@ def _pair_accuracy(run: RunState) -> _Parts:
     answer, work, mount = run.assessment, run.accuracy_at_work, run.session.mount
     budget = _in_words(work.budget_mm)
     place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
-    worst = directions(answer.problem, answer.state, answer.covariance, mount)
+    names = chain_words(answer.problem, mount).names
+    found = directions(answer.problem, answer.state, answer.covariance, names)
+    worst = [direction for _, direction in found]
     return worst, [place], [*_measured_pose_findings(run)]
 
 
@@ -408,8 +410,9 @@ def check_answer(run: RunState) -> None:
         else dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
     )
     if run.mount is not None:
-        check_observability(
-            part, fit.state, fit.noise, run.mount, pixel_px, with_first_effect=is_estimated
+        words = chain_words(part, run.mount)
+        check_determined(
+            part, fit.state, fit.noise, words, pixel_px, with_first_effect=is_estimated
         )
         return
     names = {name: _names(part.tree, name) for name in part.unknown}

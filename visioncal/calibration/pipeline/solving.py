@@ -34,7 +34,8 @@ from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.observability import (
-    check_observability,
+    chain_words,
+    check_determined,
     refuse_open_motion,
     too_little_motion,
 )
@@ -100,7 +101,8 @@ def solve(
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.is_misread:
             noise = starting_noise(start.problem)
-            refuse_open_motion(start.problem, start.state, noise, start.cell.mount)
+            words = chain_words(start.problem, start.cell.mount)
+            refuse_open_motion(start.problem, start.state, noise, words)
         raise
     return solved if solver == "joint" else _by_closed_form(solved, solver)
 
@@ -393,7 +395,8 @@ def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, I
         DegenerateError: The geometry of the motion alone does not determine the result.
     """
     start = find_start(cell, observed)
-    check_observability(start.problem, start.state, starting_noise(start.problem), mount)
+    words = chain_words(start.problem, mount)
+    check_determined(start.problem, start.state, starting_noise(start.problem), words)
     return start.cell, initial_inliers(start)[0]
 
 

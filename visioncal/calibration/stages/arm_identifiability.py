@@ -12,19 +12,14 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData, ArmPair
-from visioncal.estimation.excitation_advice import Move, joints_to_move
 from visioncal.estimation.identifiability import (
     Identifiability,
     Indices,
     Jacobians,
-    count_determined,
-    identifiability,
-)
-from visioncal.estimation.null_space import (
-    dominant_words,
-    imitated,
+    Move,
     joint_words,
-    null_of,
+    joints_to_move,
+    missing_parameters,
     null_words,
 )
 from visioncal.estimation.parameters import (
@@ -163,27 +158,27 @@ def identify_arm(arm: ArmData, convention: Convention | None = None) -> ArmIdent
         weight = arm.pair.weight(arm.noise, arm.measured)
         by_errors = _error_jacobians(arm, anywhere, weight)
         by_parameters = _parameter_jacobians(arm, tables, anywhere, weight)
-        counts, null = identifiability(_jacobians_at_stops(arm), by_errors), null_of(by_parameters)
-        missing = None
+        counts = Identifiability.of(_jacobians_at_stops(arm), by_errors)
+        words = [*null_words(by_parameters, tables.parameters, arm.model.nominal)]
+        advice = ""
         if counts.missing.size:
-            missing = _Missing(
-                imitated(by_parameters, by_errors, counts.missing), _moves(arm, counts, weight)
+            named = missing_parameters(
+                by_parameters, by_errors, counts.missing, tables.parameters, arm.model.nominal
             )
+            moves = _moves(arm, counts, weight)
+            words.append(_missing_words(named, moves, arm.model.nominal))
+            advice = _advice(words[-1], moves, counts, arm.model.nominal)
         place = arm.place_jacobian(anywhere)[0]
         sigmas_m, near_sigmas_m = (arm.place_sigmas_m(array) for array in (anywhere, near))
         fitted = (arm.problem, arm.state, arm.noise)
         influence = stop_influence(*fitted, arm.stops, place, arm.chain)
-    nominal = arm.model.nominal
     return ArmIdentifiability(
         convention=tables.before.convention,
         estimates=tuple(_estimates(arm, tables)),
         counts=counts,
         indices=Indices.of(counts.values, len(arm.stops)) if len(counts.values) else None,
-        not_determined=(
-            *null_words(null, tables.parameters, nominal),
-            *([_missing_words(missing, tables.parameters, nominal)] if missing else []),
-        ),
-        advice=_advice(missing, counts, tables.parameters, nominal) if missing else "",
+        not_determined=tuple(words),
+        advice=advice,
         influence=influence,
         places=arm.model.robot.base_from_flange(anywhere)[:, :3, 3],
         sigmas_m=sigmas_m,
@@ -200,14 +195,6 @@ class _Tables:
     after: DHTable
     parameters: tuple[Parameter, ...]
     jacobian: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Missing:
-    """Undetermined combinations (k, n) of table parameters, and the joints to move for them."""
-
-    changes: FloatArray
-    moves: tuple[Move, ...]
 
 
 def _tables(model: ArmModel, convention: Convention | None) -> _Tables:
@@ -261,7 +248,7 @@ def _moves(arm: ArmData, counts: Identifiability, weight: FloatArray) -> tuple[M
     """Joint moves that would determine what is missing, assuming equal noise at all stops."""
 
     def count(q: FloatArray) -> int:
-        return count_determined(_error_jacobians(arm, q, weight))
+        return _error_jacobians(arm, q, weight).count_determined()
 
     return joints_to_move(arm.model.robot, arm.q, count, counts.identifiable - counts.determined)
 
@@ -281,13 +268,12 @@ def _estimates(arm: ArmData, tables: _Tables) -> Iterator[Estimate]:
         )
 
 
-def _missing_words(missing: _Missing, parameters: Sequence[Parameter], robot: Robot) -> str:
-    named = dominant_words(missing.changes, parameters, robot)
-    if not missing.moves:
+def _missing_words(named: str, moves: Sequence[Move], robot: Robot) -> str:
+    if not moves:
         return f"these stops do not determine {named}"
     first, *others = (
         (joint_words(move.joint, robot), _distance_words(move.moved, move.joint, robot))
-        for move in missing.moves
+        for move in moves
     )
     moved = listed(
         [f"{first[0]} moved by {first[1]}", *(f"{name} by {distance}" for name, distance in others)]
@@ -295,19 +281,17 @@ def _missing_words(missing: _Missing, parameters: Sequence[Parameter], robot: Ro
     return f"{moved} only, too little to determine {named}"
 
 
-def _advice(
-    missing: _Missing, counts: Identifiability, parameters: Sequence[Parameter], robot: Robot
-) -> str:
+def _advice(words: str, moves: Sequence[Move], counts: Identifiability, robot: Robot) -> str:
     further = "Add stops in which the arm stands otherwise, all over the workspace."
-    if missing.moves:
+    if moves:
         joints = [
             f"joint {move.joint + 1} by {_distance_words(move.wanted, move.joint, robot)}"
-            for move in missing.moves
+            for move in moves
         ]
         further = f"Add stops that move {listed(joints)} or more."
     return (
         f"The stops determine {counts.determined} of the {counts.identifiable} identifiable values "
-        f"of this arm and its frames: {_missing_words(missing, parameters, robot)}. What is not "
+        f"of this arm and its frames: {words}. What is not "
         f"determined stays about as stated. {further}"
     )
 

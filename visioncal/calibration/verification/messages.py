@@ -24,7 +24,7 @@ from visioncal.core.number_format import counted, figure, listed, mm_and_deg
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
-from visioncal.estimation.null_space import joint_words
+from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
