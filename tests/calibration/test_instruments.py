@@ -15,7 +15,7 @@ import visioncal
 from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
-from visioncal.estimation.positions import Mounting, PositionReadings, fit_mounting
+from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
@@ -293,21 +293,16 @@ def test_motion_that_tells_too_little_is_refused():
         known_of(session_of(shop), solver="tsai")
 
 
-def test_a_mounting_is_found_from_a_rough_start():
+def test_a_mounting_is_found():
     rng = np.random.default_rng(0)
-    flange = exp(rng.normal(size=(8, 6)))
-    mounting = Mounting(exp(rng.normal(size=(1, 6)))[0], rng.normal(size=(2, 3)))
-    points = np.arange(8) % 2
-    on_flange = mounting.on_flange[points][:, :, None]
-    in_base = (flange[:, :3, :3] @ on_flange)[:, :, 0] + flange[:, :3, 3]
-    x = invert(mounting.base_from_instrument)
-    read = in_base @ x[:3, :3].T + x[:3, 3]
-    places = PositionReadings(flange, read, points, np.arange(8) // 2, np.full(8, 1e-4))
-    off = Mounting(
-        mounting.base_from_instrument @ exp(np.full((1, 6), 0.05))[0], 0.8 * mounting.on_flange
-    )
-    found = fit_mounting(places, off, 2)
-    assert found.on_flange == pytest.approx(mounting.on_flange, abs=1e-5)
+    flange, (frame,) = exp(rng.normal(size=(8, 6))), exp(rng.normal(size=(1, 6)))
+    on_flange, points = 0.1 * rng.normal(size=(2, 3)), np.arange(8) % 2
+    in_base = (flange[:, :3, :3] @ on_flange[points][:, :, None])[:, :, 0] + flange[:, :3, 3]
+    read = (in_base - frame[:3, 3]) @ frame[:3, :3]
+    found, errors = find_mounting(mounting_problem(flange, read, points), np.arange(8) // 2)
+    assert found.points == pytest.approx(on_flange, abs=1e-7)
+    assert found.frame == pytest.approx(frame, abs=1e-7)
+    assert np.abs(errors).max() < 1e-7
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from support.parts import away, even, feature_bound, jacobian, placed, some_fram
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.estimation.groups import fit_groups
-from visioncal.estimation.pointfit import FixturePlacement, PointProblem, fit_features
+from visioncal.estimation.pointfit import fit_features, fixture_problem
+from visioncal.estimation.points import Placement
 
 NOISE_M = 1e-4
 ONE_EACH = ("origin", "x", "xy")
@@ -42,7 +43,7 @@ def test_exact_touches_give_the_exact_frame(each):
 def test_derivatives_are_those_of_the_residuals():
     rng = np.random.default_rng(2)
     _, touches = touched(2, ONE_EACH * 2)
-    problem, state = PointProblem(touches), FixturePlacement(some_frame(rng), 1.0)
+    problem, state = fixture_problem(touches), Placement(some_frame(rng))
     found = jacobian(lambda step: problem.linearise(problem.move(state, step)).residuals, 6)
     # Central differences of lengths near a metre are exact to some 1e-9.
     assert np.abs(problem.linearise(state).jacobian - found).max() < 1e-8
@@ -53,8 +54,8 @@ def test_the_error_over_its_sigma_is_distributed_as_it_should_be():
     kinds = ["origin", "x", "xy", "xy", "x", "xy", "origin", "x"]
     for seed in range(240):
         frame, touches = touched(seed, kinds[: 5 + seed % 4])
-        fit = fit_groups(PointProblem(touches))
-        error = away(fit.state.base_from_fixture, frame)
+        fit = fit_groups(fixture_problem(touches))
+        error = away(fit.state.frame, frame)
         square = error @ np.linalg.solve(fit.covariance, error) / 6
         shares.append(f_distribution.cdf(square, 6, fit.freedom))
     # With even noise of unknown level it is F, exactly but for the curvature of turns by 0.1 deg.
@@ -133,10 +134,10 @@ def test_a_touch_that_tells_no_direction_does_no_harm():
     # A few times 0.1 mm over 0.2 m.
     assert np.abs(away(frame, found.base_from_fixture)).max() < 3e-3
     points[3] = points[0]
-    guesses = list(PointProblem(replace(touches, measured=points)).guesses())
+    guesses = list(fixture_problem(replace(touches, measured=points)).guesses())
     # Of 2 x 2 x 2 sets of three touches two are on one line, and the means make one more start.
     assert len(guesses) == 7
-    turns = [guess.base_from_fixture[:3, :3] for guess in guesses]
+    turns = [guess.frame[:3, :3] for guess in guesses]
     assert all(np.allclose(turn @ turn.T, np.eye(3)) for turn in turns)
 
 

@@ -22,10 +22,9 @@ from support.touched import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.pivot import fit_pivot, readings_that_close, tool_problem
+from visioncal.estimation.points import Placement
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.readings import readings_that_close
-from visioncal.estimation.touching import TouchProblem, TouchUnknowns
 
 ROBOT = Noise.of_robot(5e-5, 3e-5)
 WAY = np.array([0.48, -0.6, 0.64])
@@ -65,8 +64,8 @@ def test_three_touches_that_agree_by_chance_are_not_believed():
 def test_derivatives_are_those_of_the_residuals(oriented):
     # Where the touches close: elsewhere the derivatives leave out what noise would add.
     made = touched(Job(tips=3, points=2, axes=2, contact_m=0.0), 2)
-    problem = TouchProblem(made.touches, ROBOT, oriented)
-    state = TouchUnknowns(compose(TURN.as_matrix(), TIP), POINTS[:2])
+    problem = tool_problem(made.touches, ROBOT, oriented=oriented)
+    state = Placement(compose(TURN.as_matrix(), TIP), POINTS[:2])
     jacobian = problem.linearise(state).jacobian
     for at, step in enumerate(1e-6 * np.eye(jacobian.shape[2])):
         ahead, behind = (
@@ -78,9 +77,9 @@ def test_derivatives_are_those_of_the_residuals(oriented):
 
 def test_the_gradient_is_exact_far_from_closing_too():
     made = touched(Job(tips=3, points=2, axes=2), 2)
-    problem = TouchProblem(made.touches, EXACT, oriented=True)
+    problem = tool_problem(made.touches, EXACT, oriented=True)
     twist = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.01])
-    state = TouchUnknowns(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
+    state = Placement(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
 
     def cost(step):
         return np.sum(problem.linearise(problem.move(state, step)).residuals ** 2) / 2
@@ -94,9 +93,9 @@ def test_the_gradient_is_exact_far_from_closing_too():
 
 def test_the_robots_noise_is_carried_to_the_touched_point():
     made = touched(Job(tips=1, axes=1), 3)
-    problem = TouchProblem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
+    problem = tool_problem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
     tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
-    known = problem.linearise(TouchUnknowns(tool, POINTS[:1])).known
+    known = problem.linearise(Placement(tool, POINTS[:1])).known
     for at, flange in enumerate(made.touches.base_from_flange):
         jacobian = [
             (invert(flange @ exp(step) @ tool) - invert(flange @ exp(-step) @ tool)) @ point / 2e-5

@@ -21,7 +21,8 @@ from support.parts import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.estimation.groups import fit_groups
-from visioncal.estimation.pointfit import FixturePlacement, PointProblem, fit_points
+from visioncal.estimation.pointfit import fit_points, fixture_problem
+from visioncal.estimation.points import Placement
 from visioncal.estimation.procrustes import align
 
 NOISE_M = 1e-4
@@ -49,8 +50,10 @@ def test_exact_points_give_the_exact_frame(count):
 @pytest.mark.parametrize("scaled", [False, True])
 def test_derivatives_are_those_of_the_residuals(scaled):
     rng = np.random.default_rng(2)
-    problem = PointProblem(pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3))), scaled)
-    state = FixturePlacement(some_frame(rng), 1.3 if scaled else 1.0)
+    problem = fixture_problem(
+        pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3))), scaled=scaled
+    )
+    state = Placement(some_frame(rng), scale=1.3 if scaled else 1.0)
     found = jacobian(
         lambda step: problem.linearise(problem.move(state, step)).residuals, 7 if scaled else 6
     )
@@ -62,8 +65,8 @@ def test_the_error_over_its_sigma_is_distributed_as_it_should_be():
     shares = []
     for seed in range(240):
         frame, pairs = measured_part(seed, 3 + seed % 6)
-        fit = fit_groups(PointProblem(pairs))
-        error = away(fit.state.base_from_fixture, frame)
+        fit = fit_groups(fixture_problem(pairs))
+        error = away(fit.state.frame, frame)
         square = error @ np.linalg.solve(fit.covariance, error) / 6
         shares.append(f_distribution.cdf(square, 6, fit.freedom))
     # With even noise of unknown level it is F, exactly but for the curvature of turns by 0.1 deg.
@@ -77,8 +80,8 @@ def test_known_and_unknown_noise_add_up():
         frame, nominal, known = some_frame(rng), some_drawing(rng, 10), uneven(rng, 10)
         noise = noise_of(known + even(10, 2 * NOISE_M), rng)
         pairs = pairs_of(nominal, placed(frame, nominal) + noise, known)
-        fit = fit_groups(PointProblem(pairs))
-        error = away(fit.state.base_from_fixture, frame)
+        fit = fit_groups(fixture_problem(pairs))
+        error = away(fit.state.frame, frame)
         squares.append(error @ np.linalg.solve(fit.covariance, error))
         levels.append(fit.sigma)
     # Of a chi-square with six degrees, a little widened by some twenty residuals' noise level: the
@@ -93,8 +96,8 @@ def test_weights_reach_the_bound():
         rng = np.random.default_rng(seed)
         frame, nominal, known = some_frame(rng), some_drawing(rng, 6), uneven(rng, 6)
         pairs = pairs_of(nominal, placed(frame, nominal) + noise_of(known, rng), known)
-        fit = fit_groups(PointProblem(pairs))
-        errors.append(away(frame, fit.state.base_from_fixture) ** 2)
+        fit = fit_groups(fixture_problem(pairs))
+        errors.append(away(frame, fit.state.frame) ** 2)
         plain.append(away(frame, align(pairs.measured, nominal)) ** 2)
         bounds.append(np.diag(point_bound(frame, nominal, known)))
     share = np.sqrt(np.mean(errors, axis=0) / np.mean(bounds, axis=0))

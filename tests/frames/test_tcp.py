@@ -15,7 +15,6 @@ from support.touched import TIP, Job, error_of, relabelled, slipped, touched
 
 from visioncal.calibration.run import run
 from visioncal.core.transforms import invert
-from visioncal.estimation.readings import readings_that_close
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_calibration
 from visioncal.results import Calibration, FrameFile
@@ -121,17 +120,6 @@ def test_poses_in_other_forms(tmp_path):
     assert "--robot-inverse" in done.out
     assert done.out.startswith("check")
     assert off_mm(found(visioncal("tcp", path, "--robot-inverse", "--json"))) < NEAR_MM
-
-
-def test_inverse_poses_of_touches_along_axes_are_named(tmp_path):
-    """Touches of one point close both ways; those along the axes do not, and seem to be wrong."""
-    touches = touched(Job(axes=3), 0).touches
-    assert readings_that_close(touches) == ()
-    back = replace(touches, base_from_flange=invert(touches.base_from_flange))
-    done = tcp(tmp_path, back)
-    assert done.status == 2
-    assert "Read the other way round, as flange_from_base, the touches close to" in done.said
-    assert "--robot-inverse" in done.said
 
 
 def test_joint_angles_go_through_the_robots_model(tmp_path):

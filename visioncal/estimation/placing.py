@@ -1,10 +1,14 @@
 """Certainty of a placed frame: its worst directions in words, and the noise of a touch."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.estimation.groups import GroupFit, State
+from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 
 # Least noise of any instrument [m]: exact coordinates would otherwise be judged by rounding.
@@ -14,6 +18,8 @@ TOUCH_NOISE_M = 1e-4
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
 _ENOUGH = 6
+# Scaled eigenvalue ratio below which points do not determine a direction.
+_NULL_RATIO = 1e-8
 
 
 def counted_noise_m(fit: GroupFit[State], expected_m: float) -> float:
@@ -72,3 +78,48 @@ def worst_of(
         is_rotation=True,
     )
     return offset, rotation
+
+
+def refuse_poor(
+    label: str,
+    fit: GroupFit[State],
+    worst: Callable[[FloatArray], Sequence[Direction]],
+    cause: Callable[[Direction], tuple[str, str]],
+    culprits: Sequence[str] = (),
+    wild: DataError | None = None,
+) -> None:
+    """Refuses a fit that leaves a direction undetermined.
+
+    Wild disagreement of points is no fault of the geometry: it is judged by a noise of at most the
+    limit, and at least of a micrometre.
+
+    Args:
+        label: The first word of the message.
+        fit: The fit.
+        worst: The worst directions by a covariance (p, p) of the fit's unknowns.
+        cause: Cause and next step for the worst direction.
+        culprits: Further culprits.
+        wild: The error where the noise is beyond the limit, too; None for none of its own.
+
+    Raises:
+        DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
+        DataError: `wild`.
+    """
+    level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
+    information = fit.groups.subset(fit.used).information(level)
+    directions = worst(covariance_from(information))
+    is_null = spectrum(information).ratio < _NULL_RATIO
+    beyond = [direction for direction in directions if direction.sigma > direction.limit]
+    if not beyond and not is_null:
+        return
+    if wild is not None and fit.sigma > SIGMA_LIMIT_M:
+        raise wild
+    poorest = max(directions, key=lambda direction: direction.sigma / direction.limit)
+    first = beyond[0] if beyond else poorest
+    fault = "is not determined at all" if is_null else f"has a predicted sigma of {first.figure}"
+    words, next_step = cause(first)
+    raise DegenerateError(
+        f"{label}: {first.words} {fault}: {words}.",
+        culprits=[*(direction.words for direction in beyond or [first]), *culprits],
+        next_step=next_step,
+    )

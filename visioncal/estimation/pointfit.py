@@ -20,14 +20,14 @@ from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import f_limit, t_chance
-from visioncal.core.transforms import compose, exp, skew
+from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
-from visioncal.estimation.groups import GroupFit, Groups, fit_groups
-from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.numbering import Numbering, find_numbering
-from visioncal.estimation.observability import SIGMA_LIMIT_M, axis_words
-from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, worst_of
+from visioncal.estimation.observability import Direction, axis_words
+from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, refuse_poor, worst_of
+from visioncal.estimation.points import Placement, PointProblem
 from visioncal.estimation.procrustes import (
     align,
     mirrored,
@@ -64,15 +64,7 @@ _IS_FRAME = 0.5
 _BEHIND = 0.1
 # Relative tolerance of a ratio of lengths about that of two units: no part is off by so much.
 _UNIT_TOLERANCE = 0.1
-# Pairs of units (small, large) that are confused.
-_MIXED_UNITS = (
-    ("mm", "m"),
-    ("mm", "inch"),
-    ("mm", "cm"),
-    ("cm", "m"),
-    ("inch", "m"),
-    ("cm", "inch"),
-)
+_UNITS = ("m", "mm", "cm", "inch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,13 +150,8 @@ class PointPairs:
         return float(np.sqrt(np.trace(self.known, axis1=1, axis2=2).mean() / 3.0))
 
 
-def check_pairs(pairs: PointPairs) -> None:
-    """Refuses points that cannot determine a frame.
-
-    Raises:
-        DataError: Fewer than three points, missing numbers, or another unit.
-        DegenerateError: The points are collinear or coincident.
-    """
+def _check_pairs(pairs: PointPairs) -> None:
+    """Refuses points that cannot determine a frame."""
     if len(pairs) < FEWEST_POINTS:
         raise DataError(
             f"fixture: {len(pairs)} measured points with coordinates in the drawing, at least "
@@ -174,8 +161,34 @@ def check_pairs(pairs: PointPairs) -> None:
         )
     _check_finite(pairs, "point")
     for points, whose in ((pairs.nominal, "drawn"), (pairs.measured, "measured")):
-        _check_line(points, whose, pairs.labels)
-    _check_units(pairs)
+        extents, axes = spreads(points)
+        if extents[1] ** 2 > max(_LEAST_RATIO * extents[0] ** 2, LEAST_NOISE_M**2):
+            continue
+        frame = "fixture" if whose == "drawn" else "base"
+        of, words = f" about the {frame}'s {axis_words(axes[0])}", _line_words(points, whose)
+        if extents[0] <= LEAST_NOISE_M:
+            of, words = "", f"the {whose} points are all in one place"
+        raise DegenerateError(
+            f"fixture: the fixture's rotation{of} is not determined at all: {words}.",
+            culprits=list(pairs.labels),
+            next_step="Measure three points that are far apart and not on one line.",
+        )
+    # Typical distances do not depend on the numbering or a few outliers.
+    first, second = np.triu_indices(len(pairs), 1)
+    measured_m, drawn_m = (
+        float(np.median(np.linalg.norm(points[first] - points[second], axis=1)))
+        for points in (pairs.measured, pairs.nominal)
+    )
+    ratio = measured_m / drawn_m
+    for read, meant in product(_UNITS, _UNITS):
+        if read != meant and abs(ratio * UNITS_M[read] / UNITS_M[meant] - 1.0) < _UNIT_TOLERANCE:
+            raise DataError(
+                f"fixture: the measured points are {ratio:.4g} times as far apart as the drawn "
+                f"ones, and should be as far: the measured ones are in {read} and were read as "
+                f"{meant}, or the drawn ones are in {meant} and were read as {read}.",
+                culprits=list(pairs.labels),
+                next_step="Correct the unit of one of the two tables.",
+            )
 
 
 def _check_finite(pairs: PointPairs, thing: str) -> None:
@@ -187,29 +200,27 @@ def _check_finite(pairs: PointPairs, thing: str) -> None:
         )
 
 
-def determines_hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -> bool:
-    """Whether points (n, 3) distinguish a drawing of them (n, 3) from its mirror image.
+def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[float, float, float]:
+    """Squared misfits of a drawing and of its mirror image [m^2], and their ratio's limit.
 
     Coplanar points have no handedness: mirrored they are the same points seen from behind, with the
     frame's z axis reversed.
-
-    Args:
-        measured: In the base [m].
-        nominal: In the fixture's frame [m].
-        noise_m: Stated noise of a coordinate [m].
     """
-    as_drawn, flipped, limit = _hands(measured, nominal, noise_m)
-    return flipped > limit * as_drawn
+    freedom, floor = 3.0 * len(measured) - 6.0, _floor(len(measured), noise_m)
+    return (
+        float(procrustes_residual(measured, nominal)) + floor,
+        float(procrustes_residual(measured, mirrored(nominal))) + floor,
+        float(f_limit(_FALSE_ALARM, freedom, freedom)),
+    )
 
 
-def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
-    """Refuses points that are the mirror image of the drawing, at a stated noise [m].
+def _floor(count: int, noise_m: float) -> float:
+    """Squared misfit [m^2] by noise, added to both sides of a ratio."""
+    return (3.0 * count - 6.0) * max(noise_m, LEAST_NOISE_M) ** 2
 
-    `numbering` is the order in which they fit best.
 
-    Raises:
-        DataError: Mirrored, the points fit significantly better.
-    """
+def _check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
+    """Refuses points that are the mirror image of the drawing, at a stated noise [m]."""
     as_drawn, flipped, limit = _hands(pairs.measured, pairs.nominal, noise_m)
     reordered = float(procrustes_residual(pairs.measured, pairs.drawn[numbering.assignment]))
     if as_drawn <= limit * flipped or flipped > limit * (reordered + _floor(len(pairs), noise_m)):
@@ -229,68 +240,12 @@ def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
     )
 
 
-def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[float, float, float]:
-    """Squared misfits of the drawing and of its mirror image [m^2], and their ratio's limit."""
-    freedom, floor = 3.0 * len(measured) - 6.0, _floor(len(measured), noise_m)
-    return (
-        float(procrustes_residual(measured, nominal)) + floor,
-        float(procrustes_residual(measured, mirrored(nominal))) + floor,
-        float(f_limit(_FALSE_ALARM, freedom, freedom)),
-    )
-
-
-def _floor(count: int, noise_m: float) -> float:
-    """Squared misfit [m^2] by noise, added to both sides of a ratio."""
-    return (3.0 * count - 6.0) * max(noise_m, LEAST_NOISE_M) ** 2
-
-
-def line_words(points: FloatArray, whose: str) -> str:
+def _line_words(points: FloatArray, whose: str) -> str:
     """Words for near collinearity of (n, 3): `the drawn points lie within 0.2 mm of a line`."""
     centred = points - points.mean(axis=0)
     axis = spreads(points)[1][0]
     aside = np.linalg.norm(centred - np.outer(centred @ axis, axis), axis=1).max()
     return f"the {whose} points lie within {figure(1e3 * aside)} mm of a line"
-
-
-def _check_line(points: FloatArray, whose: str, labels: Sequence[str]) -> None:
-    extents, axes = spreads(points)
-    if extents[1] ** 2 > max(_LEAST_RATIO * extents[0] ** 2, LEAST_NOISE_M**2):
-        return
-    if extents[0] <= LEAST_NOISE_M:
-        raise DegenerateError(
-            f"fixture: the fixture's rotation is not determined at all: the {whose} points are all "
-            f"in one place, to within {figure(1e3 * extents[0])} mm.",
-            culprits=list(labels),
-            next_step="Measure three points that are far apart and not on one line.",
-        )
-    frame = "fixture" if whose == "drawn" else "base"
-    raise DegenerateError(
-        f"fixture: the fixture's rotation about the {frame}'s {axis_words(axes[0])} is not "
-        f"determined at all: {line_words(points, whose)}.",
-        culprits=list(labels),
-        next_step="Add a point far from that line.",
-    )
-
-
-def _check_units(pairs: PointPairs) -> None:
-    """Compares typical distances, which do not depend on the numbering or a few outliers."""
-    ratio = _typical_distance(pairs.measured) / _typical_distance(pairs.nominal)
-    for small, large in _MIXED_UNITS:
-        factor = UNITS_M[large] / UNITS_M[small]
-        for read, meant, size in ((small, large, factor), (large, small, 1.0 / factor)):
-            if abs(ratio / size - 1.0) < _UNIT_TOLERANCE:
-                raise DataError(
-                    f"fixture: the measured points are {ratio:.4g} times as far apart as the drawn "
-                    f"ones, and should be as far: the measured ones are in {read} and were read as "
-                    f"{meant}, or the drawn ones are in {meant} and were read as {read}.",
-                    culprits=list(pairs.labels),
-                    next_step="Correct the unit of one of the two tables.",
-                )
-
-
-def _typical_distance(points: FloatArray) -> float:
-    i, j = np.triu_indices(len(points), 1)
-    return float(np.median(np.linalg.norm(points[i] - points[j], axis=1)))
 
 
 @dataclass(frozen=True)
@@ -303,25 +258,17 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
-class FixturePlacement:
-    """Pose of the drawing: (4, 4) `base_from_fixture`, applied after a scale of the drawing."""
-
-    base_from_fixture: FloatArray
-    scale: float
-
-
-@dataclass(frozen=True, eq=False)
 class PointFit:
     """A fixture's frame from n points."""
 
     # The inlier points and their fit, without any scale. Its residuals are measured less stated, in
     # the fixture's frame [m], zero where nothing is stated.
-    agreement: GroupInliers[FixturePlacement]
+    agreement: GroupInliers[Placement]
 
     @property
     def base_from_fixture(self) -> FloatArray:
         """(4, 4) the frame."""
-        return self.agreement.fit.state.base_from_fixture
+        return self.agreement.fit.state.frame
 
     @property
     def covariance(self) -> FloatArray:
@@ -349,50 +296,24 @@ class DrawingFit(PointFit):
     hand_known: bool
 
 
-@dataclass(frozen=True, eq=False)
-class PointProblem:
-    """Fit of a fixture to points, with its scale free or held at one."""
+def fixture_problem(pairs: PointPairs, *, scaled: bool = False) -> PointProblem:
+    """The problem of a fixture, with its scale free or held at one."""
 
-    pairs: PointPairs
-    scaled: bool = False
+    def closed_form(rows: IntArray) -> Placement:
+        measured, nominal = pairs.measured[rows], pairs.nominal[rows]
+        scale = scale_between(measured, nominal) if scaled else 1.0
+        return Placement(align(measured, scale * nominal), scale=scale)
 
-    def guesses(self) -> Iterator[FixturePlacement]:
-        """Closed forms from all points, and from small sets."""
-        if self.pairs.kinds:
-            yield from (FixturePlacement(frame, 1.0) for frame in _feature_frames(self.pairs))
+    def starts(_: PointProblem) -> Iterator[Placement]:
+        if pairs.kinds:
+            yield from map(Placement, _feature_frames(pairs))
             return
-        yield self._closed_form(np.arange(len(self.pairs)))
-        for rows in small_sets(len(self.pairs), FEWEST_POINTS):
-            yield self._closed_form(rows)
+        yield closed_form(np.arange(len(pairs)))
+        yield from map(closed_form, small_sets(len(pairs), FEWEST_POINTS))
 
-    def _closed_form(self, rows: IntArray) -> FixturePlacement:
-        measured, nominal = self.pairs.measured[rows], self.pairs.nominal[rows]
-        scale = scale_between(measured, nominal) if self.scaled else 1.0
-        return FixturePlacement(align(measured, scale * nominal), scale)
-
-    def linearise(self, state: FixturePlacement) -> Groups:
-        """Residuals (n, 3) in the fixture's frame, and their Jacobian by its step and the scale.
-
-        A step (w, v) on the right moves a point `q` of the fixture's frame by `q x w - v`, and one
-        of the scale moves the stated point p by p.
-        """
-        pairs, frame = self.pairs, state.base_from_fixture
-        rotation, stated = frame[:3, :3], pairs.stated
-        local = (pairs.measured - frame[:3, 3]) @ rotation
-        columns = [skew(local), np.tile(-np.eye(3), (len(local), 1, 1))]
-        if self.scaled:
-            columns.append(-pairs.nominal[:, :, None])
-        return Groups(
-            np.where(stated, local - state.scale * pairs.nominal, 0.0),
-            np.where(stated[:, :, None], np.concatenate(columns, axis=2), 0.0),
-            stated,
-            rotation.T @ pairs.known @ rotation,
-        )
-
-    def move(self, state: FixturePlacement, step: FloatArray) -> FixturePlacement:
-        """Takes a (6,) or (7,) step on the right."""
-        scale = state.scale + float(step[6]) if self.scaled else 1.0
-        return FixturePlacement(state.base_from_fixture @ exp(step[:6]), scale)
+    return PointProblem(
+        pairs.nominal, pairs.stated, pairs.known, starts, pairs.measured, scaled=scaled
+    )
 
 
 def _feature_frames(touches: PointPairs) -> Iterator[FloatArray]:
@@ -439,7 +360,7 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     _check_sides(touches)
     if expected_noise_m is None and len(touches) == len(FEATURE_KINDS):
         expected_noise_m = TOUCH_NOISE_M
-    agreement = find_inlier_groups(PointProblem(touches), expected_noise_m)
+    agreement = find_inlier_groups(fixture_problem(touches), expected_noise_m)
     fit = agreement.fit
     off, worst = _off_words(touches, fit)
     wild = DataError(
@@ -447,7 +368,7 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
         culprits=[worst],
         next_step="Check their kinds and touch the worst again.",
     )
-    frame = fit.state.base_from_fixture
+    frame = fit.state.frame
     local = (touches.measured - frame[:3, 3]) @ frame[:3, :3]
     _refuse_poor(
         touches,
@@ -534,10 +455,10 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         DegenerateError: The points are collinear, or nearly so.
     """
     points = pairs.merged()
-    check_pairs(points)
+    _check_pairs(points)
     noise = float(np.hypot(pairs.known_noise_m, expected_noise_m or 0.0))
     numbering = find_numbering(points.measured, points.drawn, noise)
-    check_hand(points, numbering, noise)
+    _check_hand(points, numbering, noise)
     agreement, scale = _fit_inliers(pairs, expected_noise_m)
     _check_numbering(
         points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.mask)}
@@ -551,30 +472,30 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         _cause(pairs, fit),
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
     )
-    hand_known = determines_hand(pairs.measured[agrees], pairs.nominal[agrees], noise)
-    return DrawingFit(agreement, scale, numbering, hand_known)
+    as_drawn, flipped, limit = _hands(pairs.measured[agrees], pairs.nominal[agrees], noise)
+    return DrawingFit(agreement, scale, numbering, flipped > limit * as_drawn)
 
 
 def _fit_inliers(
     pairs: PointPairs, expected_noise_m: float | None
-) -> tuple[GroupInliers[FixturePlacement], Scale]:
+) -> tuple[GroupInliers[Placement], Scale]:
     """Finds the inliers, without rejecting points that only a scale contradicts."""
-    rigid = find_inlier_groups(PointProblem(pairs), expected_noise_m)
+    rigid = find_inlier_groups(fixture_problem(pairs), expected_noise_m)
     if not _is_inlier(rigid).all():
-        scaled = find_inlier_groups(PointProblem(pairs, scaled=True), expected_noise_m)
+        scaled = find_inlier_groups(fixture_problem(pairs, scaled=True), expected_noise_m)
         scale = _scale_of(scaled.fit)
         if scale.differs and _is_inlier(scaled).sum() > _is_inlier(rigid).sum():
-            fit = fit_groups(PointProblem(pairs), scaled.mask)
+            fit = fit_groups(fixture_problem(pairs), scaled.mask)
             # Noise does not explain the fit without the scale.
             return replace(scaled, fit=fit, mask=fit.used, explained=False), scale
-    return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.mask))
+    return rigid, _scale_of(fit_groups(fixture_problem(pairs, scaled=True), rigid.mask))
 
 
-def _is_inlier(agreement: GroupInliers[FixturePlacement]) -> Mask:
+def _is_inlier(agreement: GroupInliers[Placement]) -> Mask:
     return agreement.mask & ~agreement.doubtful
 
 
-def _scale_of(fit: GroupFit[FixturePlacement]) -> Scale:
+def _scale_of(fit: GroupFit[Placement]) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
     chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
     # A negative scale is no drawing of another size: exchanged names fit like that.
@@ -599,7 +520,7 @@ def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[
     )
 
 
-def _no_fit(pairs: PointPairs, fit: GroupFit[FixturePlacement], scale: Scale) -> DataError:
+def _no_fit(pairs: PointPairs, fit: GroupFit[Placement], scale: Scale) -> DataError:
     """Error for points that contradict the drawing too much for any frame."""
     off, worst = _off_words(pairs, fit)
     scaled = pairs.nominal[fit.used] * scale.value
@@ -612,7 +533,7 @@ def _no_fit(pairs: PointPairs, fit: GroupFit[FixturePlacement], scale: Scale) ->
     )
 
 
-def _off_words(pairs: PointPairs, fit: GroupFit[FixturePlacement]) -> tuple[str, str]:
+def _off_words(pairs: PointPairs, fit: GroupFit[Placement]) -> tuple[str, str]:
     """How far points are off, in words, and the name of the farthest."""
     distances = np.linalg.norm(fit.groups.residuals, axis=1)
     rms_mm, worst = 1e3 * np.sqrt(np.mean(distances**2)), int(np.argmax(distances))
@@ -625,42 +546,29 @@ def _off_words(pairs: PointPairs, fit: GroupFit[FixturePlacement]) -> tuple[str,
 
 def _refuse_poor(
     pairs: PointPairs,
-    fit: GroupFit[FixturePlacement],
+    fit: GroupFit[Placement],
     centre: FloatArray,
     wild: DataError,
     cause: str,
     next_step: str,
 ) -> None:
-    """Refuses a fixture whose worst directions are over their limits.
+    """Refuses a fixture whose worst directions, at a (3,) centre in it [m], are over the limits."""
 
-    Wild disagreement of points is no fault of the geometry: it is judged by a noise of at most the
-    limit, and at least of a micrometre; beyond, the error is `wild`. The offset is that of a (3,)
-    centre in the fixture [m].
-    """
-    level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
-    covariance = covariance_from(fit.groups.subset(fit.used).information(level))[:6, :6]
-    worst = worst_of(fit.state.base_from_fixture, covariance, "fixture", "base", centre)
-    beyond = [direction for direction in worst if direction.sigma > direction.limit]
-    if not beyond:
-        return
-    if fit.sigma > SIGMA_LIMIT_M:
-        raise wild
+    def worst(covariance: FloatArray) -> Sequence[Direction]:
+        return worst_of(fit.state.frame, covariance[:6, :6], "fixture", "base", centre)
+
     lost = [name for name, stays in zip(pairs.labels, fit.used, strict=True) if not stays]
     verb = "does" if len(lost) == 1 else "do"
     without = f"without {some_of(lost)}, which {verb} not agree with the others, " if lost else ""
-    raise DegenerateError(
-        f"fixture: {beyond[0].words} has a predicted sigma of {beyond[0].figure}: "
-        f"{without}{cause}.",
-        culprits=[*(direction.words for direction in beyond), *pairs.labels],
-        next_step=next_step,
-    )
+    words = f"{without}{cause}"
+    refuse_poor("fixture", fit, worst, lambda _: (words, next_step), pairs.labels, wild)
 
 
-def _cause(pairs: PointPairs, fit: GroupFit[FixturePlacement]) -> str:
+def _cause(pairs: PointPairs, fit: GroupFit[Placement]) -> str:
     noise = f"at a noise of {figure(1e3 * float(np.hypot(fit.sigma, pairs.known_noise_m)))} mm"
     for points, whose in ((pairs.nominal, "drawn"), (pairs.measured, "measured")):
         extents = spreads(points[fit.used])[0]
         if extents[1] < _SLENDER * extents[0]:
-            return f"{line_words(points[fit.used], whose)}, {noise}"
+            return f"{_line_words(points[fit.used], whose)}, {noise}"
     reach = 1e3 * spreads(pairs.nominal[fit.used])[0][0]
     return f"the points reach {reach:.3g} mm from their centre (rms), {noise}"

@@ -21,12 +21,12 @@ from visioncal.estimation.pointfit import (
     FEATURE_KINDS,
     DrawingFit,
     FeatureKind,
-    FixturePlacement,
     PointFit,
     PointPairs,
     fit_features,
     fit_points,
 )
+from visioncal.estimation.points import Placement
 from visioncal.frames.touches import (
     MeasuredPoints,
     NominalPoints,
@@ -329,7 +329,7 @@ def _fitted(
     measured: MeasuredPoints,
     causes: Sequence[str],
     setting: FitSettings,
-) -> PointsFit[FixturePlacement]:
+) -> PointsFit[Placement]:
     """The fit with the points' common errors in its covariance; `causes` are as in `PointsFit`."""
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     noise = np.hypot(noise_m, pairs.nominal_sigma_m)
@@ -353,7 +353,7 @@ def _fitted(
 
 
 def _fixture_frame(
-    fitted: PointsFit[FixturePlacement],
+    fitted: PointsFit[Placement],
     centre: FloatArray,
     method: str,
     more: Sequence[Finding],
@@ -373,9 +373,7 @@ def _fixture_frame(
     return fitted.frame(method, more, {"worst": worst, **details}, setting)
 
 
-def _redundancy_findings(
-    fitted: PointsFit[FixturePlacement], setting: FitSettings
-) -> Iterator[Finding]:
+def _redundancy_findings(fitted: PointsFit[Placement], setting: FitSettings) -> Iterator[Finding]:
     used = [kind for kind, ok in zip(fitted.kinds, fitted.agrees.tolist(), strict=True) if ok]
     once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
@@ -434,7 +432,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
 def _drawing_findings(
     fit: DrawingFit,
-    fitted: PointsFit[FixturePlacement],
+    fitted: PointsFit[Placement],
     measured: MeasuredPoints,
     pairs: PointPairs,
     used: int,
@@ -478,7 +476,7 @@ def _drawing_findings(
 
 
 def _mirror_findings(
-    fitted: PointsFit[FixturePlacement],
+    fitted: PointsFit[Placement],
     measured: MeasuredPoints,
     pairs: PointPairs,
     seen_from: str,

@@ -11,10 +11,15 @@ from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
-from visioncal.estimation.pivot import PivotFit, fit_pivot
+from visioncal.estimation.pivot import (
+    PivotFit,
+    PoseReading,
+    Touches,
+    TouchKind,
+    fit_pivot,
+    readings_that_close,
+)
 from visioncal.estimation.placing import assumed_words
-from visioncal.estimation.readings import PoseReading, readings_that_close
-from visioncal.estimation.touching import Touches, TouchKind
 from visioncal.frames.fixture import RENAMED, FitSettings, PointsFit, Words
 from visioncal.frames.touches import (
     TouchRows,

@@ -41,7 +41,7 @@ from visioncal.core.transforms import apply, compose, invert, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.positions import PositionReadings, find_mounting
+from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.procrustes import align, spreads
 
 # Distances of views are capped here in a start's score [m].
@@ -57,9 +57,8 @@ _NEAR_M = 0.02
 # Fewest stops at which points are read to determine them and the instrument; fewest points that
 # place an instrument, and their least extent in the second direction [m].
 _FEWEST_STOPS, _FEWEST_POINTS, _SPREAD_M = 4, 3, 0.02
-# Assumed sigma of these starts, and of readings [m].
+# Assumed sigma of these starts [m].
 _ROUGH_M = 1e-2
-_READING_M = 1e-4
 
 # (4, 4) `body_from_frame` by name; and a frame with (t, 4, 4) candidate poses and a sigma [m].
 _Placed: TypeAlias = Mapping[str, FloatArray]
@@ -266,18 +265,14 @@ def mounted_points(growth: Growth) -> Iterator[Relation]:
         if len(np.unique(stops)) < _FEWEST_STOPS:
             continue
         points = np.repeat(np.arange(len(pairs)), [len(pair.rows) for pair in pairs])
-        places = PositionReadings(
-            growth.poses[robot][stops],
-            growth.sighted.candidates.poses[rows, 0, :3, 3],
-            points,
-            np.unique(stops, return_inverse=True)[1],
-            np.full(len(rows), _READING_M),
-        )
-        mounting, residuals = find_mounting(places)
-        no_turns, sigma_m = np.eye(4)[None], float(np.median(residuals)) + _ROUGH_M
+        read = growth.sighted.candidates.poses[rows, 0, :3, 3]
+        problem = mounting_problem(growth.poses[robot][stops], read, points)
+        mounting, errors = find_mounting(problem, np.unique(stops, return_inverse=True)[1])
+        off_m = np.linalg.norm(errors, axis=1)
+        no_turns, sigma_m = np.eye(4)[None], float(np.median(off_m)) + _ROUGH_M
         base = growth.tree.branches[flange].parent
-        yield Relation(base, seer, mounting.base_from_instrument, sigma_m, no_turns)
-        for pair, point in zip(pairs, mounting.on_flange, strict=True):
+        yield Relation(base, seer, mounting.frame, sigma_m, no_turns)
+        for pair, point in zip(pairs, mounting.points, strict=True):
             yield Relation(flange, pair.seen, compose(np.eye(3), point), sigma_m, no_turns)
 
 

@@ -1,7 +1,7 @@
 """Readings of a measuring instrument: positions of points on the flange, or poses of a probe."""
 
 from collections import defaultdict
-from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Self, TypeVar
@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted, did_you_mean, figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
-from visioncal.estimation.positions import Mounting, PositionReadings, find_mounting, residuals
+from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.kinds import (
@@ -70,19 +70,6 @@ class Readings:
 
         probes = None if self.probes is None else kept(self.probes)
         return replace(self, read_m=kept(self.read_m), points=kept(self.points), probes=probes)
-
-    def places(
-        self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
-    ) -> PositionReadings:
-        """The readings of points in some views; the (m,) stops are numbered from 0."""
-        read = np.array([self.read_m[view] for view in views]).reshape(-1, 3)
-        return PositionReadings(
-            np.array([base_from_flange[view] for view in views]).reshape(-1, 4, 4),
-            read,
-            np.array([self.points[view] for view in views], dtype=np.int64),
-            stops,
-            self.instrument.sigmas_m(read),
-        )
 
 
 def read_instrument(session: Session) -> Readings:
@@ -183,10 +170,37 @@ def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection,
         raise nothing_seen(observed)
     stops = np.unique([stop_of[view] for view in views], return_inverse=True)[1]
     _check_stops(readings, stops)
-    places = readings.places(views, poses, stops)
+    problem = mounting_problem(
+        np.array([poses[view] for view in views]),
+        np.array([readings.read_m[view] for view in views]),
+        np.array([readings.points[view] for view in views], dtype=np.int64),
+    )
     with one_blas_thread():
-        mounting, _ = find_mounting(places)
-    return tuple(_exchanged(readings, views, places, mounting))
+        mounting, errors = find_mounting(problem, stops)
+    # An error of the flange's pose moves all points of a stop alike: only their relative positions
+    # count.
+    all_rows = [np.flatnonzero(stops == stop) for stop in range(stops.max() + 1)]
+    rows_of = [rows for rows in all_rows if len(rows) > 1]
+    scatter_m = [_scatter_m(errors[rows]) for rows in rows_of]
+    usual_m = max(float(np.median(scatter_m)) if scatter_m else 0.0, _LEAST_SCATTER_M)
+    rejections = []
+    for rows, before_m in zip(rows_of, scatter_m, strict=True):
+        pairs = combinations(rows.tolist(), 2) if before_m > _EXCHANGED * usual_m else ()
+        for pair in pairs:
+            changed = problem.points.copy()
+            changed[list(pair)] = changed[list(pair[::-1])]
+            restored = replace(problem, points=changed).linearise(mounting).residuals
+            after_m = _scatter_m(restored[rows])
+            if after_m < _USUAL * usual_m:
+                first, second = (readings.names[problem.points[row]] for row in pair)
+                words = (
+                    f"the points {first} and {second} are exchanged at this stop: changed back, "
+                    f"its points agree to {figure(1e3 * after_m)} mm, not {figure(1e3 * before_m)} "
+                    "mm"
+                )
+                rejections += [Rejection(views[row], words) for row in pair]
+                break
+    return tuple(rejections)
 
 
 def _read(view: View) -> FloatArray:
@@ -308,45 +322,6 @@ def _check_stops(readings: Readings, stops: IntArray) -> None:
         next_step="Read at more stops, with the flange turned about different axes; 20 to 30 "
         "calibrate the arm too.",
     )
-
-
-def _exchanged(
-    readings: Readings, views: Sequence[int], places: PositionReadings, mounting: Mounting
-) -> Iterator[Rejection]:
-    """Finds stops at which the names of two points are exchanged."""
-    # An error of the flange's pose moves all points of a stop alike: only their relative positions
-    # count.
-    errors = residuals(places, mounting)
-    stops = [np.flatnonzero(places.stops == stop) for stop in range(places.stops.max() + 1)]
-    rows_of = [rows for rows in stops if len(rows) > 1]
-    if not rows_of:
-        return
-    scatter_m = [_scatter_m(errors[rows]) for rows in rows_of]
-    usual_m = max(float(np.median(scatter_m)), _LEAST_SCATTER_M)
-    for rows, before_m in zip(rows_of, scatter_m, strict=True):
-        if before_m < _EXCHANGED * usual_m:
-            continue
-        for first, second in combinations(rows.tolist(), 2):
-            restored = errors[rows] - _change(places, mounting, rows, first, second)
-            after_m = _scatter_m(restored)
-            if after_m < _USUAL * usual_m:
-                names = [readings.names[places.points[index]] for index in (first, second)]
-                words = (
-                    f"the points {names[0]} and {names[1]} are exchanged at this stop: changed "
-                    f"back, its points agree to {figure(1e3 * after_m)} mm, not "
-                    f"{figure(1e3 * before_m)} mm"
-                )
-                yield from (Rejection(views[index], words) for index in (first, second))
-                break
-
-
-def _change(
-    places: PositionReadings, mounting: Mounting, rows: IntArray, first: int, second: int
-) -> FloatArray:
-    """Change of the residuals (r, 3) of a stop's rows when two rows exchange their points."""
-    before, after = mounting.on_flange[places.points[[first, second]]]
-    sign = (rows == first).astype(float) - (rows == second)
-    return np.asarray(sign[:, None] * (after - before))
 
 
 def _scatter_m(errors: FloatArray) -> float:
