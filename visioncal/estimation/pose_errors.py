@@ -52,7 +52,7 @@ _NO_WEIGHT = 1e-4
 # Fewer stops have hardly more residuals than edges and noise have parameters.
 _FEWEST_STOPS = 6
 # Rows of a session that is one block, and of the blocks of a longer one: the work grows with the
-# square of these. Most stops that tie its blocks by the posture.
+# square of these. Most stops that tie its blocks.
 _ONE_BLOCK, _BLOCK, _MOST_TIES = 200, 96, 16
 # Most columns that represent the errors of all stops; the remainder counts as noise.
 _MOST_COLUMNS = 360
@@ -416,7 +416,7 @@ class _Likelihood:
             return _columns([process], count, np.unique(self.stops), _MOST_TIES)[0]
         # What was before a stop, and is behind it, is independent given a process there.
         first = np.unique([self.stops[block[0]] for block in blocks])
-        return _columns([process], count, first, len(first))[0]
+        return _columns([process], count, first, _MOST_TIES)[0]
 
     def maximised(self, model: _Model) -> _Model:
         """The model with maximum-likelihood sizes, searched from its present ones."""
