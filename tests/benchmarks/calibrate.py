@@ -25,8 +25,7 @@ from results import few, first, wished, write_section
 from support.cells import calibrated
 
 import visioncal
-from visioncal.calibration.pipeline.evidence import view_evidence
-from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of, view_evidence
 from visioncal.calibration.run import Run
 from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session

@@ -7,7 +7,7 @@ import pytest
 from support.cells import calibrated, error_of, known_of, session_of
 from support.marks import slow
 
-from visioncal.calibration.pipeline.evidence import view_evidence
+from visioncal.calibration.pipeline.result import view_evidence
 from visioncal.calibration.run import STAGES
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Camera, Target

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.cells import known_of
 
-from visioncal.calibration.pipeline.evidence import view_evidence
-from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of, view_evidence
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Unpack
 
 from visioncal.calibration.pipeline.assessment import assess_fit
-from visioncal.calibration.pipeline.evidence import view_evidence
 from visioncal.calibration.pipeline.judging import check_answer, findings_of
 from visioncal.calibration.pipeline.reading import (
     check_joint_angles,
@@ -14,7 +13,7 @@ from visioncal.calibration.pipeline.reading import (
     read_cell_inputs,
     read_readings,
 )
-from visioncal.calibration.pipeline.result import result_of
+from visioncal.calibration.pipeline.result import result_of, view_evidence
 from visioncal.calibration.pipeline.run_state import (
     CalibrationOptions,
     RunState,

@@ -19,7 +19,6 @@ from visioncal.calibration.pipeline.fault_messages import (
     movements,
     pose_faults,
     reasons,
-    residuals,
     versions,
 )
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
@@ -187,20 +186,15 @@ def assess_fit(
 
 def _sigmas(solved: CellFit) -> dict[str, dict[str, float]]:
     """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
-    fit, problem = solved.inlier_fit.fit, solved.inlier_fit.problem
+    fit, problem, seen = solved.inlier_fit.fit, solved.inlier_fit.problem, solved.linearised_corners
     results = {
-        robot: {
-            "translation_mm": 1e3 * float(sigma_m),
-            "rotation_deg": float(np.rad2deg(sigma_rad)),
-        }
-        for robot, (sigma_rad, sigma_m) in zip(problem.robots, fit.noise.robots, strict=True)
-    }
-    if solved.linearised_corners is not None:
-        pairs = zip(
-            solved.linearised_corners.camera_parameters.problems,
-            solved.linearised_corners.sigmas_px,
-            strict=True,
+        robot: {"translation_mm": 1e3 * sigma_m, "rotation_deg": float(np.rad2deg(sigma_rad))}
+        for robot, (sigma_rad, sigma_m) in zip(
+            problem.robots, fit.noise.robots.tolist(), strict=True
         )
+    }
+    if seen is not None:
+        pairs = zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True)
         results |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
     sensors = dict.fromkeys(
         (*sensors_of(solved.cell, solved.poses), *(row.seer for row in solved.cell.rows))
@@ -208,6 +202,59 @@ def _sigmas(solved: CellFit) -> dict[str, dict[str, float]]:
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
         results[frame] = {**results.get(frame, {}), "level": level}
     return results
+
+
+@dataclass(frozen=True, eq=False)
+class SeenRows:
+    """Observations that can be compared with a fit, at its lenses and boards."""
+
+    rows: tuple[ObservationRow, ...]  # The n observations.
+    views: tuple[ViewPoses, ...]  # Their poses.
+    problem: Problem  # Their problem, with the unknowns of the fit.
+
+    def residuals(self, solved: CellFit) -> FloatArray:
+        """(n, 3) residuals from what the fit predicts, NaN for none [mm], [deg], [px].
+
+        Those of one camera and one robot are the distances of the target, as each view places it,
+        from its mean over the inliers.
+        """
+        problem, part, state = self.problem, solved.inlier_problem, solved.inlier_fit.fit.state
+        predicted = problem.predicted(state)
+        away_m, away_rad = pose_residuals(problem, state, predicted)
+        if solved.cell.mount is not None:
+            fitted = np.isin(problem.observations.observed, part.observations.observed)
+            mean_m, mean_rad = scatter(problem.subset(fitted), part, state)
+            away_m[fitted] = mean_m
+            away_rad[fitted] = np.where(np.isnan(away_rad[fitted]), np.nan, mean_rad)
+        px = solved.pixels(self.rows, self.views, predicted, state)
+        return np.stack([1e3 * away_m, np.rad2deg(away_rad), px], axis=1)
+
+
+def fitted_rows(solved: CellFit) -> SeenRows:
+    """The observations of a fit, with its outliers."""
+    return SeenRows(solved.cell.rows, solved.poses, solved.inlier_fit.problem)
+
+
+def held_back(solved: CellFit, observed: Observed) -> SeenRows | None:
+    """Held-back observations that can be compared with the fit; None for none."""
+    cell, state, frames = solved.cell, solved.inlier_fit.fit.state, solved.cell.tree.branches.keys()
+    rows = [
+        row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
+    ]
+    if not rows:
+        return None
+    solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
+    views = [observed.poses[row.view] for row in rows]
+    first = _problem(solved, observed, [with_candidate(view, 0, None) for view in views])
+    optics, targets = solved.camera_parameters, targets_of(cell)
+    for at, (row, pose) in enumerate(zip(rows, first.predicted(state), strict=True)):
+        view = choose_nearest(views[at], pose, targets.get(row.seen))
+        if optics is not None and view.corners is not None and row.seer in optics.problems:
+            stack = CornerStack.of({row.view: view.corners}, optics.points)
+            poses = fit_poses(stack, optics.camera(row.seer), view.cam_from_target)
+            view = replace(view, cam_from_target=poses.cam_from_target)
+        views[at] = view
+    return SeenRows(tuple(rows), tuple(views), _problem(solved, observed, views))
 
 
 def _views(
@@ -218,125 +265,46 @@ def _views(
     faults: Sequence[PoseFault],
 ) -> tuple[ViewResult, ...]:
     """Result of each observation, in the order of the session's rows."""
-    rows, used = solved.cell.rows, solved.inlier_fit.used
-    residuals_mm_deg, why = _residuals(solved), reasons(solved, faults)
-    rms_px = solved.reprojection_px(np.arange(len(rows)), solved.inlier_fit.fit.state)
-    left_out_residuals = np.full((len(rows), 3), np.nan)
-    left_out_residuals[used] = np.stack(
+    used, why = solved.inlier_fit.used, reasons(solved, faults)
+    left_out = np.full((len(used), 3), np.nan)
+    left_out[used] = np.stack(
         [1e3 * held_out.residual_m, np.rad2deg(held_out.residual_rad), held_out.rms_px], axis=1
     )
-    results = {}
-    for at, row in enumerate(rows):
-        mm, deg, px = _finite_or_none(np.append(residuals_mm_deg[at], rms_px[at]))
-        corners = solved.poses[at].corners
-        results[row.view] = ViewResult(
-            row.view,
-            bool(used[at]),
-            why.get(row.view, ""),
-            None if corners is None else len(corners.ids),
-            px,
-            mm,
-            deg,
-            row.seer,
-            row.seen,
-            solved.cell.stops[row.station],
-            *_finite_or_none(left_out_residuals[at]),
-        )
-    results |= held_back_results(solved, observed)
-    lost = solved.cell.reasons
-    for observation in cell.session.observations:
-        number = observation.view.number
-        if number not in results and not observation.view.is_of_lens:
-            stop = (
-                cell.stops[observation.station] if observation.station < len(cell.stops) else number
+    results: dict[int, ViewResult] = {}
+    held = held_back(solved, observed)
+    for seen in (fitted_rows(solved), *([] if held is None else [held])):
+        is_held = seen is held
+        for at, (mm, deg, px) in enumerate(map(_finite_or_none, seen.residuals(solved))):
+            row, corners = seen.rows[at], seen.views[at].corners
+            results[row.view] = ViewResult(
+                row.view,
+                not is_held and bool(used[at]),
+                HELD_BACK if is_held else why.get(row.view, ""),
+                None if corners is None else len(corners.ids),
+                px,
+                mm,
+                deg,
+                row.seer,
+                row.seen,
+                solved.cell.stops[row.station],
+                *_finite_or_none(left_out[at] if not is_held else np.full(3, np.nan)),
             )
+    for observation in cell.session.observations:
+        number, station = observation.view.number, observation.station
+        if number not in results and not observation.view.is_of_lens:
             results[number] = ViewResult(
                 number,
                 used=False,
-                reason=lost.get(number, ""),
+                reason=solved.cell.reasons.get(number, ""),
                 seer=observation.seer,
                 seen=observation.seen,
-                stop=stop,
+                stop=cell.stops[station] if station < len(cell.stops) else number,
             )
     return tuple(results[view.number] for view in cell.session.views if view.number in results)
 
 
 def _finite_or_none(figures: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in figures.tolist()]
-
-
-def _residuals(solved: CellFit) -> FloatArray:
-    """(n, 2) residuals of the observations [mm], [deg]."""
-    # Of one camera and one robot it is the distance of the target, as each view places it, from its
-    # mean over the inliers; of a whole cell, from what the rest predicts.
-    if solved.cell.mount is None:
-        return residuals(solved)
-    problem = solved.inlier_fit.problem
-    away_m, away_rad = scatter(problem, solved.inlier_problem, solved.inlier_fit.fit.state)
-    oriented = problem.observations.has_rotation
-    return np.stack([1e3 * away_m, np.where(oriented, np.rad2deg(away_rad), np.nan)], axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """The held-back observations, at the lenses and boards of the fit."""
-
-    rows: tuple[ObservationRow, ...]  # The h observations.
-    views: tuple[ViewPoses, ...]  # Their poses.
-    problem: Problem  # Their problem, with the unknowns of the fit.
-
-
-def held_back(solved: CellFit, observed: Observed) -> Held | None:
-    """Held-back observations that can be compared with the fit; None for none."""
-    cell, state, frames = solved.cell, solved.inlier_fit.fit.state, solved.cell.tree.branches.keys()
-    rows = [
-        row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
-    ]
-    if not rows:
-        return None
-    solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
-    views = [observed.poses[row.view] for row in rows]
-    predicted = _problem(
-        solved, observed, [with_candidate(view, 0, None) for view in views]
-    ).predicted(state)
-    targets = targets_of(cell)
-    views = [
-        choose_nearest(view, pose, targets.get(row.seen))
-        for view, pose, row in zip(views, predicted, rows, strict=True)
-    ]
-    optics = solved.camera_parameters
-    for at, (view, row) in enumerate(zip(views, rows, strict=True)):
-        if optics is not None and view.corners is not None and row.seer in optics.problems:
-            stack, camera = CornerStack.of({view.view: view.corners}, optics.points), row.seer
-            poses = fit_poses(stack, optics.camera(camera), view.cam_from_target).cam_from_target
-            views[at] = replace(view, cam_from_target=poses)
-    return Held(tuple(rows), tuple(views), _problem(solved, observed, views))
-
-
-def held_back_results(solved: CellFit, observed: Observed) -> dict[int, ViewResult]:
-    """Results of the held-back observations, by view: residuals from what the fit predicts."""
-    held = held_back(solved, observed)
-    if held is None:
-        return {}
-    state, problem = solved.inlier_fit.fit.state, held.problem
-    away_m, away_rad = pose_residuals(problem, state)
-    if solved.cell.mount is not None:
-        fitted = set(solved.inlier_problem.observations.observed)
-        is_fitted = np.array([name in fitted for name in problem.observations.observed])
-        from_mean = scatter(problem.subset(is_fitted), solved.inlier_problem, state)
-        away_m[is_fitted] = from_mean[0]
-        away_rad[is_fitted] = np.where(np.isnan(away_rad[is_fitted]), np.nan, from_mean[1])
-    rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
-    figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
-    results = {}
-    for row, view, residual in zip(held.rows, held.views, figures, strict=True):
-        mm, deg, px = _finite_or_none(residual)
-        stop = solved.cell.stops[row.station]
-        count = None if view.corners is None else len(view.corners.ids)
-        results[row.view] = ViewResult(
-            row.view, False, HELD_BACK, count, px, mm, deg, row.seer, row.seen, stop
-        )
-    return results
 
 
 def held_back_by_arm(solved: CellFit, observed: Observed, robot: str) -> tuple[UnseenView, ...]:

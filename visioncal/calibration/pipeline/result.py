@@ -1,4 +1,4 @@
-"""Assembles a Calibration of one camera and robot, or of a whole cell, from a finished run.
+"""Assembles a Calibration of one camera and robot, or of a whole cell, and the views' evidence.
 
 It includes the joint fit, as a later verification of the same cell needs it.
 """
@@ -6,11 +6,11 @@ It includes the joint fit, as a later verification of the same cell needs it.
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from visioncal.calibration.pipeline.assessment import held_back_by_arm
+from visioncal.calibration.pipeline.assessment import fitted_rows, held_back, held_back_by_arm
 from visioncal.calibration.pipeline.cell_fit import within
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
@@ -20,7 +20,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
-from visioncal.calibration.stages.readings import Readings
+from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
@@ -39,6 +39,7 @@ from visioncal.results import (
     ViewResult,
 )
 from visioncal.results.arm import ArmSections
+from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import (
     BoardResult,
     CellDetails,
@@ -56,9 +57,9 @@ from visioncal.results.sections import (
 )
 from visioncal.results.views import rms_of
 from visioncal.robot import Robot
-from visioncal.session import View, frame_name
+from visioncal.session import frame_name
 from visioncal.session.frames import object_name
-from visioncal.vision.targets import target_document
+from visioncal.vision.targets import first_corners, target_document
 
 _T = TypeVar("_T")
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
@@ -78,13 +79,12 @@ def result_of(run: RunState) -> Calibration:
     findings, verdict = run.findings, run.verdict
     if findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
-    session, answer = run.session, run.assessment
-    cell = cell_of(run) if run.mount is None else None
-    names = _edge_names(run) if cell is None else cell_edges(run)
+    session, answer, is_pair = run.session, run.assessment, run.mount is not None
+    names = _edge_names(run)
     size = 6 * len(names)
     was_left_out = np.isfinite(answer.held_out.residual_m).any()
-    method = answer.held_out.method if was_left_out else ""
-    boards, rigs = shapes_of(run)
+    cell = None if is_pair else _cell(run, names)
+    boards, rigs = _shapes(run)
     calibration = Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -96,7 +96,11 @@ def result_of(run: RunState) -> Calibration:
         noise={},
         views=answer.views,
         rms=rms_of(answer.views),
-        validation=Validation.of(method, answer.views, by_pair=True),
+        validation=Validation.of(
+            answer.held_out.method if was_left_out or is_pair else "",
+            answer.views,
+            by_pair=not is_pair,
+        ),
         verdict=verdict,
         boards=boards,
         rigs=rigs,
@@ -104,35 +108,84 @@ def result_of(run: RunState) -> Calibration:
         dense=_dense(run),
         need=need_met(findings.need, findings.judged_picks, whole=cell is not None),
     )
-    return calibration if cell is not None else _complete_pair(calibration, run, names)
-
-
-def _complete_pair(
-    calibration: Calibration, run: RunState, names: Mapping[str, str]
-) -> Calibration:
-    """Completes the calibration of one camera and one robot, which have no names."""
-    # A single target without a name has one section.
-    is_unnamed = not run.session.targets
-    return replace(
-        calibration,
-        solvers=_solvers(run, names),
-        noise=_noise(run),
-        views=_views(run),
-        validation=Validation.of(run.assessment.held_out.method, run.assessment.views),
-        camera=next(iter(cameras_of(run).values()), None),
-        robot=run.robot,
-        clock=next((clocked.clock for clocked in run.clocks.values()), None),
-        instrument=None if run.readings is None else _instrument(run.readings),
-        points=tuple(_points(run)),
-        board=next(iter(calibration.boards.values()), None) if is_unnamed else None,
-        boards={} if is_unnamed else calibration.boards,
-        rig=next(iter(calibration.rigs.values()), None) if is_unnamed else None,
-        rigs={} if is_unnamed else calibration.rigs,
-        uncertainty=_uncertainty(run),
-        means=_means_of(run),
-        joint_fit=_joint_fit_of(run),
-        **vars(_arm(run)),
+    return (
+        replace(calibration, **_sections_of_pair(run, names, boards, rigs))
+        if is_pair
+        else (calibration)
     )
+
+
+def _edge_names(run: RunState) -> dict[str, str]:
+    """The names of the edges by their child frames; of a pair, the camera's first."""
+    answer = run.assessment
+    if run.mount is None:
+        branches = answer.problem.tree.branches
+        return {
+            version.name: f"{branches[key].parent}_from_{version.name}"
+            for key, version in answer.versions.items()
+        }
+    frames, names = answer.problem.unknown, edge_names(run.session.mount)
+    if run.mount == "instrument":
+        # Of the points that an instrument read, the first is the probe.
+        return dict(zip(frames, names, strict=False))
+    parents = [name.partition("_from_")[0] for name in names]
+    return {frame: f"{parents[min(at, 1)]}_from_{frame}" for at, frame in enumerate(frames)}
+
+
+def _sections_of_pair(
+    run: RunState,
+    names: Mapping[str, str],
+    boards: Mapping[str, BoardResult],
+    rigs: Mapping[str, RigResult],
+) -> dict[str, Any]:
+    """The sections of one camera and one robot, which have no names."""
+    session, answer, readings, arm = run.session, run.assessment, run.readings, run.robot_arm
+    solutions = compare_solvers(answer.problem, answer.state, session.mount, run.solver)
+    sections = _arm_sections(run, arm.robot)
+    if sections.arm is not None and arm.model is not None:
+        views = held_back_by_arm(run.cell_fit, run, arm.robot)
+        sections = replace(sections, arm=replace(sections.arm, holdout=views))
+    used = [view.numbers for view in session.views if view.number in run.used]
+    # A single target without a name has one section.
+    is_unnamed = not session.targets
+    return {
+        "solvers": {
+            name: SolverResult(
+                dict(zip(names.values(), solution.edges, strict=False)),
+                1e3 * solution.rms_m,
+                None if solution.rms_rad is None else float(np.rad2deg(solution.rms_rad)),
+            )
+            for name, solution in solutions.items()
+        },
+        "noise": _noise(run),
+        "views": _views(run),
+        "camera": next(iter(_cameras(run).values()), None),
+        "robot": run.robot,
+        "clock": next((clocked.clock for clocked in run.clocks.values()), None),
+        "instrument": None
+        if readings is None
+        else InstrumentResult(
+            words=readings.instrument.words,
+            reads="poses" if readings.are_poses else "places",
+            sigma_m=readings.instrument.sigma_m,
+            sigma_per_m=readings.instrument.sigma_per_m,
+            sigma_rad=readings.instrument.sigma_rad if readings.are_poses else None,
+        ),
+        "points": tuple(_points(run)),
+        "board": next(iter(boards.values()), None) if is_unnamed else None,
+        "boards": {} if is_unnamed else boards,
+        "rig": next(iter(rigs.values()), None) if is_unnamed else None,
+        "rigs": {} if is_unnamed else rigs,
+        "uncertainty": _uncertainty(run),
+        # Of those that all used views state.
+        "means": {
+            name: float(np.mean([numbers[name] for numbers in used]))
+            for name in CONDITIONS
+            if used and all(name in numbers for numbers in used)
+        },
+        "joint_fit": _joint_fit(run),
+        **vars(sections),
+    }
 
 
 def _dense(run: RunState) -> DenseResult | None:
@@ -152,64 +205,14 @@ def _dense(run: RunState) -> DenseResult | None:
     )
 
 
-def _edge_names(run: RunState) -> dict[str, str]:
-    """The names of the edges by their child frames, the camera's first."""
-    frames, names = run.assessment.problem.unknown, edge_names(run.session.mount)
-    if run.mount == "instrument":
-        # Of the points that an instrument read, the first is the probe.
-        return dict(zip(frames, names, strict=False))
-    parents = [name.partition("_from_")[0] for name in names]
-    return {frame: f"{parents[min(at, 1)]}_from_{frame}" for at, frame in enumerate(frames)}
-
-
-def _solvers(run: RunState, names: Mapping[str, str]) -> dict[str, SolverResult]:
-    answer, mount = run.assessment, run.session.mount
-    solutions = compare_solvers(answer.problem, answer.state, mount, run.solver)
-    return {
-        name: SolverResult(
-            dict(zip(names.values(), solution.edges, strict=False)),
-            1e3 * solution.rms_m,
-            None if solution.rms_rad is None else float(np.rad2deg(solution.rms_rad)),
-        )
-        for name, solution in solutions.items()
-    }
-
-
 def _views(run: RunState) -> tuple[ViewResult, ...]:
     """Result of each view of the session, in its order."""
     results = {view.view: view.of_pair for view in run.assessment.views}
-    return tuple(
-        results.get(view.number) or ViewResult(view.number, used=False, reason=_reason(run, view))
-        for view in run.session.views
-    )
-
-
-def _reason(run: RunState, row: View) -> str:
-    """Why a row is not an observation of the chain."""
-    if row.is_of_lens:
-        return _OF_LENS
-    return run.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)
-
-
-def _arm(run: RunState) -> ArmSections:
-    """The sections on the only robot's arm, with its residuals at held-back views."""
-    arm = run.robot_arm
-    sections = arm_sections(run, arm.robot)
-    if sections.arm is None or arm.model is None:
-        return sections
-    views = held_back_by_arm(run.cell_fit, run, arm.robot)
-    return replace(sections, arm=replace(sections.arm, holdout=views))
-
-
-def _instrument(readings: Readings) -> InstrumentResult:
-    instrument = readings.instrument
-    return InstrumentResult(
-        words=instrument.words,
-        reads="poses" if readings.are_poses else "places",
-        sigma_m=instrument.sigma_m,
-        sigma_per_m=instrument.sigma_per_m,
-        sigma_rad=instrument.sigma_rad if readings.are_poses else None,
-    )
+    for row in run.session.views:
+        why = run.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)
+        why = _OF_LENS if row.is_of_lens else why
+        results.setdefault(row.number, ViewResult(row.number, used=False, reason=why))
+    return tuple(results[row.number] for row in run.session.views)
 
 
 def _points(run: RunState) -> Iterator[PointResult]:
@@ -231,7 +234,7 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
         distances_m=work.distances_m,
         budget_mm=work.budget_mm,
         radius95_mm=work.radius95_mm,
-        noise_95=_of_robot(run, noise_intervals(run)),
+        noise_95=_of_robot(run, _noise_intervals(run)),
         spectrum=work.spectrum,
         inflation=max(alike, default=1.0),
     )
@@ -240,9 +243,8 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
 def _noise(run: RunState) -> dict[str, float]:
     """Standard deviations per axis, of corners and flange, or of both together without corners."""
     px = [sigmas["pixel_px"] for sigmas in run.assessment.sigmas.values() if "pixel_px" in sigmas]
+    px += [] if px or run.pixel_px is None else [run.pixel_px]
     noise = {"pixel_px": px[-1]} if px else {}
-    if not noise and run.pixel_px is not None:
-        noise["pixel_px"] = run.pixel_px
     if run.readings is not None:
         noise["instrument_mm"] = 1e3 * run.readings.sigma_m
         if run.readings.are_poses:
@@ -257,7 +259,26 @@ def _of_robot(run: RunState, levels: Mapping[str, Mapping[str, _T]]) -> dict[str
     return {f"{of}_{name}": level for name, level in levels[problem.robots[0]].items()}
 
 
-def _joint_fit_of(run: RunState) -> JointFit | None:
+def _noise_intervals(run: RunState) -> dict[str, Intervals]:
+    """95 % intervals of the robots' noise levels, by robot and by name."""
+
+    def bounds(interval: FloatArray) -> tuple[float, float]:
+        low, high = interval.tolist()
+        return low, high
+
+    answer = run.assessment
+    return {
+        robot: {
+            "translation_mm": bounds(1e3 * interval_m),
+            "rotation_deg": bounds(np.rad2deg(interval_rad)),
+        }
+        for robot, (interval_rad, interval_m) in zip(
+            answer.problem.robots, answer.intervals, strict=True
+        )
+    }
+
+
+def _joint_fit(run: RunState) -> JointFit | None:
     """The unknowns of the fit with their covariance; None for a calibration by an instrument."""
     if run.mount == "instrument":
         return None
@@ -269,18 +290,8 @@ def _joint_fit_of(run: RunState) -> JointFit | None:
         boards=tuple(names) or ("",),
         looks=() if seen is None else tuple(seen.free.tolist()),
         arm=_fitted_arm(run, run.robot_arm),
-        covariance=_covariance(run),
+        covariance=_written_covariance(run),
     )
-
-
-def _means_of(run: RunState) -> dict[str, float]:
-    """The means of `CONDITIONS` over the used views, of those that all used views state."""
-    views = [view for view in run.session.views if view.number in run.used]
-    return {
-        name: float(np.mean([view.numbers[name] for view in views]))
-        for name in CONDITIONS
-        if views and all(name in view.numbers for view in views)
-    }
 
 
 def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
@@ -296,10 +307,9 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values)
-    # Errors that are not part of its geometry depend on the loads of a stop.
-    loaded = bool(model.values_by_stop.any())
-    # Functions of the joints are part of the geometry.
-    kept = model.is_kept
+    # Errors that are not part of its geometry, as functions of the joints are, depend on the loads
+    # of a stop.
+    loaded, kept = bool(model.values_by_stop.any()), model.is_kept
     functions = model.functions if loaded else None
     return FittedArm(
         of="model",
@@ -313,53 +323,50 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _covariance(run: RunState) -> FloatArray:
-    """Covariance of the written unknowns, and of the arm's errors that are not estimated."""
-    answer, arm, written = run.assessment, run.robot_arm, _written_jacobian(run)
-    own = written @ answer.covariance @ written.T
+def _written_covariance(run: RunState) -> FloatArray:
+    """Covariance of the unknowns as they are written, and of the arm's that are not estimated."""
+    # Further boards are written relative to the first; clocks and drift are left out.
+    answer, arm, seen = run.assessment, run.robot_arm, run.cell_fit.linearised_corners
+    problem, boards, rows = answer.problem, answer.state.edges[1:], np.eye(answer.problem.size)
+    # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
+    further = [
+        rows[6:12] - adjoint(invert(boards[0]) @ boards[at]) @ rows[6 * at + 6 : 6 * at + 12]
+        for at in range(1, len(boards))
+    ]
+    of_errors = rows[problem.effect_columns.get(f"arm of {arm.robot}", slice(0, 0))]
+    of_errors = of_errors if arm.model is None else of_errors[arm.model.is_kept]
+    optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
+    written = np.concatenate([rows[:12], rows[optics], *further, of_errors])
+    own = np.asarray(written @ answer.covariance @ written.T)
     if arm.errors is None or arm.errors.is_estimated or not arm.errors.of_links:
         return own
-    problem, state, noise = answer.problem, answer.state, answer.noise
-    jacobian = written @ misfit_jacobian(problem, state, noise, arm.robot, arm.errors)
+    jacobian = written @ misfit_jacobian(problem, answer.state, answer.noise, arm.robot, arm.errors)
     size, variance = jacobian.shape[1], arm.errors.sigma**2
     # The fit deviates by its Jacobian times the errors; the truth deviates from it the other way.
     cross = -variance * jacobian
     return np.block([[own, cross], [cross.T, variance * np.eye(size)]])
 
 
-def _written_jacobian(run: RunState) -> FloatArray:
-    """(w, p) Jacobian of the unknowns as they are written with respect to those of the fit."""
-    # Further boards are written relative to the first; clocks and drift are left out.
-    problem, rows = run.assessment.problem, np.eye(run.assessment.problem.size)
-    boards = run.assessment.state.edges[1:]
-    # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
-    further = [
-        rows[6:12] - adjoint(invert(boards[0]) @ boards[at]) @ rows[6 * at + 6 : 6 * at + 12]
-        for at in range(1, len(boards))
-    ]
-    nothing, arm = slice(0, 0), f"arm of {run.robot_arm.robot}"
-    errors, seen = problem.effect_columns.get(arm, nothing), run.cell_fit.linearised_corners
-    optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
-    of_errors, model = rows[errors], run.robot_arm.model
-    kept = slice(None) if model is None else model.is_kept
-    return np.concatenate([rows[:12], rows[optics], *further, of_errors[kept]])
-
-
-def cell_of(run: RunState) -> CellResult:
-    """Assembles the sections of a whole cell, by name, when all stages have run."""
+def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
+    """The sections of a whole cell, by name."""
     session, cell, solved, answer = run.session, run.cell, run.cell_fit, run.assessment
-    edges = cell_edges(run)
     kept = {
         name: branch.parent
         for name, branch in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
-    parents = {frame: name.partition("_from_")[0] for frame, name in edges.items()}
+    models = session.robot_documents
+    robots = {
+        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
+        for name in session.robots
+    }
+    for name in solved.arms:
+        robots[name] = RobotResult(robots[name].model, **vars(_arm_sections(run, name)))
     return CellResult(
         reference=cell.reference,
-        tree=kept | parents,
-        cameras={object_name(name, "camera"): lens for name, lens in cameras_of(run).items()},
-        robots=_robots(run),
+        tree=kept | {frame: name.partition("_from_")[0] for frame, name in edges.items()},
+        cameras={object_name(name, "camera"): lens for name, lens in _cameras(run).items()},
+        robots=robots,
         targets={
             name or "target": target_document(plate) for name, plate in session.plates.items()
         },
@@ -370,63 +377,25 @@ def cell_of(run: RunState) -> CellResult:
         ),
         weakest=weakest_link(solved.cell, answer.last_edges),
         details=CellDetails({pair.words: clock for pair, clock in answer.clocks(run).items()}),
-        joint_fit=fit_section(run),
+        joint_fit=_joint_fit_of_cell(run),
         uncertainty=CellUncertainty(
             budget_mm={edges[frame]: mm for frame, mm in answer.budget_mm.items()},
-            noise_95=noise_intervals(run),
+            noise_95=_noise_intervals(run),
         ),
     )
 
 
-def cell_edges(run: RunState) -> dict[str, str]:
-    """The names of a whole cell's edges by their child frames."""
-    branches = run.assessment.problem.tree.branches
-    return {
-        version.name: f"{branches[key].parent}_from_{version.name}"
-        for key, version in run.assessment.versions.items()
-    }
-
-
-def _robots(run: RunState) -> dict[str, RobotResult]:
-    session, solved = run.session, run.cell_fit
-    models = session.robot_documents
-    found = {
-        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
-        for name in session.robots
-    }
-    for name in solved.arms:
-        found[name] = RobotResult(found[name].model, **vars(arm_sections(run, name)))
-    return found
-
-
-def arm_sections(run: RunState, robot: str) -> ArmSections:
+def _arm_sections(run: RunState, robot: str) -> ArmSections:
     """The result's sections on a robot's arm."""
     solved, answer, first = run.cell_fit, run.assessment, dict[int, int]()
     for row in solved.cell.rows:
         first.setdefault(row.station, row.view)
     stops = stops_of(answer.problem, robot)
-    found = answer.arms[robot]
-    return solved.arms[robot].at(stops).result(found, [first[index] for index in stops.tolist()])
+    views = [first[index] for index in stops.tolist()]
+    return solved.arms[robot].at(stops).result(answer.arms[robot], views)
 
 
-def noise_intervals(run: RunState) -> dict[str, Intervals]:
-    """95 % intervals of the robots' noise levels, by robot and by name."""
-    pairs = zip(run.assessment.problem.robots, run.assessment.intervals, strict=True)
-    return {
-        robot: {
-            "translation_mm": _bounds(1e3 * interval_m),
-            "rotation_deg": _bounds(np.rad2deg(interval_rad)),
-        }
-        for robot, (interval_rad, interval_m) in pairs
-    }
-
-
-def _bounds(interval: FloatArray) -> tuple[float, float]:
-    low, high = interval.tolist()
-    return low, high
-
-
-def cameras_of(run: RunState) -> dict[str, CameraResult]:
+def _cameras(run: RunState) -> dict[str, CameraResult]:
     """The cameras by their frames, with their covariance.
 
     A camera's covariance, the edges', and their cross covariance are blocks of one matrix. Stated
@@ -452,58 +421,42 @@ def cameras_of(run: RunState) -> dict[str, CameraResult]:
         lens = optics.lens_of(name)
         free = np.isin(lens, seen.free)
         estimated = scene.estimated or bool(np.isin(lens, seen.moving).any())
-        result = CameraResult(optics.camera(name), estimated)
+        result = CameraResult(
+            optics.camera(name), estimated, field=lens_field_of(solved, name, covariance, edges)
+        )
         if free.any():
             columns = solved.columns_of(lens[free])
             own, cross = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
             own[np.ix_(free, free)] = covariance[np.ix_(columns, columns)]
             cross[free] = covariance[columns, :edges]
-            result = CameraResult(optics.camera(name), estimated, own, cross)
-        cameras[name] = replace(result, field=lens_field_of(solved, name, covariance, edges))
+            result = replace(result, covariance=own, edge_covariance=cross)
+        cameras[name] = result
     return cameras
 
 
-def fit_section(run: RunState) -> CellJointFit:
+def _joint_fit_of_cell(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
-    solved, covariance, edges = (
-        run.cell_fit,
-        run.assessment.covariance,
-        6 * len(run.assessment.edges),
-    )
+    solved, answer = run.cell_fit, run.assessment
     seen, optics = solved.linearised_corners, solved.camera_parameters
-    arms, of_arms = _calibrated_arms(run)
-    if seen is None or optics is None:
-        columns = [*range(edges), *of_arms]
-        return CellJointFit(
-            cameras={}, targets={}, arms=arms, covariance=covariance[np.ix_(columns, columns)]
-        )
-    columns = [*range(edges), *solved.columns_of(seen.free).tolist(), *of_arms]
-    return CellJointFit(
-        cameras={
-            object_name(name, "camera"): _relative_indices(seen.free, at)
-            for name, at in optics.lenses.items()
-        },
-        targets={
-            name: _relative_indices(seen.free, shape) for name, shape in _shape_slices(run).items()
-        },
-        arms=arms,
-        covariance=covariance[np.ix_(columns, columns)],
-    )
-
-
-def _calibrated_arms(run: RunState) -> tuple[dict[str, FittedArm], list[int]]:
-    """The errors of the calibrated arms, by name, and their columns in the fit."""
-    arms, columns = dict[str, FittedArm](), list[int]()
-    effects = run.assessment.problem.effect_columns
-    for robot, arm in run.cell_fit.arms.items():
-        fitted, effect = _fitted_arm(run, arm), effects.get(f"arm of {arm.robot}")
+    columns, arms = [*range(6 * len(answer.edges))], dict[str, FittedArm]()
+    cameras, targets = dict[str, tuple[int, ...]](), dict[str, tuple[int, ...]]()
+    if seen is not None and optics is not None:
+        columns += solved.columns_of(seen.free).tolist()
+        for name, at in optics.lenses.items():
+            cameras[object_name(name, "camera")] = _relative_indices(seen.free, at)
+        for name, shape in _shape_slices(run).items():
+            targets[name] = _relative_indices(seen.free, shape)
+    for robot, arm in solved.arms.items():
+        fitted = _fitted_arm(run, arm)
+        effect = answer.problem.effect_columns.get(f"arm of {arm.robot}")
         if fitted is not None and arm.model is not None and effect is not None:
             arms[robot or "robot"] = fitted
             columns += np.arange(effect.start, effect.stop)[arm.model.is_kept].tolist()
-    return arms, columns
+    covariance = answer.covariance[np.ix_(columns, columns)]
+    return CellJointFit(cameras=cameras, targets=targets, arms=arms, covariance=covariance)
 
 
-def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
+def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
     solved, covariance = run.cell_fit, run.assessment.covariance
     seen, optics = solved.linearised_corners, solved.camera_parameters
@@ -516,13 +469,10 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
         _shape_slices(run).items(), run.session.boards.items(), optics.corners, strict=True
     )
     for (name, shape), (plate, target), corners in shapes:
+        values, sigmas = optics.values[shape], all_sigmas[shape]
+        free = _relative_indices(seen.free, shape)
         if frame_name("target", plate) not in solved.inlier_problem.tree.branches:
             continue
-        values, sigmas, free = (
-            optics.values[shape],
-            all_sigmas[shape],
-            _relative_indices(seen.free, shape),
-        )
         if not target.is_rig:
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
@@ -548,3 +498,38 @@ def _shape_slices(run: RunState) -> dict[str, slice]:
 def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:
     """Those of ascending indices that lie in a slice, relative to its start."""
     return tuple(int(value) for value in within(indices, part) - part.start)
+
+
+def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
+    """Collects the evidence of each view: corners, predictions, poses."""
+    solved, state, boards = run.cell_fit, run.assessment.state, tuple(run.session.boards.values())
+    held, optics, evidence = held_back(solved, run), solved.camera_parameters, dict[int, Any]()
+    for seen in (fitted_rows(solved), *([] if held is None else [held])):
+        poses = zip(seen.problem.measured(state), seen.problem.predicted(state), strict=True)
+        for row, view, (measured, predicted) in zip(seen.rows, seen.views, poses, strict=True):
+            px = None
+            if view.corners is not None and optics is not None and row.seer in optics.problems:
+                points = optics.points[view.corners.ids]
+                px = predict_corners(optics.camera(row.seer), predicted, points)
+            evidence[row.view] = (view.corners, px, measured)
+    observations = {observation.view.number: observation for observation in run.timed.observations}
+    views = []
+    for number in (view.number for view in run.session.views):
+        pose, observation = run.poses.get(number), observations.get(number)
+        corners, px, measured = evidence.get(number) or (
+            run.corners.get(number) if pose is None else pose.corners,
+            None,
+            None if pose is None else pose.cam_from_target[0],
+        )
+        if corners is not None and len(boards) > 1 and len(corners.ids):
+            # From the first of its own board on.
+            starts = first_corners(boards)
+            first = int(starts[starts <= corners.ids[0]][-1])
+            corners = replace(corners, ids=corners.ids - first)
+        flange = run.base_from_flange.get(number)
+        if observation is not None and len(observation.robots) == 1:
+            arm = solved.arms.get(robot_key(next(iter(observation.robots))))
+            if arm is not None and arm.has_pose[observation.station]:
+                flange = np.asarray(arm.poses[observation.station])
+        views.append(ViewEvidence(number, corners, px, flange, measured))
+    return tuple(views)
