@@ -10,8 +10,8 @@ from support.marks import slow
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.finding_kinds import EMPTY_IMAGE
 from visioncal.core.types import Camera
-from visioncal.core.verdict import EMPTY_IMAGE
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, fisheye_camera, simulate, wide_camera
 from visioncal.vision.camera import intrinsics

@@ -11,13 +11,14 @@ from support.sound_findings import SOUND, changed, directions
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.findings import PointAccuracy
-from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.calibration.suspects.judge import judge
+from visioncal.calibration.suspects.judged import PointAccuracy
+from visioncal.core.finding_kinds import EMPTY_IMAGE, GOOD_FOR
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
-from visioncal.core.verdict import EMPTY_IMAGE, GOOD_FOR, Finding, Remedy, remarks
+from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.present.report.content import need_facts

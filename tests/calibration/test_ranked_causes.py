@@ -13,16 +13,16 @@ from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.run import calibrate
-from visioncal.calibration.stages.cause_ranking import (
+from visioncal.calibration.stages.fit_messages import scale_finding
+from visioncal.calibration.stages.need import Picks
+from visioncal.calibration.suspects.judge import judge
+from visioncal.calibration.suspects.judged import PointAccuracy
+from visioncal.calibration.suspects.ranking import (
     MEASURE_BOARD,
     NO_JOINTS,
     REFINE_LENS,
-    with_misread,
+    explained_by,
 )
-from visioncal.calibration.stages.findings import PointAccuracy
-from visioncal.calibration.stages.fit_messages import scale_finding
-from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.need import Picks
 from visioncal.core.codec import read, write
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.types import Need
@@ -237,7 +237,7 @@ def test_every_doubt_has_a_cause_and_a_next_step(changes, causes) -> None:
 
 def test_poses_that_are_misread_explain_the_rest() -> None:
     before = judge(changed(SOUND, warnings=(DRIFT,)))
-    after = with_misread(
+    after = explained_by(
         before, Finding("misread_poses", "The quaternions are w, x, y, z.", READ_AGAIN)
     )
     assert ids(after) == ["misread_poses", "moved_slowly"]
@@ -246,14 +246,15 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
     assert after.reasons[1:] == before.reasons
 
 
-def test_exchanged_rows_that_are_read_so_leave_other_causes_their_steps() -> None:
-    wrong = Finding("wrong_views", "View 9 was left out.", Remedy("Compare view 9."), (9,))
-    before = judge(changed(SOUND, warnings=(EXCHANGED, wrong), stops=8))
-    after = with_misread(before, Finding("misread_poses", "With views exchanged.", READ_AGAIN))
-    steps = {finding.kind: str(finding.do) for finding in after.findings if finding.do}
-    assert steps["exchanged_views"].startswith("Write a copy of the session with these rows")
-    assert steps["few_stops"] == steps["exchanged_views"]
-    assert steps["wrong_views"] == "Compare view 9."
+def test_exchanged_rows_explain_poses_that_are_misread() -> None:
+    before = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
+    after = explained_by(before, Finding("misread_poses", "With views exchanged.", READ_AGAIN))
+    assert after == before
+
+
+def test_a_kind_that_is_in_no_catalogue_is_no_finding() -> None:
+    with pytest.raises(KeyError, match="something_odd"):
+        judge(changed(SOUND, warnings=(Finding("something_odd", "It is odd."),)))
 
 
 def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_explain() -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.sound_findings import SOUND, changed, directions, left_out, views
 
-from visioncal.calibration.stages.findings import Sensor
-from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
+from visioncal.calibration.suspects.judge import judge
+from visioncal.calibration.suspects.judged import Sensor
 from visioncal.core.number_format import figure
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import remarks

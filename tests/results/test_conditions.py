@@ -10,7 +10,7 @@ from support.wrong_arms import WRONG_LINKS
 from visioncal import Calibration
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.suspects.judge import judge
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import controller_form, write_pose
 from visioncal.core.number_format import figure, rounded_up

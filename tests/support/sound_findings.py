@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from visioncal.calibration.stages.findings import (
+from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
     JudgedPair,

@@ -22,7 +22,7 @@ from visioncal.calibration.pipeline.run_state import (
 from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.judge import judge
+from visioncal.calibration.suspects.judge import judge
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import VisioncalError

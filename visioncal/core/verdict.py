@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
+from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, NOTE, Kind
 from visioncal.core.number_format import percent, ranges
 from visioncal.core.summaries import html_card
 
@@ -18,25 +19,8 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 # Number of findings, and of steps, that are shown first; least probability of causes among them,
 # of causes with steps, and of causes that are likely beside the first.
 _SHOWN, _LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
-# Kinds of findings that are not doubts.
-AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
-# The arm was calibrated: what a result is good for depends on how its targets are sent.
-CALIBRATED_ARM = "calibrated_arm"
-# Missing images, images of another size than the camera's, and empty rows: no doubts about the
-# rest, and reported first.
-MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
-NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
-# A part of the image without corners: few robots fill all of a fixed camera's image, and picks are
-# where the views looked.
-EMPTY_IMAGE, REPEATED_READINGS = "empty_image", "repeated_readings"
-# Kinds of a step's warnings that are no doubts about the result.
-NO_DOUBTS = (*NOT_USABLE, EMPTY_IMAGE, REPEATED_READINGS)
-# Kinds with a special rank among causes of at least the last probability.
-EXCHANGED, ARM_ERRORS, UNEXPLAINED, _SURE = "exchanged_views", "arm_errors", "unexplained", 0.99
-# Kinds of findings that state the size of errors, the most important first.
-_SIZES = (NEED, GOOD_FOR, UNEXPLAINED, "optimism", "weak_motion", "place", "workspace")
-
-
+# From this probability on, causes are ranked by their kinds.
+_SURE = 0.99
 # Smaller than any need [mm]: for findings on what is left out of a result, which do not impair it.
 LEAST_NEED_MM = 1e-3
 _HEADLINES = {
@@ -44,14 +28,6 @@ _HEADLINES = {
     "check": "Check before use",
     "bad": "Bad: do not use",
 }
-# Kinds of findings on sources of errors, whose probability is their share.
-SOURCES = (
-    "calibration",
-    "unmeasured_board",
-    "robot_noise",
-    "robot_noise_of_pick",
-    "uncorrected_targets",
-)
 # Commands of remedies.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
@@ -134,6 +110,11 @@ class Finding:
         return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
 
     @property
+    def of_kind(self) -> Kind:
+        """What a verdict makes of it, by its kind."""
+        return KINDS.get(self.kind, Kind(self.kind))
+
+    @property
     def reason(self) -> str:
         """Its text and advice."""
         return self.words if self.do is None else f"{self.words} {self.do}"
@@ -194,7 +175,7 @@ class Verdict:
     @property
     def ordered(self) -> tuple[Finding, ...]:
         """All findings, the most likely cause first."""
-        likeliest = (cause for cause in self.causes[:1] if cause.kind not in SOURCES)
+        likeliest = (cause for cause in self.causes[:1] if not cause.of_kind.is_source)
         distinct = {id(finding): finding for finding in (*likeliest, *self.findings)}
         return tuple(distinct.values())
 
@@ -204,11 +185,8 @@ class Verdict:
         possible = (finding for finding in self.findings if finding.probability)
 
         def order(finding: Finding) -> tuple[float, int, float]:
-            # Among causes that are as good as certain, exchanged rows come first, since they
-            # mislead all other tests; errors of the arm, which always exist, and unexplained errors
-            # come last.
-            rank = {EXCHANGED: -1, ARM_ERRORS: 1, UNEXPLAINED: 1}.get(finding.kind, 0)
-            return -min(finding.probability, _SURE), rank, -finding.probability
+            most = -finding.probability
+            return max(most, -_SURE), finding.of_kind.order, most
 
         return tuple(sorted(possible, key=order))
 
@@ -216,8 +194,9 @@ class Verdict:
     def ranked(self) -> tuple[Finding, ...]:
         """All findings in reading order: the likeliest cause, its effect, then the rest."""
         causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
-        costs = [finding for kind in _SIZES for finding in self.findings if finding.kind == kind]
-        missing = [finding for finding in self.findings if finding.kind in NOT_USABLE]
+        sized = (finding for finding in self.findings if finding.of_kind.size)
+        costs = sorted(sized, key=lambda finding: finding.of_kind.size)
+        missing = [finding for finding in self.findings if finding.of_kind.is_unusable]
         # Behind a likely cause, and not where the result is of no use.
         of_use = [] if self.status == "bad" else self.findings
         to_correct = [finding for finding in of_use if finding.kind == CALIBRATED_ARM]
@@ -238,7 +217,7 @@ class Verdict:
         likely = "" if finding.by_limit else f" ({percent(finding.probability)})"
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
         how = "Most likely" if finding in self.causes[:1] else how
-        is_likely = finding.probability >= _LEAST_LIKELY and finding.kind not in SOURCES
+        is_likely = finding.probability >= _LEAST_LIKELY and not finding.of_kind.is_source
         begin = f"{how}{likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()
 

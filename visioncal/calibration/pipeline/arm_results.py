@@ -7,15 +7,15 @@ import numpy as np
 
 from visioncal.calibration.stages import residual_findings, thermal
 from visioncal.calibration.stages.arms import IdentifiedArm, RobotArm
-from visioncal.calibration.stages.cause_ranking import MOVED_AT_ONCE
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.residual_findings import ResidualTest
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.finding_kinds import NOTE
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import NOTE, Finding, Remedy, remarks
+from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.intervals import expected_levels
@@ -141,7 +141,7 @@ def doubts_of_arms(
     for robot, arm in arms.items():
         findings_of_arm = _findings_on(arm, tests.get(robot), level, cell, joint)
         for finding in (*findings_of_arm, *results[robot].doubts()):
-            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_robot_name(arms, robot))
+            yield finding if finding.of_kind.is_step else finding.of(_robot_name(arms, robot))
 
 
 def notes_on_arms(

@@ -15,20 +15,21 @@ from visioncal.calibration.pipeline.misread_poses import (
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
-from visioncal.calibration.stages.cause_ranking import LEAST_RUN
 from visioncal.calibration.stages.cell import Cell, read_cell
 from visioncal.calibration.stages.image_checks import unnamed_images, unseen_cause
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, by_reason
+from visioncal.calibration.suspects.ranking import LEAST_RUN
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
+from visioncal.core.finding_kinds import MISSING
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.summaries import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress
-from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_paths
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
 from visioncal.session import Session
 from visioncal.vision.boards import kind_of
 from visioncal.vision.boards.board import hidden_corners

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.findings import StandingTie
 from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import FEWEST_VIEWS, Turning
 
 
@@ -126,7 +126,7 @@ def _stations(cell: Cell, base: str) -> IntArray:
     return np.array(sorted(stations), dtype=np.int64)
 
 
-def sole_static_view(cell: Cell, frame: str) -> StandingTie | None:
+def sole_static_view(cell: Cell, frame: str) -> Finding | None:
     """The view of a fixed board by a fixed camera that alone connects a frame to the rest.
 
     It counts as one view, however often it is repeated. None where other views connect the frame.
@@ -144,10 +144,11 @@ def sole_static_view(cell: Cell, frame: str) -> StandingTie | None:
     if frame in connected or len(pairs) != 1 or not flange:
         return None
     ((camera, board),) = pairs
-    return StandingTie(
+    return Finding(
+        "untied",
         f"{camera} sees {board} from one place alone, and that is one view however often it is "
         "repeated",
-        f"Let {camera} see a board on {flange} at 5 stops or more, too.",
+        Remedy(f"Let {camera} see a board on {flange} at 5 stops or more, too."),
     )
 
 

@@ -13,8 +13,8 @@ from visioncal.calibration.pipeline.misread_poses import (
     turned_boards,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cause_ranking import with_misread, with_other_board
 from visioncal.calibration.stages.image_checks import because, unseen_cause
+from visioncal.calibration.suspects.ranking import explained_by
 from visioncal.core.errors import VisioncalError
 from visioncal.core.verdict import Finding
 
@@ -85,14 +85,14 @@ def with_likely_causes(state: RunState, sought: Misreading | None) -> RunState:
         if hint is None and state.mount is not None:
             hint = misread_pose_finding(sought.located)
         if hint is not None:
-            state = replace(state, verdict=with_misread(state.verdict, hint))
+            state = replace(state, verdict=explained_by(state.verdict, hint))
     verdict = state.verdict
     if verdict is None or all(finding.kind != "lost_views" for finding in verdict.findings):
         return state
     cause = unseen_cause(state)
     if cause is None or cause.kind != "other_board":
         return state
-    return replace(state, verdict=with_other_board(verdict, cause))
+    return replace(state, verdict=explained_by(verdict, cause))
 
 
 def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...]:

@@ -8,22 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
-from visioncal.calibration.stages.cause_ranking import run_evidence
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import pose_residuals
+from visioncal.calibration.suspects.ranking import run_evidence
+from visioncal.core.finding_kinds import EXCHANGED
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import (
-    CALIBRATE,
-    EXCHANGED,
-    Finding,
-    Remedy,
-    exchanging,
-    look_at,
-    or_alone,
-)
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, look_at, or_alone
 from visioncal.estimation.moves import common_change
 from visioncal.estimation.slight_steps import common_size
 from visioncal.results import Moved

@@ -20,26 +20,26 @@ from visioncal.calibration.pipeline.connectivity import (
 from visioncal.calibration.pipeline.fault_messages import moved_finding
 from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale, measured_turns
-from visioncal.calibration.stages.findings import (
+from visioncal.calibration.stages.need import PickInputs, predict_picks
+from visioncal.calibration.stages.priors import prior_findings
+from visioncal.calibration.stages.random_effects import random_effect_findings
+from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
     JudgedPair,
     PointAccuracy,
     Sensor,
-    StandingTie,
 )
-from visioncal.calibration.stages.need import PickInputs, predict_picks
-from visioncal.calibration.stages.priors import prior_findings
-from visioncal.calibration.stages.random_effects import random_effect_findings
+from visioncal.calibration.suspects.ranking import is_of_chain
 from visioncal.core.conventions import controller_form
+from visioncal.core.finding_kinds import MOVED_FRAME, NOTE
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Rejection
-from visioncal.core.verdict import NOTE, Finding, Remedy
+from visioncal.core.types import Rejection
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
@@ -64,38 +64,31 @@ def findings_of(run: RunState) -> Findings:
     frames = solved.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    worst, places, warnings = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
-    doubts = doubts_of_arms(
+    worst, places, of_cell = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
+    of_arms = doubts_of_arms(
         solved.arms, answer.residual_tests, answer.arms, solved.level, solved.cell
     )
-    of_arms = [_with_alternative(doubt, run) for doubt in doubts]
-    if any(warning.kind == "measured_turns" for warning in warnings):
-        # These errors come from the camera's poses and appear to depend on the arm's posture; joint
-        # angles would not help.
-        of_arms = [arm for arm in of_arms if arm.do is not NO_JOINTS]
+    found = [*(_with_alternative(doubt, run) for doubt in of_arms), *lens_findings(answer.lenses)]
     of_rest = [
         *prior_findings(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.camera_findings(answer.covariance),
         *random_effect_findings(solved.inlier_problem, solved.inlier_fit.fit, answer.covariance),
     ]
-    of_lenses = [*lens_findings(answer.lenses)]
-    doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}
-    if doubted & OF_CHAIN or not solved.inlier_fit.used.all():
-        of_lenses += lens_changes(solved)
+    if any(map(is_of_chain, (*found, *of_rest))) or not solved.inlier_fit.used.all():
+        found += lens_changes(solved)
     is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
-        _sensors(connected, answer.sigmas, solved.residual_px, run),
+        _sensors(connected, run),
         _arms(answer),
         worst,
         places,
         (
             *(fault.found for fault in answer.faults),
-            *of_arms,
-            *of_lenses,
+            *found,
             *run.warnings,
             *(finding for finding in of_rest if finding.kind != NOTE),
-            *warnings,
+            *of_cell,
             *_unconnected(run),
         ),
         (
@@ -107,7 +100,7 @@ def findings_of(run: RunState) -> Findings:
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         predict_picks(_pick_inputs(run), run.session.need),
-        None if run.mount else _sole_static_view(solved.cell, answer.last_edges),
+        None if run.mount else _tie(solved.cell, answer.last_edges),
         run.session.corrects_targets,
         _use(run),
     )
@@ -116,19 +109,18 @@ def findings_of(run: RunState) -> Findings:
 def _use(run: RunState) -> Remedy:
     """How a good result is used: in the robot's own program, or to locate things by it."""
     form = None if run.robot is None else controller_form(run.robot.name)
+    words, command = "Locate things by the camera", "locate SESSION -c OUT"
     if run.mount is None:
         words, command = "Take the frames to another program", "export OUT --to ros --edge all"
     elif form is not None:
         words, command = "Take the transform to the robot", f"export OUT --to {form.name}"
     elif run.mount == "instrument":
         words, command = "Take the transform to another program", "export OUT --to text"
-    else:
-        words, command = "Locate things by the camera", "locate SESSION -c OUT"
     again = "visioncal verify compares later stops with it."
     return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")
 
 
-def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
+def _tie(cell: Cell, edges: Mapping[str, Edge]) -> Finding | None:
     """The static view that alone links the worst frame to the rest, if any."""
     worst = {
         frame: max(value.sigma / value.limit for value in _directions(cell, frame, edge))
@@ -139,13 +131,12 @@ def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | No
 
 def _with_alternative(finding: Finding, run: RunState) -> Finding:
     """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
-    steps = [
-        test.step for test in run.assessment.residual_tests.values() if isinstance(test.step, Move)
-    ]
-    if finding.kind != MOVED_FRAME or run.mount is None or not steps:
+    steps = (test.step for test in run.assessment.residual_tests.values())
+    moves = [step for step in steps if isinstance(step, Move)]
+    if finding.kind != MOVED_FRAME or run.mount is None or not moves:
         return finding
     tree = run.cell_fit.cell.tree
-    on_flange = tree.body(steps[0].frame) != tree.root
+    on_flange = tree.body(moves[0].frame) != tree.root
     same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
     return replace(finding, words=f"{finding.words} {same} would look the same.")
 
@@ -186,18 +177,18 @@ _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence
 def _pair_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
     answer, work, mount = run.assessment, run.accuracy_at_work, run.session.mount
-    budget = _in_words(work.budget_mm)
-    place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
+    place = _place("Where the views look, a point", work.budget_mm, work.radius95_mm)
     names = chain_words(answer.problem, mount).names
     found = directions(answer.problem, answer.state, answer.covariance, names)
     worst = [direction for _, direction in found]
     return worst, [place], [*_measured_pose_findings(run)]
 
 
-def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
-    """Replaces underscores in the sources' names by spaces, but not in the frames' names."""
+def _place(words: str, budget_mm: Mapping[str, float], radius95_mm: float) -> PointAccuracy:
+    """Accuracy of a point; underscores in the sources' names, but not in frames', become spaces."""
     parts = ((name.partition(" of "), mm) for name, mm in budget_mm.items())
-    return {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
+    in_words = {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
+    return PointAccuracy(words, in_words, radius95_mm)
 
 
 def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
@@ -206,20 +197,19 @@ def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     views = [view for view in run.base_from_flange if view in usable]
     if run.cameras or run.mount == "instrument" or not views:
         return
+    in_hand = run.mount == "eye-in-hand"
     poses = np.array([run.base_from_flange[view] for view in views])
     seen = np.array([run.poses[view].cam_from_target[0] for view in views])
-    parent = poses if run.mount == "eye-in-hand" else invert(poses)
+    parent = poses if in_hand else invert(poses)
     # The camera may have a name.
     (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
-    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
-        yield finding
     target = edge.matrix @ seen
-    in_hand = run.mount == "eye-in-hand"
-    finding = (
-        measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target)
-    )
-    if finding is not None:
-        yield finding
+    for finding in (
+        distance_scale(parent, seen, edge.matrix),
+        measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target),
+    ):
+        if finding is not None:
+            yield finding
 
 
 def _cell_accuracy(run: RunState) -> _Parts:
@@ -231,7 +221,7 @@ def _cell_accuracy(run: RunState) -> _Parts:
     return (
         sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
         [
-            PointAccuracy(frame, _in_words(budget[frame]), 1e3 * radius95(edge.covariance[3:, 3:]))
+            _place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
         [moved_finding(move) for move in answer.moved],
@@ -274,16 +264,16 @@ def _pairs(
         by_pair.setdefault(("", "") if alone else (view.seer, view.seen), []).append(view)
     return [
         JudgedPair(
-            pair_views,
+            mine,
             [
                 Rejection(view.view, view.reason)
-                for view in pair_views
+                for view in mine
                 if _is_outlier(view) and view.view not in explained
             ],
             f"{seer} of {seen}" if len(by_pair) > 1 else "",
-            *_weighted_rms(answer, pair_views),
+            *_weighted_rms(answer, mine),
         )
-        for (seer, seen), pair_views in by_pair.items()
+        for (seer, seen), mine in by_pair.items()
     ]
 
 
@@ -295,26 +285,18 @@ def _weighted_rms(answer: FitAssessment, views: Sequence[ViewResult]) -> tuple[R
     used, held_out, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
     pairs = {(view.seer, view.seen) for view in views}
     of_pairs = np.array([pair in pairs for pair in zip(used.observers, used.observed, strict=True)])
-
-    def rms(block: slice, residuals: FloatArray, doubt: float) -> FloatArray | None:
-        finite = of_pairs & np.isfinite(residuals)
-        if not finite.any():
-            return None
-        noise = np.trace(used.covariance[finite, block, block], axis1=1, axis2=2)
-        weights = (noise + doubt**2) ** -2.0
-        squares = np.stack([noise, residuals[finite] ** 2], axis=1)
-        return np.sqrt(np.average(squares, axis=0, weights=weights))
-
-    rad = rms(slice(3), held_out.residual_rad, float(np.deg2rad(limits.scatter_deg[0])))
-    metres = rms(slice(3, 6), held_out.residual_m, 1e-3 * limits.scatter_mm[0])
-    noise, residual = (
-        Rms(
-            0.0 if metres is None else 1e3 * float(metres[at]),
-            None if rad is None else float(np.rad2deg(rad[at])),
-        )
-        for at in (0, 1)
-    )
-    return noise, residual
+    rms: list[tuple[float, float] | None] = []
+    for axes, residuals, limit in (
+        (slice(3, 6), 1e3 * held_out.residual_m, limits.scatter_mm[0]),
+        (slice(3), np.rad2deg(held_out.residual_rad), limits.scatter_deg[0]),
+    ):
+        finite, unit = of_pairs & np.isfinite(residuals), 1e3 if axes.start else np.rad2deg(1.0)
+        noise = unit**2 * np.trace(used.covariance[finite, axes, axes], axis1=1, axis2=2)
+        squares, weights = np.stack([noise, residuals[finite] ** 2]), (noise + limit**2) ** -2.0
+        means = np.average(squares, axis=1, weights=weights) if finite.any() else None
+        rms.append(None if means is None else (float(means[0] ** 0.5), float(means[1] ** 0.5)))
+    mm, deg = rms[0] or (0.0, 0.0), rms[1] or (None, None)
+    return Rms(mm[0], deg[0]), Rms(mm[1], deg[1])
 
 
 def _is_outlier(view: ViewResult) -> bool:
@@ -322,31 +304,25 @@ def _is_outlier(view: ViewResult) -> bool:
     return not view.used and view.residual_mm is not None and view.reason != HELD_BACK
 
 
-def _sensors(
-    views: Sequence[ViewResult],
-    noise: Mapping[str, Mapping[str, float]],
-    residual_px: Mapping[str, float],
-    run: RunState,
-) -> list[Sensor]:
+def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     seers = dict.fromkeys(view.seer for view in views)
     not_needed = run.spared.keys() | run.held_back
     seen, sensors = run.cell_fit.linearised_corners, []
     for seer in seers:
-        seer_views = [view for view in views if view.seer == seer]
-        unused = (view for view in seer_views if not view.used and view.view not in not_needed)
-        lost = [Rejection(view.view, view.reason) for view in unused]
-        levels = noise.get(seer, {})
+        mine = [view for view in views if view.seer == seer]
+        unused = [view for view in mine if not view.used and view.view not in not_needed]
+        levels, scene = run.assessment.sigmas.get(seer, {}), run.scenes.get(seer)
         sensors.append(
             Sensor(
-                sum(view.used for view in seer_views),
-                lost,
-                [view.view for view in seer_views if _is_outlier(view)],
-                residual_px.get(seer, levels.get("pixel_px")),
-                levels.get("level", 1.0),
-                sum(view.view in run.spared for view in seer_views),
-                seer if len(seers) > 1 else "",
-                seen is not None and seen.holds_lens(seer),
-                seer in run.scenes and run.scenes[seer].matrix_sigma_px is not None,
+                used=sum(view.used for view in mine),
+                lost=[Rejection(view.view, view.reason) for view in unused],
+                outliers=[view.view for view in mine if _is_outlier(view)],
+                pixel_px=run.cell_fit.residual_px.get(seer, levels.get("pixel_px")),
+                level=levels.get("level", 1.0),
+                spared=sum(view.view in run.spared for view in mine),
+                name=seer if len(seers) > 1 else "",
+                holds_lens=seen is not None and seen.holds_lens(seer),
+                has_lens_sigma=scene is not None and scene.matrix_sigma_px is not None,
             )
         )
     return sensors
@@ -357,27 +333,25 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
-        noise, numbers, arm = (
-            answer.sigmas[robot],
-            answer.arms[robot].identifiability,
-            solved.arms[robot],
+        numbers, arm = answer.arms[robot].identifiability, solved.arms[robot]
+        judged = JudgedArm(
+            len(stops_of(problem, robot)),
+            has_posture_errors=arm.errors is not None and arm.errors.is_significant,
+            workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
+            modelled=robot in modelled,
+            by_functions=arm.function_gain > 0.0,
+            can_tilt=arm.can_tilt,
+            name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
-        is_known = not problem.is_combined
-        lower_bounds = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
-        arms.append(
-            JudgedArm(
-                len(stops_of(problem, robot)),
-                noise["translation_mm"] if is_known else None,
-                noise["rotation_deg"] if is_known else None,
-                lower_bounds if is_known else None,
-                has_posture_errors=arm.errors is not None and arm.errors.is_significant,
-                workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
-                modelled=robot in modelled,
-                by_functions=arm.function_gain > 0.0,
-                can_tilt=arm.can_tilt,
-                name=robot if len(problem.robots) > 1 else "",
+        if not problem.is_combined:
+            noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()
+            judged = replace(
+                judged,
+                noise_mm=noise["translation_mm"],
+                noise_deg=noise["rotation_deg"],
+                lower_bounds=(1e3 * least_m, float(np.rad2deg(least_rad))),
             )
-        )
+        arms.append(judged)
     return arms
 
 
@@ -385,8 +359,7 @@ def poor_motion(run: RunState) -> Finding | None:
     """Finding that the motion of one robot is too poor for one camera; None for a whole cell."""
     if run.mount is None or len(run.base_from_flange) < 2:
         return None
-    poses = np.array([*run.base_from_flange.values()])
-    words, advice = too_little_motion(poses, run.mount)
+    words, advice = too_little_motion(np.array([*run.base_from_flange.values()]), run.mount)
     return Finding("weak_motion", words, Remedy(advice)) if words else None
 
 
@@ -400,58 +373,49 @@ def check_answer(run: RunState) -> None:
     if run.is_misread and poor_motion(run) is None:
         # With misread poses, sigmas predicted at their fit say nothing of the motion.
         return
-    inliers, cell = run.cell_fit.inlier_fit, run.cell_fit.cell
-    part, fit = run.cell_fit.inlier_problem, inliers.fit
-    seen = run.cell_fit.linearised_corners
-    is_estimated = seen is not None and any(scene.estimated for scene in run.scenes.values())
-    pixel_px = (
-        {}
-        if seen is None
-        else dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
-    )
-    if run.mount is not None:
-        words = chain_words(part, run.mount)
-        check_determined(
-            part, fit.state, fit.noise, words, pixel_px, with_first_effect=is_estimated
-        )
-        return
-    names = {name: _names(part.tree, name) for name in part.unknown}
+    part, fit, seen = run.cell_fit.inlier_problem, run.cell_fit.inlier_fit.fit, None
+    pixel_px, is_estimated = dict[str, float](), False
+    if (seen := run.cell_fit.linearised_corners) is not None:
+        pixel_px = dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
+        is_estimated = any(scene.estimated for scene in run.scenes.values())
+    words = chain_words(part, run.mount) if run.mount is not None else _words_of(run)
+    check_determined(part, fit.state, fit.noise, words, pixel_px, with_first_effect=is_estimated)
+
+
+def _words_of(run: RunState) -> CellWords:
+    """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
+    inliers, cell, part = run.cell_fit.inlier_fit, run.cell_fit.cell, run.cell_fit.inlier_problem
     outliers = inliers.problem.subset(~inliers.used)
     # A robot that was never tilted leaves more undetermined than a static view does.
     is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
 
-    def static_view(frame: str) -> StandingTie | None:
-        return sole_static_view(cell, frame) if is_tilted else None
-
-    def motion(frame: str) -> str:
-        if not part.observations_through(frame).any() and (
-            count := int(outliers.observations_through(frame).sum())
-        ):
-            return f"all {count} observations of it disagree with the rest of the cell"
-        view = static_view(frame)
-        return _motion(cell, part, frame) if view is None else view.words
-
-    def advice(frame: str, culprit: str) -> str:
-        if (view := static_view(frame)) is not None:
-            return view.advice
-        if part.observations_through(frame).any() or not len(outliers):
+    def words(frame: str, culprit: str = "") -> tuple[str, str]:
+        seen = part.observations_through(frame)
+        count = int(outliers.observations_through(frame).sum())
+        if is_tilted and (tie := sole_static_view(cell, frame)) is not None:
+            why, advice = tie.words, str(tie.do)
+        elif not seen.any() and len(outliers):
+            why = "observations of it are too few or too poor"
+            advice = (
+                "Look whether the board that ties it has the stated size, and whether images and "
+                "poses belong together."
+            )
+        else:
+            why, advice = _motion(cell, part, frame), _frame_advice(cell, frame)
             flanges = part.tree.flanges.values()
-            between = [
-                name
-                for name in flanges
-                if part.observations_through(name)[part.observations_through(frame)].any()
-            ]
-            measured = ""
+            between = [name for name in flanges if part.observations_through(name)[seen].any()]
             if between and "offset along" in culprit:
-                measured = measuring_advice(cell, between[0])
-            return f"{_frame_advice(cell, frame)} {measured}".rstrip()
-        return (
-            "Look whether the board that ties it has the stated size, and whether images and poses "
-            "belong together."
-        )
+                advice = f"{advice} {measuring_advice(cell, between[0])}".rstrip()
+        if not seen.any() and count:
+            why = f"all {count} observations of it disagree with the rest of the cell"
+        return why, advice
 
-    scene = CellWords("cell", names, motion, advice)
-    check_determined(part, fit.state, fit.noise, scene, pixel_px, with_first_effect=is_estimated)
+    return CellWords(
+        "cell",
+        {name: _names(part.tree, name) for name in part.unknown},
+        lambda frame: words(frame)[0],
+        lambda frame, culprit: words(frame, culprit)[1],
+    )
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:
@@ -464,9 +428,8 @@ def _motion(cell: Cell, part: Problem, frame: str) -> str:
     """Describes the motion of the robots between a frame and its observers."""
     rows, words = part.observations_through(frame), []
     for robot, base in part.tree.bases.items():
-        stops = np.unique(
-            part.observations.stops[rows & part.observations_through(part.tree.flanges[robot])]
-        )
+        through = rows & part.observations_through(part.tree.flanges[robot])
+        stops = np.unique(part.observations.stops[through])
         words += [robot_motion(cell, base, stops)] if len(stops) > 1 else []
     return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 
@@ -501,16 +464,11 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
         return ""
     name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
     worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
+    above = [(row, cell.tree.above(end)) for row in cell.rows for end in (row.seer, row.seen)]
+    counts = Counter(f"{row.seer} of {row.seen}" for row, frames in above if name in frames)
+    fewest = sorted(counts.items(), key=lambda pair: pair[1])
+    words = [f"{counted(count, 'view')} by {pair}" for pair, count in fewest]
     return (
         f"The weakest link is {name}: sigma {mm_and_deg(edge.sigma_mm, edge.sigma_deg)}, most of "
-        f"it in {worst.words}. {_determining_views(cell, name)}"
+        f"it in {worst.words}. It rests on {some_of(words, 4)}."
     )
-
-
-def _determining_views(cell: Cell, frame: str) -> str:
-    rows = [row for row in cell.rows if frame in cell.tree.above(row.seer)]
-    rows += [row for row in cell.rows if frame in cell.tree.above(row.seen)]
-    counts = Counter(f"{row.seer} of {row.seen}" for row in rows)
-    fewest = sorted(counts.items(), key=lambda pair: pair[1])
-    words = [f"{counted(count, 'view')} by {key}" for key, count in fewest]
-    return f"It rests on {some_of(words, 4)}."

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
-from visioncal.calibration.stages.cause_ranking import LENS_CHANGED
+from visioncal.core.finding_kinds import LENS_CHANGED
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Remedy

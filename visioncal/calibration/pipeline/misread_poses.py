@@ -26,9 +26,9 @@ from visioncal.calibration.stages.corner_numbers import (
     numbering_finding,
     share_from_behind,
 )
-from visioncal.calibration.stages.doubts import is_scattered
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.checks import is_scattered
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
@@ -323,7 +323,7 @@ def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
                 break
             mirrored.add(pair.camera)
             named = replace(hint, words=f"Camera {pair.camera}: {hint.words}")
-            if hint.do is _MIRRORED_CORNERS:
+            if hint.do == _MIRRORED_CORNERS:
                 # The command that writes a copy takes one camera and one robot only.
                 yield replace(named, do=Remedy(COUNTED_BACKWARDS))
                 continue

@@ -11,10 +11,10 @@ from visioncal.calibration.pipeline.budget import WorkAccuracy, work_accuracy
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.findings import Findings
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.readings import Readings
+from visioncal.calibration.suspects.judged import Findings
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, Mount, Progress

@@ -15,9 +15,10 @@ from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_pose
 from visioncal.calibration.stages.repeats import listed, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.finding_kinds import EMPTY_IMAGE
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, Rejection, Target
-from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import View, frame_name
 from visioncal.session.document import CameraTable

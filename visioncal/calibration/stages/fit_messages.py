@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.image_size import other_images
+from visioncal.core.finding_kinds import NOTE
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (

@@ -8,10 +8,11 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.finding_kinds import EMPTY_ROWS, MISSING
 from visioncal.core.limits import MAX_BLUR_PX, CalibrationLimits
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Remedy
+from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading

@@ -7,9 +7,10 @@ import numpy as np
 
 from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError
+from visioncal.core.finding_kinds import OTHER_SIZE
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Camera, Corners, FloatArray, Target
-from visioncal.core.verdict import OTHER_SIZE, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import TILTED
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
+from visioncal.core.finding_kinds import EMPTY_IMAGE
 from visioncal.core.number_format import counted, listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
@@ -196,7 +196,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
         step = Remedy("Vary the distance of the views.")
     if is_flat and tilt_deg < _TILT_SPREAD_DEG:
         words.append(f"All views are frontal (tilted by at most {tilt_deg:.0f} degrees).")
-        step = TILTED
+        step = Remedy("Add views tilted by 30 to 45 degrees.")
     if words:
         yield Finding("weak_lens", " ".join(words), step, until_mm=0.0)
     cell = np.minimum((stack.px / np.array(fit.camera.resolution) * _GRID).astype(int), _GRID - 1)

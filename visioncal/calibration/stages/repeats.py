@@ -11,9 +11,10 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
+from visioncal.core.finding_kinds import REPEATED_READINGS
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
-from visioncal.core.verdict import LEAST_NEED_MM, REPEATED_READINGS, Finding, Remedy
+from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
 from visioncal.session import Observation, Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
 from visioncal.session.observations import APART_DEG, APART_MM, APART_RAD

@@ -7,8 +7,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import BOARD_CHANGED, MOVED_FRAME, NO_JOINTS
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.suspects.ranking import NO_JOINTS
+from visioncal.core.finding_kinds import BOARD_CHANGED, MOVED_FRAME
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray

@@ -5,28 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import correcting, is_negligible, rank_causes
-from visioncal.calibration.stages.doubts import (
+from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.calibration.suspects.checks import (
     collect_findings,
     is_scattered,
     remedy_for_uncertainty,
 )
-from visioncal.calibration.stages.findings import Findings
-from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.calibration.suspects.judged import Findings
+from visioncal.calibration.suspects.ranking import correcting, is_negligible, rank_causes
+from visioncal.core.finding_kinds import AGREEMENT, CALIBRATED_ARM, GOOD_FOR, NEED, NOTE
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent, rounded_up
-from visioncal.core.verdict import (
-    AGREEMENT,
-    CALIBRATED_ARM,
-    GOOD_FOR,
-    NEED,
-    NO_DOUBTS,
-    NOTE,
-    Finding,
-    Verdict,
-    VerdictStatus,
-    remarks,
-)
+from visioncal.core.verdict import Finding, Verdict, VerdictStatus, remarks
 from visioncal.results import NeedMet
 from visioncal.results.conditions import uncorrected_words
 
@@ -38,47 +28,49 @@ def judge(findings: Findings) -> Verdict:
         `bad` with a fatal finding, `check` with doubts, `good` without. Where the task states its
         need, the probability that picks are within it decides: good from 0.95, check from 0.5, bad
         below, and never good with something unexplained.
+
+    Raises:
+        KeyError: A finding is of a kind that is not in the catalogue.
     """
-    small = [warning for warning in findings.warnings if is_negligible(warning, findings.picks)]
-    warnings = [warning for warning in findings.warnings if warning not in small]
-    notes = (*findings.notes, *(finding.words for finding in small))
-    findings = replace(findings, warnings=warnings, notes=notes)
+    picks, warnings = findings.picks, list(findings.warnings)
+    small = [warning for warning in warnings if is_negligible(warning, picks)]
+    notes = remarks((*findings.notes, *(finding.words for finding in small)), NOTE)
+    findings = replace(findings, warnings=[found for found in warnings if found not in small])
     doubts = collect_findings(findings)
-    good_for_mm = _good_for_mm(findings.picks, doubts)
-    uncorrected = [pick.uncorrected or pick for pick in findings.picks]
-    is_calibrated = any(pick.uncorrected is not None for pick in findings.picks)
-    uncorrected_mm = _good_for_mm(uncorrected, doubts) if is_calibrated else None
+    good_for_mm, uncorrected_mm = _good_for_mm(picks, doubts), None
+    is_calibrated = any(pick.uncorrected is not None for pick in picks)
+    if is_calibrated:
+        uncorrected_mm = _good_for_mm([pick.uncorrected or pick for pick in picks], doubts)
     met = need_met(findings.need, findings.judged_picks)
-    status: VerdictStatus = "good" if not doubts else "check"
-    if met is None:
-        status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
-    elif met.probability >= NeedLimits.probability[0]:
-        need_mm = met.need.mm or 0.0
-        doubts = [doubt for doubt in doubts if doubt.until_mm > need_mm]
-        status = "check" if doubts else "good"
-    else:
-        status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
-    ordered: Sequence[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
+    enough, least = NeedLimits.probability
+    is_met = met is not None and met.probability >= enough
+    if met is not None and is_met:
+        doubts = [doubt for doubt in doubts if doubt.until_mm > (met.need.mm or 0.0)]
+    status: VerdictStatus = "check" if doubts else "good"
+    if met is not None and not is_met:
+        status = "check" if met.probability >= least else "bad"
+    elif met is None and any(doubt.is_fatal for doubt in doubts):
+        status = "bad"
+    stated: list[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
-        ordered = rank_causes(
-            ordered,
-            findings.picks if met is None else findings.judged_picks,
-            met,
-            more=remedy_for_uncertainty(findings),
-            left_out_mm=findings.held_out.mm,
-            is_scattered=is_scattered(findings),
-        )
-    stated = list(ordered)
-    if met is None:
-        stated += _good_for(findings, good_for_mm, status)
-    else:
-        place = len(stated) * (met.probability >= NeedLimits.probability[0])
-        stated.insert(place, Finding(NEED, _need_words(findings, met)))
-    stated += [] if doubts else [_agreement(findings, is_enough=status == "good")]
-    stated += [warning for warning in findings.warnings if warning.kind in NO_DOUBTS]
-    verdict = Verdict(
-        status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm, uncorrected_mm
-    )
+        stated = [
+            *rank_causes(
+                stated,
+                picks if met is None else findings.judged_picks,
+                met,
+                more=remedy_for_uncertainty(findings),
+                left_out_mm=findings.held_out.mm,
+                is_scattered=is_scattered(findings),
+            )
+        ]
+    if met is not None:
+        stated.insert(len(stated) * is_met, Finding(NEED, _need_words(findings, met)))
+    elif good_for_mm is not None:
+        stated.append(_good_for(findings, good_for_mm, status))
+    if not doubts:
+        stated.append(_agreement(findings, is_enough=status == "good"))
+    stated += [warning for warning in findings.warnings if not warning.of_kind.is_doubt]
+    verdict = Verdict(status, (*stated, *notes), good_for_mm, uncorrected_mm)
     if not is_calibrated:
         return verdict
     step = None if findings.corrects_targets else correcting(findings.need)
@@ -94,20 +86,16 @@ def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | N
     return max(least, *(pick.good_for_mm for pick in picks))
 
 
-def _good_for(
-    findings: Findings, good_for_mm: float | None, status: VerdictStatus
-) -> tuple[Finding, ...]:
-    if good_for_mm is None:
-        return ()
+def _good_for(findings: Findings, good_for_mm: float, status: VerdictStatus) -> Finding:
     verb = "would be" if status == "bad" else "is"
     worst = max(findings.picks, key=lambda pick: pick.good_for_mm)
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
-    words = (
+    corrected = "" if worst.uncorrected is None else ", with corrected targets"
+    return Finding(
+        GOOD_FOR,
         f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more at "
-        f"{figure(worst.distance_m)} m from the {sensor}"
-        f"{'' if worst.uncorrected is None else ', with corrected targets'}."
+        f"{figure(worst.distance_m)} m from the {sensor}{corrected}.",
     )
-    return (Finding(GOOD_FOR, words),)
 
 
 def _need_words(findings: Findings, met: NeedMet) -> str:

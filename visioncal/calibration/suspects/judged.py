@@ -69,7 +69,7 @@ class JudgedArm:
     modelled: bool = False  # Whether its model is known.
     by_functions: bool = False  # Whether joint error functions were fitted to the stops.
     can_tilt: bool = True  # Whether its flange turns about more than one direction.
-    name: str = ""  # Its name; empty for a single robot.
+    name: str = ""  # `Robot` and its name, for messages; empty for a single robot.
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,6 @@ class PointAccuracy:
     words: str  # The point in words.
     budget_mm: Mapping[str, float]  # Its standard deviation by source, and as a `total` [mm].
     radius95_mm: float  # Radius of 95 % probability [mm].
-
-
-@dataclass(frozen=True)
-class StandingTie:
-    """Single view of static frames that alone connects a part of a cell; in words, with advice."""
-
-    words: str
-    advice: str
 
 
 @dataclass(frozen=True)
@@ -107,8 +99,9 @@ class Findings:
     # Error budgets of picks by camera and robot, with targets that are corrected where the arm was
     # calibrated; empty where they are not predicted.
     picks: Sequence[Picks] = ()
-    # The only connection of the worst frame; None where there are more.
-    tie: StandingTie | None = None
+    # The single view of static frames that alone connects the worst frame; None where there are
+    # more.
+    tie: Finding | None = None
     corrects_targets: bool = False  # Whether targets are corrected for a calibrated arm.
     use: Remedy | None = None  # How a good result is used.
 
@@ -131,14 +124,13 @@ class Findings:
         cameras = dict.fromkeys(pick.camera for pick in self.picks)
         if len({sensor.name for sensor in self.sensors}) < 2 or not cameras:
             return ""
-        weak_m = {
-            camera: max(
-                (direction.sigma for direction in self.worst if _is_offset_of(direction, camera)),
-                default=0.0,
-            )
-            for camera in cameras
-        }
-        return f" --camera {object_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
+
+        def weakest_m(camera: str) -> float:
+            offsets = (part for part in self.worst if not part.is_rotation)
+            mine = (part.sigma for part in offsets if part.words.startswith(f"{camera}'s "))
+            return max(mine, default=0.0)
+
+        return f" --camera {object_name(max(cameras, key=weakest_m), 'camera')}"
 
     @property
     def views(self) -> tuple[ViewResult, ...]:
@@ -154,7 +146,3 @@ class Findings:
     def held_out(self) -> Rms:
         """Residuals of all used views, left out in turn."""
         return left_out_rms(self.views)
-
-
-def _is_offset_of(direction: Direction, frame: str) -> bool:
-    return not direction.is_rotation and direction.words.startswith(f"{frame}'s ")

@@ -1,0 +1,444 @@
+"""Checks of a result against its limits: by its views, motion, corners and arms."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
+from visioncal.calibration.suspects.ranking import (
+    LEAST_RUN,
+    MEASURE_BOARD,
+    NO_JOINTS,
+    REFINE_LENS,
+    add_views_remedy,
+    run_evidence,
+)
+from visioncal.core.finding_kinds import UNEXPLAINED
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import counted, figure, mm_and_deg
+from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at, or_alone
+from visioncal.results import Rms, ViewResult
+
+_LIMITS = CalibrationLimits()
+# Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
+_ROUNDING = 1e-6
+# Views, and sources of a budget, that are named.
+_LISTED = 3
+# Ratio of the outlier limit of measured poses to that of views with corners: sound poses of a board
+# that is seen squarely are off by 8 times the median now and then.
+_UNEVEN = 1.5
+# Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
+# a small board far away.
+_OF_NOISE = 1.5
+# Implausible noise of an arm is no doubt for a task that needs so many times as much.
+_GOOD_ENOUGH = 10.0
+
+
+def collect_findings(judged: Findings) -> list[Finding]:
+    """All findings against a result, in the order of the checks."""
+    robots, scatter = [*_robot_noise(judged)], [*_scatter(judged)]
+    if scatter:
+        # Scatter replaces the robot's noise, and is accepted up to the same need at least.
+        least = max((doubt.until_mm for doubt in robots), default=0.0)
+        scatter = [replace(doubt, until_mm=max(doubt.until_mm, least)) for doubt in scatter]
+        robots = []
+    # With fatal scatter, sigmas say nothing about the motion. A step inflates all of them, and more
+    # views do not help.
+    is_wild = any(doubt.is_fatal for doubt in scatter)
+    is_wild |= any(warning.of_kind.is_step for warning in judged.warnings)
+    return [
+        *scatter,
+        *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
+        *_standing_out(judged),
+        *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair, judged)),
+        *([] if is_wild else [*_sigmas(judged), *_place(judged), *_workspace(judged)]),
+        *_few_stops(judged),
+        *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _lost_views(sensor)),
+        *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _corner_noise(sensor)),
+        *robots,
+        *(_warned(warning, judged) for warning in judged.warnings if warning.of_kind.is_doubt),
+    ]
+
+
+def is_scattered(judged: Findings) -> bool:
+    """Whether views disagree with each other by more than in a sound cell."""
+    return any(_scatter(judged))
+
+
+def _warned(warning: Finding, judged: Findings) -> Finding:
+    """A stage's warning, with the residuals of the other views where it left some out."""
+    if not warning.of_kind.leaves_out:
+        return warning
+    return replace(warning, without_it=_without(warning.views, judged.held_out))
+
+
+def _without(views: Sequence[int], held_out: Rms) -> str:
+    left_out = f"view {views[0]}" if len(views) == 1 else "these views"
+    return f"Without {left_out}, the others predict each other to {held_out.words}."
+
+
+def _ratio(first: Rms, second: Rms) -> float:
+    """The largest ratio of two residuals, of position and of rotation; 0 where all are rounding."""
+    pairs = [(first.mm, second.mm), (first.deg or 0.0, second.deg or 0.0)]
+    if first.deg is None or second.deg is None:
+        pairs.pop()
+    return max(one / max(other, _ROUNDING) if one > _ROUNDING else 0.0 for one, other in pairs)
+
+
+def _scatter(judged: Findings) -> Iterator[Finding]:
+    """Findings on left-out views that disagree with the others, or with views in the fit."""
+    words, views, is_fatal = [], list[ViewResult](), False
+    for pair in judged.pairs:
+        held = pair.weighted_held_out or pair.held_out
+        beyond = []
+        for value, unit, (check, bad), noise in (
+            (held.mm, "mm", _LIMITS.scatter_mm, pair.noise.mm),
+            (held.deg or 0.0, "deg", _LIMITS.scatter_deg, pair.noise.deg or 0.0),
+        ):
+            if value > max(check, _OF_NOISE * noise):
+                beyond.append(f"{figure(value)} {unit} (doubt begins at {check:g})")
+                is_fatal |= value > bad
+        if beyond:
+            views += [view for view in pair.views if view.used and view.residual_mm is not None]
+            words.append(" and ".join(beyond) + (f" ({pair.name})" if pair.name else ""))
+    if words:
+        worst = sorted(views, key=lambda view: -(view.residual_mm or 0.0))[:_LISTED]
+        named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
+        causes = (
+            "an instrument or a tool that moved, readings paired with other poses, units or "
+            "conventions of the poses"
+            if judged.mount == "instrument"
+            else "a board that moved, images paired with other poses, units or conventions of the "
+            "poses, intrinsics, a warped board"
+        )
+        yield Finding(
+            UNEXPLAINED,
+            f"Left out of the fit, views disagree with the others by {', '.join(words)}, rms; the "
+            f"worst are {named}.",
+            Remedy(
+                f"Look at the worst views for possible causes: {causes}, or an arm with large "
+                "model errors.",
+                REVIEW,
+            ),
+            tuple(view.view for view in worst),
+            is_fatal=is_fatal,
+            until_mm=0.0,
+        )
+    ratio = _ratio(judged.held_out, judged.rms)
+    if ratio > _LIMITS.optimism[0] and not any(arm.by_functions for arm in judged.arms):
+        yield Finding(
+            "optimism",
+            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
+            "views for their noise.",
+            _tilted(judged),
+            is_fatal=ratio > _LIMITS.optimism[1],
+            until_mm=0.0,
+        )
+
+
+def _residual(view: ViewResult, between: str = ", ") -> str:
+    turned = "" if view.residual_deg is None else f"{between}{figure(view.residual_deg)} deg"
+    return f"{figure(view.residual_mm or 0.0)} mm{turned}"
+
+
+def _left_out(pair: JudgedPair) -> Iterator[Finding]:
+    """Finding on outlier views of a pair, single or consecutive."""
+    if not pair.outliers:
+        return
+    views, reason = tuple(rejection.view for rejection in pair.outliers), pair.outliers[0].reason
+    compared = [view.view for view in pair.views if view.used or view.view in views]
+    kind, evidence, run = "wrong_views", 0.0, _run(views, compared)
+    listed, more = ", ".join(map(str, views)), "s" * (len(views) > 1)
+    words = f"View {views[0]} was left out. It {reason}."
+    if more:
+        words = f"Views {listed} were left out. View {views[0]} {reason}."
+    step = Remedy(
+        f"Compare image and pose of view{more} {listed}: record them again, or in views.csv, "
+        f"delete the row{more} of view {listed}.",
+        look_at(views[0]),
+    )
+    if run:
+        kind, evidence = "something_moved", run_evidence(len(views), len(compared))
+        words = f"{words} They follow each other: {run}, something had moved."
+        advice = "Fasten what moved, and calibrate the views before and after it apart."
+        step = or_alone(advice, views)
+    others = _without(views, pair.held_out)
+    yield Finding(kind, words, step, views, without_it=others, mahalanobis_sq=evidence)
+
+
+def _run(views: Sequence[int], compared: Sequence[int]) -> str:
+    """When consecutive ones of the compared views were taken; empty where they are scattered."""
+    first, count = compared.index(views[0]), len(views)
+    end = first + count
+    if not LEAST_RUN <= count < len(compared) or [*compared[first:end]] != [*views]:
+        return ""
+    if end == len(compared):
+        return f"from view {views[0]} on"
+    return f"from view {views[0]} to view {views[-1]}" if first else f"before view {compared[end]}"
+
+
+def _standing_out(judged: Findings) -> Iterator[Finding]:
+    """Findings on single views with outstanding residuals."""
+    # Where corners give the noise of each view, the outlier search has judged views better.
+    if any(arm.noise_mm is not None for arm in judged.arms):
+        return
+    for pair in judged.pairs:
+        used = [view for view in pair.views if view.used]
+        sizes = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
+        typical = np.maximum(np.median(sizes.reshape(-1, 2), axis=0), _ROUNDING) if used else 1.0
+        for view, ratio in zip(used, (sizes / typical).reshape(-1, 2).max(axis=1), strict=True):
+            if ratio > _LIMITS.outlier * (1.0 if view.rms_px is not None else _UNEVEN):
+                yield Finding(
+                    "wrong_views",
+                    f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
+                    f"from the others, {ratio:.0f} times what is typical. It is in the fit and "
+                    "pulls at it.",
+                    Remedy(
+                        "Look at its image and its pose, and take it out of views.csv if one is "
+                        "wrong.",
+                        look_at(view.view),
+                    ),
+                    (view.view,),
+                ).of(pair.name)
+
+
+def _holdout(pair: JudgedPair, judged: Findings) -> Iterator[Finding]:
+    """Finding on views that the session holds back, and the result does not predict."""
+    holdout = pair.holdout
+    if holdout is not None and (ratio := _ratio(holdout, pair.held_out)) > _LIMITS.holdout:
+        observed = "readings" if judged.mount == "instrument" else "images"
+        yield Finding(
+            "holdout",
+            f"The views that the session holds back are missed by {holdout.words}, {ratio:.0f} "
+            "times worse than views left out in turn. They lie where the result does not hold, or "
+            f"their poses or {observed} are wrong.",
+            Remedy("Record views where the result is to hold, with role = fit."),
+        )
+
+
+def _variance(judged: Findings, *sources: str) -> float:
+    """Share of sources in the variance of the points of interest."""
+    total, part = (
+        sum(
+            mm**2
+            for place in judged.places
+            for name, mm in place.budget_mm.items()
+            if name.startswith(names)
+        )
+        for names in (("total",), sources)
+    )
+    return part / total if total else 0.0
+
+
+def _better_stated(judged: Findings) -> Remedy | None:
+    """Remedy for a held board or lens that causes most uncertainty; None for other causes."""
+    # Held values are lenses rather than boards where the budget has more of these.
+    board, lens, held = (_variance(judged, at) for at in ("board", "intrinsics", "held values"))
+    is_lens = lens > board and any(sensor.holds_lens for sensor in judged.sensors)
+    if board + held * (not is_lens) > 0.5:
+        return MEASURE_BOARD
+    is_stated = any(sensor.holds_lens and sensor.has_lens_sigma for sensor in judged.sensors)
+    return REFINE_LENS if is_lens and is_stated and lens + held > 0.5 else None
+
+
+def remedy_for_uncertainty(judged: Findings) -> Remedy | None:
+    """Remedy that makes a result less uncertain; None where a finding on the arm has it."""
+    if stated := _better_stated(judged):
+        return stated
+    if any(warning.do == NO_JOINTS for warning in judged.warnings):
+        return None
+    return _more_views(judged, "Add views from other poses of the robot.")
+
+
+def _more_views(judged: Findings, words: str, purpose: str = "") -> Remedy:
+    options = f"{purpose}{judged.of_camera}"
+    return add_views_remedy(words, modelled=judged.plannable, purpose=options)
+
+
+def _tilted(judged: Findings) -> Remedy:
+    words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
+    if not all(arm.can_tilt for arm in judged.arms):
+        words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
+    return _more_views(judged, words)
+
+
+def _sigmas(judged: Findings) -> Iterator[Finding]:
+    """Finding on directions of the unknown edges that are known too little."""
+    # Those of a calibrated arm are as undetermined as the errors of its first and last links, which
+    # compensate them in all poses: of it the workspace counts.
+    if all(arm.workspace_mm is not None for arm in judged.arms):
+        return
+    weak, is_fatal = [], False
+    for direction in judged.worst:
+        scale, unit, (check, bad) = 1e3, "mm", _LIMITS.sigma_mm
+        if direction.is_rotation:
+            scale, unit, (check, bad) = float(np.rad2deg(1.0)), "deg", _LIMITS.sigma_deg
+        if (sigma := direction.sigma * scale) > check:
+            weak.append(f"{direction.words} ({figure(sigma)} {unit})")
+            is_fatal |= sigma > bad
+    if not weak:
+        return
+    named = ", ".join(weak)
+    least = f"{_LIMITS.sigma_mm[0]:g} mm and {_LIMITS.sigma_deg[0]:g} deg"
+    known = f"known to {named} (sigma; doubt begins at {least}): most of that"
+    words = f"Weakly determined by the motion, with their sigmas: {named}; doubt begins at {least}."
+    step = _better_stated(judged)
+    has_no_joints = any(warning.do == NO_JOINTS for warning in judged.warnings)
+    if has_no_joints and _variance(judged, "arm", "robot", "poses") > 0.5:
+        words = f"As mounts, {known} is the arm's, and is the same in every recording."
+        step = NO_JOINTS
+    elif step == MEASURE_BOARD:
+        words = f"Frames are {known} is the board's, as well as its size is stated."
+    elif step is not None:
+        words = f"Frames are {known} is the lens's, which is held and known too little."
+    elif judged.tie is not None:
+        words = (
+            f"Weakly determined, with their sigmas: {named}; doubt begins at {least}. The cause: "
+            f"{judged.tie.words}."
+        )
+        step = judged.tie.do
+    step = step or _tilted(judged)
+    yield Finding("weak_motion", words, step, is_fatal=is_fatal, until_mm=0.0)
+
+
+def _place(judged: Findings) -> Iterator[Finding]:
+    """Finding on the error budget of the worst point of interest."""
+    check, bad = _LIMITS.sigma_mm
+    if all(arm.workspace_mm is not None for arm in judged.arms):
+        return
+    # Where errors of a lens and its mount cancel, picks are more accurate than points in the
+    # camera's frame.
+    if len(judged.places) == len(judged.picks) == 1 and judged.picks[0].budget_mm["total"] <= check:
+        return
+    beyond = [place for place in judged.places if place.budget_mm["total"] > check]
+    if not beyond:
+        return
+    beyond.sort(key=lambda place: -place.budget_mm["total"])
+    worst, *others = beyond
+    total, *parts = sorted(worst.budget_mm.items(), key=lambda at: (at[0] != "total", -at[1]))
+    listed = ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED])
+    words = (
+        f"{worst.words} is placed to {figure(total[1])} mm (sigma; 95 % within "
+        f"{figure(worst.radius95_mm)} mm): {listed}."
+    )
+    if others:
+        named = (f"{place.words} ({figure(place.budget_mm['total'])} mm)" for place in others)
+        words += f" Over {check:g} mm are also {', '.join(named)}."
+    step = _better_stated(judged)
+    yield Finding("place", words, step, is_fatal=total[1] > bad, until_mm=0.0)
+
+
+def _workspace(judged: Findings) -> Iterator[Finding]:
+    """Findings on the accuracy of calibrated arms over their workspace."""
+    check, bad = _LIMITS.sigma_mm
+    for arm in judged.arms:
+        if arm.workspace_mm is None or arm.workspace_mm <= check:
+            continue
+        board = (
+            " The board's size counts in it, as no view shows when an arm and a board are both too "
+            "large: measure its squares, and state square_sigma_m."
+        )
+        seen = any(sensor.pixel_px is not None for sensor in judged.sensors)
+        yield Finding(
+            "workspace",
+            f"All over the workspace the calibrated arm places its tool to "
+            f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at {check:g})."
+            f"{board * seen}",
+            _more_views(
+                judged,
+                "Add views with other postures of the arm, all over the workspace.",
+                " --for kinematics",
+            ),
+            is_fatal=arm.workspace_mm > bad,
+            until_mm=0.0,
+        ).of(arm.name)
+
+
+def _few_stops(judged: Findings) -> Iterator[Finding]:
+    used, (check, bad) = sum(view.used for view in judged.views), _LIMITS.stops
+    for arm in judged.arms:
+        if arm.stops < check:
+            is_fatal, thing = arm.stops < bad, "view" if arm.stops == used else "stop"
+            yield Finding(
+                "too_few_stops" if is_fatal else "few_stops",
+                f"Only {counted(arm.stops, thing, ('is', 'are'))} used; {check} or more are needed "
+                "to check the result.",
+                _tilted(judged),
+                is_fatal=is_fatal,
+                until_mm=0.0,
+            ).of(arm.name)
+
+
+def _lost_views(sensor: Sensor) -> Iterator[Finding]:
+    count, (check, bad) = len(sensor.lost), _LIMITS.lost_share
+    total = sensor.used + sensor.spared + count
+    share = count / max(total, 1)
+    if share <= check:
+        return
+    others = [rejection for rejection in sensor.lost if rejection.view not in sensor.outliers]
+    # Outliers have a finding of their own.
+    kind, step, details = "left_out", None, ""
+    if disagree := len({*sensor.outliers}):
+        verb = "disagrees" if disagree == 1 and others else "disagree"
+        details = f"; {disagree if others else 'all'} of them {verb} with the others"
+    if others:
+        kind, first = "lost_views", others[0]
+        details += f"; the first{' but for these' if disagree else ''}: view {first.view}, "
+        details += first.reason
+        advice = "Correct the first of them and those like it, or repeat what is missing."
+        step = Remedy(advice, look_at(first.view))
+    words = f"{count} of {total} views {'is' if count == 1 else 'are'} not used{details}."
+    views = tuple(rejection.view for rejection in sensor.lost)
+    yield Finding(kind, words, step, views, is_fatal=share > bad)
+
+
+def _corner_noise(sensor: Sensor) -> Iterator[Finding]:
+    (check, bad), noise = _LIMITS.pixel_px, sensor.pixel_px
+    if noise is None:
+        return
+    if noise > check:
+        yield Finding(
+            "corner_noise",
+            f"Corners deviate by {figure(noise)} px from any pose of a flat board (doubt begins at "
+            f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
+            "are blurred.",
+            Remedy("Look for blur, glare, and a lens or a board that is not as stated."),
+            is_fatal=noise > bad,
+        )
+    if sensor.level > _LIMITS.level:
+        yield Finding(
+            "corner_noise",
+            f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
+            "of few pixels, blur, or a lens that is not as stated.",
+            Remedy("Go nearer, or show it larger squares."),
+        )
+
+
+def _robot_noise(judged: Findings) -> Iterator[Finding]:
+    """Findings on implausible noise of arms, which usually has another cause."""
+    for arm in judged.arms:
+        if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
+            continue
+        # Only noise whose confidence interval is above the limit counts.
+        least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
+        if max(least_mm / _LIMITS.robot_mm, least_deg / _LIMITS.robot_deg) <= 1.0:
+            continue
+        likelier = (
+            "Read a few stops twice, with the times in stamp_s, to see how well readings repeat; "
+            "more likely than the arm's noise are an instrument that reads worse than stated or "
+            "was moved, or a model of the arm that is off by as much."
+            if judged.mount == "instrument"
+            else "Look for what is likelier than noise of the arm: a board of another size than "
+            "stated (measure it over many squares) or warped, intrinsics that are not this "
+            "camera's, a model of the arm that is off by as much, or poses that were read before "
+            "the arm stood still (read one twice to see how well it repeats)."
+        )
+        ratio = max(arm.noise_mm / _LIMITS.robot_mm, arm.noise_deg / _LIMITS.robot_deg)
+        yield Finding(
+            UNEXPLAINED,
+            "The residuals would take a flange that is off by "
+            f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; arms repeat to 0.1 mm.",
+            Remedy(likelier),
+            until_mm=_GOOD_ENOUGH * ratio * _LIMITS.robot_mm,
+        ).of(arm.name)

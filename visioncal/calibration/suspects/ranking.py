@@ -1,0 +1,308 @@
+"""Ranking of findings by the probability that each is the cause of a bad result.
+
+The probability depends on the kind of finding:
+
+- Test results: by the false-alarm probability p of the test. With even prior odds, the odds of a
+  fault against "nothing is wrong" are at least 1 to -e p ln p (Sellke, Bayarri and Berger 2001).
+  Findings that explain the same misfit compete: their odds are normalised, together with "none of
+  these", which is the cause `unexplained`. A finding that moves picks by less than left-out views
+  disagree explains at most the squared ratio of both.
+- Error sources that are too large with nothing wrong: by their share of a pick's mean squared
+  error.
+- Facts, such as an unconnected frame: probability one. Remarks without a test, and sigmas beyond
+  their limits, are facts that are causes only where there is no other.
+
+A probability is stated if this session's data decide it. Facts, and findings of comparisons of
+which the limit alone is known (`Finding.by_limit`), are only ranked by it: the same figure would
+stand before each.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from visioncal.calibration.stages.need import CONTROLLER, Picks
+from visioncal.core.finding_kinds import (
+    ARM_ERRORS,
+    CHAIN,
+    EXCHANGED,
+    FACT,
+    KINDS,
+    LENS_CHANGED,
+    UNEXPLAINED,
+    Kind,
+)
+from visioncal.core.limits import CalibrationLimits, NeedLimits
+from visioncal.core.number_format import figure, percent
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import Need
+from visioncal.core.verdict import CALIBRATE, PLAN, REVIEW, Finding, Remedy, Verdict
+from visioncal.estimation.effects import RANDOM_EFFECTS
+from visioncal.results import NeedMet
+
+_KINDS: Mapping[str, Kind] = {
+    **KINDS,
+    **{effect.kind: Kind(effect.kind, 1e-4, CHAIN) for effect in RANDOM_EFFECTS},
+}
+# Probability from which on a mistake precedes sigmas beyond their limits.
+_LIKELIER = 0.5
+# Fewest consecutive left-out views that count as a run, and not as chance.
+LEAST_RUN = 3
+# Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
+_LEAST_SHARE = 0.1
+
+MEASURE_BOARD = Remedy(
+    "Measure the board with a caliper over its whole width, and state square_m, the side of one "
+    "square (of a marker size_m, its side), and square_sigma_m, how well it is known, of the "
+    "target: more views tell neither."
+)
+# Remedy for a given lens that is held and not known better.
+REFINE_LENS = Remedy(
+    'In [camera], set intrinsics = "refine", best with more views and a board of many corners, or '
+    "state a smaller matrix_sigma_px where fx, fy, cx, cy are known better."
+)
+# Remedy for errors of an arm whose joints are not known.
+NO_JOINTS = Remedy(
+    "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
+    "calibrate then estimates the arm, too."
+)
+# Error sources of picks: kind of the finding, words, and remedy.
+_SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
+    "calibration": ("calibration", "the calibration itself", None),
+    "board": ("unmeasured_board", "the board, whose size is not known better", MEASURE_BOARD),
+    "look": (
+        "robot_noise",
+        "the robot's own noise where it looks, which more views do not change",
+        Remedy("Look several times from different stops, and take the mean."),
+    ),
+    "pick": (
+        "robot_noise_of_pick",
+        "the robot's own noise where it picks, which no calibration changes",
+        Remedy("Take a robot that repeats better, or a gripper that forgives."),
+    ),
+    CONTROLLER: (
+        "uncorrected_targets",
+        "the controller's own model of the arm, which the calibration corrects",
+        None,
+    ),
+    "arm": (ARM_ERRORS, "the arm's own errors, which more views do not change", NO_JOINTS),
+    "left out": (
+        UNEXPLAINED,
+        "errors of left-out views that the prediction does not explain",
+        Remedy(
+            "Look at the worst views: does each pose belong to its image, did anything move?",
+            REVIEW,
+        ),
+    ),
+}
+
+
+def correcting(need: Need | None) -> Remedy:
+    """Advice to correct targets for a calibrated arm; with a need, to have it judged so."""
+    words = "Correct targets for the calibrated arm before they are sent"
+    correct = "visioncal correct targets.csv --against OUT -o corrected.csv"
+    if need is None:
+        return Remedy(f"{words}.", correct)
+    limits = (("mm", need.mm), ("deg", need.deg))
+    options = "".join(f" --need-{unit} {limit:g}" for unit, limit in limits if limit is not None)
+    return Remedy(
+        f"{words}; with --corrected, the verdict is about them.",
+        f"{CALIBRATE} --corrected{options} && {correct}",
+    )
+
+
+def add_views_remedy(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
+    """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
+    if modelled:
+        return Remedy(words, f"{PLAN}{purpose}")
+    model = "With [robot] model in session.toml, visioncal plan proposes them."
+    return Remedy(f"{words} {model}")
+
+
+def explained_by(verdict: Verdict, found: Finding) -> Verdict:
+    """Verdict in which a cause comes first that explains others: misread poses, another board."""
+    if verdict.causes and verdict.causes[0].kind == EXCHANGED:
+        # The views themselves show the exchange; the finding's command undoes it.
+        return verdict
+    kind = _KINDS[found.kind]
+    odds = _odds(kind.chance)
+    rest = [finding for finding in verdict.findings if finding.kind not in kind.hides]
+    if kind.chance > FACT:
+        # What the views show otherwise may be due to it, too.
+        rest = [
+            replace(finding, probability=finding.probability / (1.0 + odds), do=None)
+            for finding in rest
+            if finding.words not in found.words
+        ]
+    cause = replace(found, probability=odds / (1.0 + odds), by_limit=True)
+    return replace(verdict, findings=(cause, *rest))
+
+
+def rank_causes(
+    doubts: Sequence[Finding],
+    picks: Sequence[Picks],
+    met: NeedMet | None,
+    *,
+    more: Remedy | None = None,
+    left_out_mm: float = 0.0,
+    is_scattered: bool = False,
+) -> tuple[Finding, ...]:
+    """Ranks findings by their probability of being the cause, and adds too large error sources.
+
+    Args:
+        doubts: All findings, of kinds in the catalogue.
+        picks: Error budgets of picks.
+        met: The required accuracy and the probability of meeting it; None where none is stated.
+        more: Remedy that makes the calibration less uncertain.
+        left_out_mm: Disagreement of left-out views [mm].
+        is_scattered: Whether that is more than in a sound cell.
+
+    Raises:
+        KeyError: A kind is not in the catalogue.
+    """
+    found = _with_probabilities(doubts, left_out_mm)
+    sigmas = [finding for finding in found if _KINDS[finding.kind].is_sigma]
+    sigma = min(sigmas, key=lambda finding: _KINDS[finding.kind].size, default=None)
+    # A sigma far beyond its limit alone makes a result bad, with no likely mistake.
+    is_likely = any(finding.probability >= _LIKELIER for finding in found)
+    decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
+    unmet = met is not None and met.probability < NeedLimits.probability[0]
+    too_large = any(pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks)
+    is_sized = is_scattered or any(doubt.until_mm == 0.0 for doubt in doubts)
+    if picks and not decides and (unmet or (met is None and too_large and is_sized)):
+        causes = {finding.kind for finding in found if finding.probability}
+        known = causes.union(*(_KINDS[kind].inflates for kind in causes))
+        for source in _sources(picks, met, more):
+            if source.kind in known:
+                continue
+            found.append(source)
+            # An uncertain calibration is due to weak motion, if more views make it better.
+            adds = more is not None and more not in (MEASURE_BOARD, REFINE_LENS)
+            if source.kind == "calibration" and source.probability >= _LIKELIER and adds:
+                weak = [finding for finding in found if finding.kind == "weak_motion"]
+                for finding in weak[:1]:
+                    found.remove(finding)
+                    found.insert(0, replace(finding, probability=source.probability))
+                    found[-1] = replace(source, do=finding.do)
+    if decides or not any(finding.probability for finding in found):
+        return tuple(
+            replace(finding, probability=1.0 - FACT, by_limit=True, do=finding.do or more)
+            if finding is sigma or not (decides or finding in sigmas)
+            else finding
+            for finding in found
+        )
+    return tuple(found)
+
+
+def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
+    """Findings with their probabilities among rivals; only the first of a kind is a cause."""
+    first: dict[str, Finding] = {}
+    for finding in doubts:
+        if _KINDS[finding.kind].chance:
+            first.setdefault(finding.kind, finding)
+    hidden = {*_hidden({doubt.kind: doubt for doubt in reversed(doubts)})}
+    misfit_mm = left_out_mm if UNEXPLAINED in first else 0.0
+    odds = {
+        name: 1.0 if name in hidden else _explaining_odds(finding, misfit_mm)
+        for name, finding in first.items()
+    }
+
+    def weighed(finding: Finding) -> Finding:
+        name, misfit = finding.kind, _KINDS[finding.kind].misfit
+        found = replace(finding, do=None) if name in hidden else finding
+        if first.get(name) is not finding:
+            return found
+        among = [rival for rival in odds if rival != name and _KINDS[rival].misfit == misfit]
+        rivals = sum(odds[rival] for rival in among) if misfit else 0.0
+        # "None of these" has odds one, unless `unexplained` stands for it as a finding.
+        none = float(name != UNEXPLAINED and not (rivals and UNEXPLAINED in odds))
+        probability = odds[name] / (none + odds[name] + rivals)
+        return replace(found, probability=probability, by_limit=not finding.mahalanobis_sq)
+
+    return [weighed(doubt) for doubt in doubts]
+
+
+def _hidden(first: Mapping[str, Finding]) -> Iterator[str]:
+    """Kinds of findings that are mere effects of another finding."""
+    arm = first.get(ARM_ERRORS)
+    for name, finding in first.items():
+        if name == "lens" and not finding.mahalanobis_sq:
+            # It was refined with the rest.
+            continue
+        for kind in first.keys() - {name}:
+            # Errors of the arm that are more evident are no effect of what the corners alone show.
+            is_clearer = (
+                name == LENS_CHANGED
+                and kind == ARM_ERRORS
+                and arm is not None
+                and arm.mahalanobis_sq > finding.mahalanobis_sq
+            )
+            if not is_clearer and {kind, _KINDS[kind].misfit} & {*_KINDS[name].hides}:
+                yield kind
+
+
+def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
+    """Odds of a finding, bounded by the share of the misfit that it can explain."""
+    # By its chi-square, or the limit of its test.
+    chance = _KINDS[doubt.kind].chance
+    if doubt.mahalanobis_sq:
+        chance = min(max(float(chdtrc(1.0, doubt.mahalanobis_sq)), FACT), chance)
+    odds = _odds(chance)
+    if doubt.up_to_mm >= misfit_mm:
+        return odds
+    most = (doubt.up_to_mm / misfit_mm) ** 2 * odds / (1.0 + odds)
+    return most / (1.0 - most)
+
+
+def is_of_chain(found: Finding) -> bool:
+    """Whether a finding explains that views disagree, or that the flange is off."""
+    return _KINDS[found.kind].misfit == CHAIN
+
+
+def run_evidence(count: int, of: int) -> float:
+    """Chi-square (one degree of freedom) of `count` consecutive left-out views among `of` views."""
+    # Views that are wrong independently are equally likely to be any of them.
+    chance = KINDS["something_moved"].chance * (of - count + 1) / math.comb(of, count)
+    return float(chi2_limit(max(chance, FACT), 1))
+
+
+def _odds(chance: float) -> float:
+    """Lower bound of the odds of a fault by a false-alarm probability (under 1 / e)."""
+    return float(-1.0 / (np.e * chance * np.log(chance)))
+
+
+def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
+    """Whether removing the cause of a finding would hardly reduce the error of picks."""
+    least_mm = min((pick.budget_mm["total"] for pick in picks), default=0.0)
+    return found.up_to_mm**2 < _LEAST_SHARE * least_mm**2
+
+
+def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -> Iterator[Finding]:
+    """Dominant error sources of the worst pair of camera and robot."""
+    need = None if met is None else met.need
+    worst = max(
+        picks, key=lambda pick: pick.good_for_mm if need is None else -pick.probability(need)
+    )
+    in_mm = need is None or need.mm is not None
+    budget, unit = (worst.budget_mm, "mm") if in_mm else (worst.budget_deg, "deg")
+    total = budget.pop("total")
+    for name, size in budget.items():
+        if size**2 < _LEAST_SHARE * total**2:
+            continue
+        kind, words, do = _SOURCES[name]
+        rest = worst.without(name)
+        without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
+        if need is not None:
+            without += f", and {percent(rest.probability(need))} within what is needed"
+        yield Finding(
+            kind,
+            f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come from "
+            f"{words}.",
+            correcting(need) if name == CONTROLLER else do or more,
+            probability=size**2 / total**2,
+            without_it=f"{without}.",
+            until_mm=0.0,
+        )
