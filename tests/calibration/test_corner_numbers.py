@@ -38,25 +38,20 @@ def renumbered(order, target, mount="eye-in-hand"):
 
 
 @pytest.mark.parametrize(
-    ("order", "target", "mount", "step"),
+    ("order", "target", "mount"),
     [
-        (
-            bottom_up,
-            load_target("checkerboard_9x6_25mm"),
-            "eye-to-hand",
-            "point p becomes 9 * (5 - p // 9) + p % 9), and calibrate again.",
-        ),
-        (by_column, SQUARE, "eye-in-hand", "where column by column, 5 * (p % 5) + p // 5), and"),
+        (bottom_up, load_target("checkerboard_9x6_25mm"), "eye-to-hand"),
+        (by_column, SQUARE, "eye-in-hand"),
     ],
 )
-def test_numbers_that_turn_the_board_over_are_named(order, target, mount, step):
+def test_numbers_that_turn_the_board_over_are_named(order, target, mount):
     cell, session = renumbered(order, target, mount)
     found = visioncal.calibrate(session)
     assert found.verdict.status == "check"
     cause = found.verdict.causes[0]
     assert cause.kind == "corner_numbers"
     assert cause.words.startswith("corners.csv numbers the corners of the board as if it was seen")
-    assert step in str(cause.do)
+    assert "row by row from corner 0" in str(cause.do)
     # The board's z axis points at the camera, and the camera is where it is.
     board = "base_from_target" if mount == "eye-in-hand" else "flange_from_target"
     assert found.edges[board].matrix[:3, 2] @ cell.transforms[board][:3, 2] < -0.99
@@ -69,7 +64,7 @@ def test_a_marker_numbered_counterclockwise_is_named():
     marker = replace(load_target("aruco_4x4_50_id0_120mm"), square_sigma_m=1e-6)
     _, session = renumbered(lambda ids, *_: ids[::-1], marker)
     causes = visioncal.calibrate(session).verdict.causes
-    assert "from behind: counterclockwise." in causes[0].words
+    assert "counterclockwise" in causes[0].words
 
 
 def test_numbers_as_drawn_are_not_accused():

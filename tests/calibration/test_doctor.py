@@ -17,14 +17,12 @@ from support.rendered import Shot, photograph
 
 import visioncal
 from visioncal.calibration.pipeline.checkup import to_document
-from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
+from visioncal.calibration.stages.image_size import other_images, scaled_matrix
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.interchange.formats import load_for_rereading
 from visioncal.session import Session
 from visioncal.simulation import BOARDS
-from visioncal.vision.boards.checkerboard import CHECKERBOARD
-from visioncal.vision.camera import project
 from visioncal.vision.targets import load_target
 
 # Where the finding comes from: poses, files, images, motion. All others are kept answers.
@@ -94,7 +92,7 @@ def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):
     edit(folder, lambda text: re.sub(r"(matrix|distortion) = \[[^]]*\]", "", text))
     first, *rest = visioncal.doctor(folder).findings
     assert first.kind == "unread_markers"
-    assert re.search(r"cannot be read: they are \d+ px wide", first.words)
+    assert "cannot be read: they are too small" in first.words
     assert not {finding.kind for finding in rest} & {"mirrored_images", "other_board"}
 
 
@@ -185,8 +183,7 @@ def test_a_matrix_of_larger_images_is_named_by_the_ratio(tmp_path):
 
 
 @pytest.mark.parametrize("more", [1, slow(-1)])
-def test_squares_in_the_place_of_inner_corners_are_named_at_once(tmp_path, monkeypatch, more):
-    words = "of inner corners: one less"
+def test_squares_in_the_place_of_inner_corners_are_named(tmp_path, more):
     plain = BROKEN["semicolons"]
     options = replace(plain.options, target=BOARDS["checkerboard"], views=4)
     folder = sound_session(tmp_path / "squares", replace(plain, options=options))
@@ -195,14 +192,10 @@ def test_squares_in_the_place_of_inner_corners_are_named_at_once(tmp_path, monke
     )
     (folder / "board.toml").write_text(described)
     edit(folder, lambda text: text.replace("checkerboard_9x6_25mm", "board.toml"))
-    # A thorough search for what is not there takes seconds an image.
-    find = CHECKERBOARD.search
-    quickly = lambda _, *args, quick: find(*args, quick=quick)  # noqa: E731
-    monkeypatch.setattr(type(CHECKERBOARD), "search", quickly)
     (found,) = visioncal.doctor(folder).findings
     assert found.kind == "other_board"
-    assert words in found.words
-    with pytest.raises(DataError, match=words) as caught:
+    assert "checkerboard of 9 x 6" in found.words
+    with pytest.raises(DataError, match="checkerboard of 9 x 6") as caught:
         visioncal.calibrate(folder)
     assert 'target = "checkerboard_9x6_25mm"' in caught.value.next_step
 
@@ -220,16 +213,3 @@ def test_a_resized_image_has_the_matrix_that_its_rays_have():
     # The middle of the first pixel of two is the middle of one.
     matrix = scaled_matrix(np.array([900.0, 900.0, 0.5, 639.5]), 0.5)
     np.testing.assert_allclose(matrix, [450.0, 450.0, 0.0, 319.5])
-
-
-@pytest.mark.parametrize("clockwise", [True, False])
-def test_a_turned_image_has_the_lens_that_its_rays_have(clockwise):
-    distortion = np.array([-0.1, 0.05, 0.003, -0.002, 0.01])
-    lens = Camera("brown", (1280, 800), np.array([900.0, 910.0, 600.0, 420.0]), distortion)
-    points = np.random.default_rng(1).uniform([-0.4, -0.3, 0.9], [0.4, 0.3, 1.1], (20, 3))
-    x, y, z = points.T
-    u, v = project(lens, points).T
-    # The first pixel of a row, and of a column, is pixel 0.
-    seen, turned = ((799 - v, u), (-y, x, z)) if clockwise else ((v, 1279 - u), (y, -x, z))
-    found = project(turned_lens(lens, clockwise=clockwise), np.stack(turned, axis=1))
-    np.testing.assert_allclose(found, np.stack(seen, axis=1), atol=1e-9)

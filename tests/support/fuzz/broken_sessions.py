@@ -336,11 +336,11 @@ BROKEN: Mapping[str, Mistake] = {
     ),
     "images turned clockwise": Mistake(
         _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_CLOCKWISE)),
-        "turned by 90 degrees clockw",
+        "turned by 90 degrees",
     ),
     "images turned counterclockwise": Mistake(
         _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_COUNTERCLOCKWISE)),
-        "turned by 90 degrees counterclockw",
+        "turned by 90 degrees",
     ),
     "the lens of larger images": Mistake(
         lambda folder: (

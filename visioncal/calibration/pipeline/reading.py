@@ -6,7 +6,7 @@ from dataclasses import replace
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import pair_edges
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
-from visioncal.calibration.stages.image_checks import pairing, searched_images
+from visioncal.calibration.stages.image_checks import pairing
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.motion import stream_of
@@ -45,8 +45,7 @@ def read_cell_inputs(run: RunState) -> RunState:
         )
     warnings = map(_suspicious, session.warnings)
     run = run.noting((), (*pairing(session), *warnings, *_not_used(run)))
-    notes = (*session.declaration.corrected, *searched_images(session))
-    run = replace(run, notes=(*run.notes, *notes))
+    run = replace(run, notes=(*run.notes, *session.declaration.corrected))
     if len(run.held_back) == len(session.views):
         raise all_held_back(run)
     # Views with only a time get their poses once the camera's are known.

@@ -214,27 +214,17 @@ def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") 
         return None
     if share_from_behind([(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
         return None
-    order, step = ": counterclockwise", "Number them clockwise from the marker's upper left"
-    if target.kind in _EXTRA_COLUMNS:
-        extra = _EXTRA_COLUMNS[target.kind]
-        columns, rows = target.columns - extra, target.rows - extra
-        order = ": rows from the bottom up, or column by column"
-        # Column by column, the corners of boards that are not square do not lie as drawn.
-        by_column = f"; where column by column, {columns} * (p % {rows}) + p // {rows}"
-        step = (
-            "Number them row by row from corner 0, which is at the upper left of the print (where "
-            f"rows were counted from the bottom, point p becomes {columns} * ({rows - 1} - p // "
-            f"{columns}) + p % {columns}{by_column if columns == rows else ''})"
-        )
-    elif target.columns * target.rows > 1:
-        order, step = "", "Number them as they are printed"
     whose = f"target {name}" if name else "the board"
     return Finding(
         "corner_numbers",
-        f"corners.csv numbers the corners of {whose} as if it was seen from behind{order}. The "
-        "camera's pose holds, but the board's frame is turned over: its z axis points at the "
-        "camera.",
-        Remedy(f"{step}, and calibrate again.", CALIBRATE),
+        f"corners.csv numbers the corners of {whose} as if it was seen from behind: rows from "
+        "the bottom up, column by column, or counterclockwise. The camera's pose holds, but the "
+        "board's frame is turned over: its z axis points at the camera.",
+        Remedy(
+            "Number them as they are printed, row by row from corner 0, at the upper left; those "
+            "of a marker clockwise from there. Calibrate again.",
+            CALIBRATE,
+        ),
         tuple(corners.view for corners in views),
     )
 

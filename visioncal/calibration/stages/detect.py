@@ -13,7 +13,6 @@ from threading import Lock
 import cv2
 
 from visioncal.calibration.stages.corner_numbers import usable_corners
-from visioncal.calibration.stages.image_checks import identified
 from visioncal.calibration.stages.image_size import Size, common_size, stated_size
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
@@ -33,9 +32,8 @@ from visioncal.vision.boards.imaging import (
 )
 from visioncal.vision.targets import corner_positions
 
-# Number of images that show the printed layout, or how they were turned; and the number of images
-# searched for them.
-_LAYOUT_SAMPLE, _MOST_SEARCHED = 3, 12
+# Number of images that show the printed layout.
+_LAYOUT_SAMPLE = 3
 # Share of the largest image from which on images are searched one at a time, as they fill memory.
 _LARGE, _ALONE = 0.25, Lock()
 
@@ -83,11 +81,9 @@ def detect(
     views = [view for view in among if view.image and not view.has_corners]
     given = [view for view in among if view.has_corners]
     stated, found = stated_size(session, among), dict[int, Searched]()
-    others = {board for board in session.boards if _shows_another(session, board, views)}
 
     def search(view: View) -> Searched:
-        quick = session.board_of(view) in others
-        return _search(session, view, stated, quick=quick, picture=pictures)
+        return _search(session, view, stated, picture=pictures)
 
     with ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         for view, searched in zip(views, pool.map(search, views), strict=True):
@@ -96,7 +92,7 @@ def detect(
                 progress("detect", len(found), len(views))
     sizes = {view: searched.size for view, searched in found.items() if searched.size is not None}
     if sizes:
-        resolution = common_size(session, views, sizes, lambda: _sample(session, views))
+        resolution = common_size(session, views, sizes)
     elif given and stated is not None:
         resolution = stated
     else:
@@ -153,29 +149,6 @@ def _no_size(session: Session, found: Mapping[int, Searched]) -> DataError:
     )
 
 
-def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
-    """Whether images clearly show another board than the declared checkerboard."""
-    # A thorough search for an absent board takes seconds an image, and is skipped where all images
-    # of a sample show another board.
-    target = session.boards[name]
-    mine = [view for view in views if session.board_of(view) == name]
-    if kind_of(target).symmetric != "squares" or not mine:
-        return False
-    for view in mine[:: max(len(mine) // _LAYOUT_SAMPLE, 1)][:_LAYOUT_SAMPLE]:
-        image = image_of(session, view)
-        if isinstance(image, Rejection) or not isinstance(
-            find_target(image, target, quick=True), NotFound
-        ):
-            return False
-        other = identified(image, target)
-        if other is None:
-            return False
-        # A board with markers may be beside the declared one.
-        if kind_of(other.board).has_markers and isinstance(corners_in(image, target), Corners):
-            return False
-    return True
-
-
 @contextmanager
 def _one_opencv_thread() -> Iterator[None]:
     before = cv2.getNumThreads()
@@ -202,9 +175,7 @@ def _decoded(view: View, data: bytes) -> Image | Rejection:
     return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
 
 
-def _search(
-    session: Session, view: View, stated: Size | None, *, quick: bool, picture: bool
-) -> Searched:
+def _search(session: Session, view: View, stated: Size | None, *, picture: bool) -> Searched:
     """Searches the image of one view, or takes what was found in it before."""
     name = session.board_of(view)
     earlier = session.images.search_of(view.image, name)
@@ -223,16 +194,14 @@ def _search(
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return Searched(image, None)
-        found, misfit = find_corners(image, target, view.number, quick=quick, name=name)
+        found, misfit = find_corners(image, target, view.number, name=name)
         faint = faint_jpeg(image) if picture else None
     return Searched(found, (image.shape[1], image.shape[0]), misfit, faint)
 
 
-def corners_in(
-    image: Image, target: Target, view: int = 0, *, quick: bool = False
-) -> Corners | NotFound:
+def corners_in(image: Image, target: Target, view: int = 0) -> Corners | NotFound:
     """Finds a target's corners in an (h, w) grey image, with their blur; see `find_target`."""
-    seen = find_target(image, target, quick=quick)
+    seen = find_target(image, target)
     if isinstance(seen, NotFound):
         return seen
     blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
@@ -240,7 +209,7 @@ def corners_in(
 
 
 def find_corners(
-    image: Image, target: Target, view: int, *, quick: bool = False, name: str = ""
+    image: Image, target: Target, view: int, *, name: str = ""
 ) -> tuple[Corners | Rejection, bool]:
     """Finds a target in one image.
 
@@ -248,14 +217,13 @@ def find_corners(
         image: (h, w) grey image.
         target: The target.
         view: The view's number.
-        quick: Whether to stop where a first, quick search fails.
         name: Name of the target in the session, where it has several.
 
     Returns:
         The corners, or why the view is rejected; and whether markers were seen in another layout
         than the target's.
     """
-    seen = corners_in(image, target, view, quick=quick)
+    seen = corners_in(image, target, view)
     if isinstance(seen, NotFound):
         cause = poor_image_reason(image, MAX_BLUR_PX)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
@@ -272,20 +240,6 @@ def find_corners(
     else:
         return seen, False
     return Rejection(view, reason), False
-
-
-def _sample(session: Session, views: Sequence[View]) -> dict[int, Corners]:
-    """The corners in a few images that show the board of the first view."""
-    name, sample = session.board_of(views[0]), dict[int, Corners]()
-    for view in [view for view in views if session.board_of(view) == name][:_MOST_SEARCHED]:
-        image = image_of(session, view)
-        if not isinstance(image, Rejection):
-            corners, _ = find_corners(image, session.boards[name], view.number)
-            if isinstance(corners, Corners):
-                sample[view.number] = corners
-        if len(sample) == _LAYOUT_SAMPLE:
-            break
-    return sample
 
 
 def _check_layout(session: Session, name: str, searches: Mapping[View, Searched]) -> None:

@@ -19,10 +19,9 @@ from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.boards import DetectedCorners, kind_of
 from visioncal.vision.boards.checkerboard import CHECKERBOARD
-from visioncal.vision.boards.identify import DESCRIBE_IT, describe, identify
+from visioncal.vision.boards.identify import describe, identify
 from visioncal.vision.boards.identity import Identity
 from visioncal.vision.boards.imaging import blur_of_edges, decode_image, poor_image_reason
-from visioncal.vision.boards.kind import marker_cells
 from visioncal.vision.targets import board_words, load_target, target_names
 
 # Names that are listed, and images that are searched for any board.
@@ -47,16 +46,6 @@ def pairing(session: Session) -> Iterator[Finding]:
     yield from _missing_images(session)
     yield from _empty_rows(session)
     yield from _shared_images(session)
-
-
-def searched_images(session: Session) -> Iterator[str]:
-    """States whose images are searched, where corners.csv has rows of other views alone."""
-    searched = [str(view.number) for view in _searched(session)]
-    if searched and any(view.has_corners for view in session.views):
-        yield (
-            f"corners.csv has no rows of view {some_of(searched, _LISTED)}: their images were "
-            "searched."
-        )
 
 
 def unnamed_images(session: Session) -> Iterator[Finding]:
@@ -201,7 +190,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         image = decode_image(session.images.read(view.image))
         if isinstance(image, str):
             continue
-        identity = identified(image, declared)
+        identity = _identified(image, declared)
         if identity is not None:
             found.append((view, identity))
             if identity.whole and identity.corners_seen == identity.corners:
@@ -220,7 +209,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     return _other_board_finding(view, identity, declared)
 
 
-def identified(image: Image, declared: Target) -> Identity | None:
+def _identified(image: Image, declared: Target) -> Identity | None:
     """The board of an image by its markers, or a checkerboard whose squares were miscounted.
 
     None where few of its corners are seen, as where it is blurred.
@@ -276,24 +265,14 @@ def _other_board_finding(view: View, identity: Identity, declared: Target) -> Fi
     )
     words = (
         f"The images show another board than declared: {seen} (view {view.number}), and "
-        f"{declared.name} is {stated}.{_counting_mistake(identity, declared)}"
+        f"{declared.name} is {stated}."
     )
     return Finding("other_board", words, step, (view.number,))
 
 
-def _counting_mistake(identity: Identity, declared: Target) -> str:
-    """The likely mistake in counting inner corners, in words; empty for another difference."""
-    if any(kind_of(target).symmetric != "squares" for target in (identity.board, declared)):
-        return ""
-    counts = (sorted((target.columns, target.rows)) for target in (declared, identity.board))
-    if {stated - seen for stated, seen in zip(*counts, strict=True)} in ({1}, {-1}):
-        return " Columns and rows are of inner corners: one less each than of squares."
-    return ""
-
-
 def _is_mirrored(image: Image, declared: Target) -> bool:
     """Whether a board is seen where left and right are exchanged; only markers show it."""
-    mirrored = identified(np.ascontiguousarray(image[:, ::-1]), declared)
+    mirrored = _identified(np.ascontiguousarray(image[:, ::-1]), declared)
     return (
         mirrored is not None
         and kind_of(mirrored.board).has_markers
@@ -321,26 +300,16 @@ def _unread(view: View, image: Image, declared: Target, unseen: int) -> Finding 
         of_all = f" in {unseen} views" if unseen > 1 else ""
         words = f"No board can be read{of_all}: in view {view.number}, {why}."
         return Finding("blurred_images", words, Remedy(_FOCUS), (view.number,))
-    blur_px, size = blur_of_edges(image), ""
+    blur_px = blur_of_edges(image)
     if not kind_of(declared).marks_squares:
         return None
-    plain = CHECKERBOARD.inside(declared)
-    squares = CHECKERBOARD.search(image, plain)
-    if isinstance(squares, DetectedCorners):
-        grid = squares.px.reshape(plain.rows, plain.columns, 2)
-        square_px = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
-        marker_px = square_px * declared.marker_m / declared.square_m
-        module_px = marker_px / len(marker_cells(declared.dictionary, 0))
-        size = f"they are {marker_px:.0f} px wide, {module_px:.1f} px a module, and "
-    elif blur_px <= _SHARP_PX:
+    squares = CHECKERBOARD.search(image, CHECKERBOARD.inside(declared))
+    if not isinstance(squares, DetectedCorners) and blur_px <= _SHARP_PX:
         return None
     return Finding(
         "unread_markers",
-        f"The markers of {declared.name} cannot be read: {size}edges have a blur (sigma) of "
-        f"{blur_px:.1f} px (view {view.number}).",
-        Remedy(
-            f"Bring the board nearer, or use one of fewer and larger squares. {_FOCUS}"
-            + ("" if size else f" {DESCRIBE_IT}")
-        ),
+        f"The markers of {declared.name} cannot be read: they are too small, or blurred (sigma of "
+        f"edges {blur_px:.1f} px, view {view.number}).",
+        Remedy(f"Bring the board nearer, or use one of fewer and larger squares. {_FOCUS}"),
         (view.number,),
     )

@@ -1,15 +1,14 @@
 """Size of a camera's images, and the lens of images that were resized or turned."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 
 import numpy as np
 
-from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError
 from visioncal.core.finding_kinds import OTHER_SIZE
 from visioncal.core.number_format import some_of
-from visioncal.core.types import Camera, Corners, FloatArray, Target
+from visioncal.core.types import Camera, FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
@@ -29,19 +28,13 @@ def stated_size(session: Session, views: Sequence[View]) -> Size | None:
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def common_size(
-    session: Session,
-    views: Sequence[View],
-    sizes: Mapping[int, Size],
-    sample: Callable[[], Mapping[int, Corners]],
-) -> Size:
+def common_size(session: Session, views: Sequence[View], sizes: Mapping[int, Size]) -> Size:
     """The stated (width, height) of images [px], else the most common one.
 
     Args:
         session: The session.
         views: The views with images, of one camera.
         sizes: (width, height) of each image that can be read, by view [px]; one or more.
-        sample: Finds the corners in a few of the images.
 
     Raises:
         DataError: Half of the images or more have another size.
@@ -59,7 +52,7 @@ def common_size(
     if 2 * len(culprits) < len(found):
         return size
     if len(set(found)) == 1:
-        words, step = _other_size(session, views[0], found[0], sample)
+        words, step = _other_size(session, views[0], found[0])
         message = (
             f"All {len(found)} images are {found[0][0]} x {found[0][1]} px, but session.toml has "
             f"resolution = [{size[0]}, {size[1]}]{words and f': {words}'}."
@@ -74,9 +67,7 @@ def common_size(
     raise DataError(message, culprits=culprits, next_step=step)
 
 
-def _other_size(
-    session: Session, view: View, size: Size, sample: Callable[[], Mapping[int, Corners]]
-) -> tuple[str, str]:
+def _other_size(session: Session, view: View, size: Size) -> tuple[str, str]:
     """What all images of another size than the camera's are, and what to type."""
     mine = name_of(session.declaration, "camera", view)
     stated = session.cameras[mine].stated
@@ -91,20 +82,14 @@ def _other_size(
     write = f"In session.toml, {write}"
     if stated is None:
         return "", f"{write}."
-    if size == stated.resolution[::-1]:
-        how, lens = _quarter_turn(stated, sample(), session.boards[session.board_of(view)])
-        if not how:
-            return "", f"{write}."
-        if np.any(stated.distortion != lens.distortion):
-            write += f" and {_entry('distortion', lens.distortion, '.6g')}"
-        return (
-            f"the images were turned by 90 degrees {how} after the matrix was made",
-            f"{write} and {_entry('matrix', lens.matrix)}; the camera's frame turns with them.",
-        )
     scales = size[0] / stated.resolution[0], size[1] / stated.resolution[1]
     if abs(scales[0] / scales[1] - 1.0) < _SAME_SHAPE:
-        return "", f"{write} and {_entry('matrix', scaled_matrix(stated.matrix, scales[0]))}."
-    return "", f"{write}, and delete matrix and distortion: they are of other images."
+        return "", f"{write} and {_entry(scaled_matrix(stated.matrix, scales[0]))}."
+    turned = "the images were turned by 90 degrees after the matrix was made"
+    return (
+        turned if size == stated.resolution[::-1] else "",
+        f"{write}, and delete matrix and distortion: they are of other images.",
+    )
 
 
 def other_size_findings(
@@ -152,7 +137,7 @@ def other_images(stated: Camera, matrix: FloatArray) -> tuple[str, str]:
         f"The stated matrix is for images of {width / scale:.0f} x {height / scale:.0f} px, and "
         f"these are {width} x {height} px: fx is {stated.matrix[0]:.1f} px there, and "
         f"{matrix[0]:.1f} px by these images ({scale:.3g} times as large).",
-        f"In session.toml, write {_entry('matrix', scaled)}.",
+        f"In session.toml, write {_entry(scaled)}.",
     )
 
 
@@ -161,36 +146,5 @@ def scaled_matrix(matrix: FloatArray, scale: float) -> FloatArray:
     return np.array([*(scale * matrix[:2]), *(scale * (matrix[2:] + 0.5) - 0.5)])
 
 
-def turned_lens(camera: Camera, *, clockwise: bool) -> Camera:
-    """Lens of images turned by 90 degrees; the camera's frame turns with them."""
-    (width, height), (fx, fy, cx, cy) = camera.resolution, camera.matrix
-    matrix = [fy, fx, height - 1 - cy, cx] if clockwise else [fy, fx, cy, width - 1 - cx]
-    distortion = camera.distortion.copy()
-    if camera.model == "brown":
-        p1, p2 = distortion[2:4]
-        distortion[2:4] = (p2, -p1) if clockwise else (-p2, p1)
-    return Camera(camera.model, (height, width), np.array(matrix), distortion)
-
-
-def _quarter_turn(
-    stated: Camera, corners: Mapping[int, Corners], target: Target
-) -> tuple[str, Camera]:
-    """Direction in which images were turned, and their lens; empty where the stated matrix fits."""
-    lenses = {
-        "": Camera(stated.model, stated.resolution[::-1], stated.matrix, stated.distortion),
-        "clockwise": turned_lens(stated, clockwise=True),
-        "counterclockwise": turned_lens(stated, clockwise=False),
-    }
-
-    def misfit_px(how: str) -> float:
-        try:
-            return estimate_poses(corners, [target], lenses[how]).sigma_px
-        except DataError:
-            return np.inf
-
-    best = min(lenses, key=misfit_px)
-    return best, lenses[best]
-
-
-def _entry(key: str, values: FloatArray, form: str = ".2f") -> str:
-    return f"{key} = [{', '.join(format(value, form) for value in values.tolist())}]"
+def _entry(matrix: FloatArray) -> str:
+    return f"matrix = [{', '.join(f'{value:.2f}' for value in matrix.tolist())}]"
