@@ -17,7 +17,7 @@ from support.fuzz.slips import (
     with_tool,
 )
 
-from visioncal.calibration.guess.joint_guess import guess_joints
+from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.reported_poses import reported_poses

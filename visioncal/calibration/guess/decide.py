@@ -1,31 +1,36 @@
 """Decision which reading is right: by its posterior beside the declared one and none of these.
 
-Reported poses are `base_from_model @ FK(q) @ flange_from_tool` with two constant transforms: a
-turned base, and an inverse that may as well be another mount, show only in the robot's own joints.
+Inverting the robot's poses, inverting the camera's, and changing the mount all exchange the unknown
+edges: no residual distinguishes them. The robot's joints do, and plausibility: what is mounted on
+the flange is near it, and the target is in front of the camera. A base that is turned shows in the
+joints alone.
 """
 
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import distances, is_about_one_axis
-from visioncal.calibration.guess.hypothesis import HALF_TURN, ROW_ORDERS, Hypothesis
-from visioncal.calibration.guess.messages import notes, sentence
-from visioncal.calibration.guess.recording import (
-    CLEAR,
+from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fit
+from visioncal.calibration.guess.readings import (
+    HALF_TURN,
+    HALF_TURNED,
+    Hypothesis,
+    of_exchanged_rows,
+)
+from visioncal.calibration.guess.search import (
     CLOSING_SCORE,
     EVIDENCE,
     FEWEST_ROWS,
+    IMPOSSIBLE,
+    Candidate,
     Recording,
-    Scored,
-    chain_fit,
+    chains,
     fitted,
-    flange_and_cell_m,
-    plausibility,
+    search,
+    thinned,
 )
-from visioncal.calibration.guess.result import Candidate, Guess
-from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
@@ -33,15 +38,35 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, pose_difference, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
+# Log posterior odds from which one reading is preferred to another.
+_CLEAR = 3.0
+# Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
+_BY_LENGTH, _MOST_BY_LENGTH = 10.0, 10.0
 _LISTED = 12
 # Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
 # Nominal models differ from the controller's by a few millimetres; a half turn, by far more.
 _NEAR_MM, _NEAR_DEG = 10.0, 2.0
-# Most rows that are fitted again, and most of them that are tried as exchanged.
-_MOST_ROWS, _MOST_OUTLIERS = 200, 8
-# Random subsets from which the fit of an order starts.
-_STARTS = 12
+# Most outlier rows that are tried as exchanged.
+_MOST_OUTLIERS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """The reading of the poses that is right, and its rivals."""
+
+    declared: Candidate  # The declared reading.
+    # The best readings, best first, with the declared one; each represents all readings that
+    # residuals cannot distinguish from it.
+    candidates: tuple[Candidate, ...]
+    best: Candidate  # The reading that stands out; the declared one where none does.
+    sentence: str  # The finding, with its figures.
+    notes: tuple[str, ...] = ()  # What residuals cannot show here, in sentences.
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether another reading than the declared one is clearly right."""
+        return self.best is not self.declared
 
 
 def guess_reading(
@@ -75,14 +100,14 @@ def guess_reading(
     recordings = [Recording(robot, camera, name, is_measured, chain) for name in mounts]
     _check(recordings[0])
     with one_blas_thread():
-        guesses = [(recording, *_decided(recording)) for recording in recordings]
+        found = [_decided(recording) for recording in recordings]
         if mount is None:
             # Of two that find the same reading, the one that changes less.
-            guesses.sort(
-                key=lambda item: (-round(_beside_other_mount(*item[::2]), 3), -item[2].log_prior)
+            found.sort(
+                key=lambda item: (-round(_beside_other_mount(item[1]), 3), -item[1].log_prior)
             )
-            _check_mount(*((recording, best) for recording, _, best in guesses))
-        return _guess(*guesses[0], is_mount_given=mount is not None)
+            _check_mount(*(best for _, best in found))
+        return _guess(*found[0], is_mount_given=mount is not None)
 
 
 def _check(recording: Recording) -> None:
@@ -104,7 +129,7 @@ def _check(recording: Recording) -> None:
                 next_step="Declare a form of rotation with as many numbers; which of them it is, "
                 "will be found.",
             )
-    common = len(recording.common_rows())
+    common = len(recording.common_rows)
     if common < FEWEST_ROWS:
         raise DegenerateError(
             f"guess: {counted(common, 'row', ('has', 'have'))} a pose of the robot and one of the "
@@ -114,86 +139,127 @@ def _check(recording: Recording) -> None:
         )
 
 
-def _decided(recording: Recording) -> tuple[list[Scored], Scored]:
+def _decided(recording: Recording) -> tuple[list[Candidate], Candidate]:
     """All readings, the declared one first, and the one that stands out; else the declared one."""
-    declared, *others = search(recording)
-    scored = [declared, *others, *_reordered(recording, declared)]
-    best = _likeliest(recording, scored)
-    swapped = _exchanged(recording, best)
+    tried = search(recording)
+    best = _likeliest(tried)
+    if best is not tried[0]:
+        tried[tried.index(best)] = best = _with_likeliest_label(best)
+    swapped = _exchanged(best)
     if swapped is not None:
-        scored.append(best := swapped)
-    if _is_half_turned(recording, best.hypothesis):
-        turned = replace(best.hypothesis.robot, half_turned=True)
-        best = replace(best, hypothesis=replace(best.hypothesis, robot=turned), labels=())
-        scored.append(best)
-    return scored, best
+        tried.append(best := swapped)
+    fit = _by_joints(best)
+    if fit is not None and fit.score <= CLOSING_SCORE:
+        away_mm, away_deg = pose_difference(HALF_TURN, fit.x)
+        if away_mm < _NEAR_MM and away_deg < _NEAR_DEG:
+            best = replace(best, hypothesis=HALF_TURNED.of(best.hypothesis), labels=())
+            tried.append(best)
+    return tried, best
 
 
-def _likeliest(recording: Recording, scored: list[Scored]) -> Scored:
+def _likeliest(tried: Sequence[Candidate]) -> Candidate:
     """The reading whose posterior stands out from the others' and none's; else the declared one."""
-    declared, *others = sorted(
-        scored, key=lambda item: (item is not scored[0], -item.log_posterior)
-    )
-    if not others or _is_poor(recording, others[0]):
+    declared, *others = tried
+    best = max(others, key=lambda item: item.log_posterior, default=declared)
+    if _is_poor(best):
         return declared
-    best = others[0]
     rivals = [declared.log_posterior, best.log_posterior - best.log_odds]
-    rivals += [item.log_posterior for item in others if not _are_same(recording, item, best)]
-    return best if best.log_posterior > max(rivals) + CLEAR else declared
-
-
-def _reordered(recording: Recording, declared: Scored) -> list[Scored]:
-    """The declared reading with all rows in another order."""
-    rows = recording.common_rows()
-    rows = declared.rows if declared.is_readable else rows[:_MOST_ROWS]
-    tried = (replace(declared.hypothesis, order=order) for order in ROW_ORDERS)
-    return [
-        item for order in tried if (item := fitted(recording, order, rows, _STARTS)).is_readable
+    rivals += [
+        other.log_posterior
+        for other in others
+        if other.log_posterior > best.log_posterior - _CLEAR and not _are_same(best, other)
     ]
+    return best if best.log_posterior > max(rivals) + _CLEAR else declared
 
 
-def _exchanged(recording: Recording, scored: Scored) -> Scored | None:
-    """The reading with two rows exchanged that explains two outlier views; None if unclear."""
-    is_few = len(scored.rows) <= _MOST_OUTLIERS
-    if not scored.is_readable or (is_few and _is_poor(recording, scored)):
+def _with_likeliest_label(best: Candidate) -> Candidate:
+    """Chooses the reading with the most plausible cell among those of one class."""
+    labels = tuple(label for label in best.labels if label.cost == best.hypothesis.cost)
+    if not labels:
+        return best
+    tried = fitted(best.recording, labels, thinned(best.recording.common_rows), STARTS)
+    likely = [_plausibility(item) for item in tried]
+    chosen = tried[int(np.argmax(likely))]
+    as_likely = (
+        item.differences
+        for item, odds in zip(tried, likely, strict=True)
+        if item.hypothesis.mount != chosen.hypothesis.mount and odds > max(likely) - _CLEAR
+    )
+    return replace(chosen, labels=labels, other_mount=next(as_likely, ()))
+
+
+def _plausibility(candidate: Candidate) -> float:
+    """Log odds of the cell that a reading gives, beside readings that close the chain alike."""
+    if not candidate.is_readable:
+        return -np.inf
+    camera = candidate.hypothesis.camera.poses(candidate.recording.camera.rows(candidate.of_rows))
+    in_front = IMPOSSIBLE * bool(np.median(camera[:, 2, 3]) > 0.0)
+    on_flange_m, at_base_m = np.log(np.maximum(_flange_and_cell_m(candidate), 1e-6))
+    by_length = _BY_LENGTH * (at_base_m - on_flange_m)
+    fit = _by_joints(candidate)
+    by_joints = 0.0 if fit is None else fit.log_likelihood
+    return float(in_front + np.clip(by_length, -_MOST_BY_LENGTH, _MOST_BY_LENGTH) + by_joints)
+
+
+def _flange_and_cell_m(candidate: Candidate) -> tuple[float, float]:
+    """Lengths of the unknown edge on the flange and of the one at the base [m]."""
+    edges = candidate.fit.x, candidate.fit.z
+    on_flange, at_base = edges if candidate.hypothesis.mount == "eye-in-hand" else edges[::-1]
+    return float(np.linalg.norm(on_flange[:3, 3])), float(np.linalg.norm(at_base[:3, 3]))
+
+
+def _by_joints(candidate: Candidate) -> Fit | None:
+    """Fits the poses of a reading to those of the joints; None with too few of these."""
+    recording = candidate.recording
+    if recording.chain is None:
         return None
-    before = fitted(recording, scored.hypothesis, recording.common_rows()[:_MOST_ROWS], 0)
-    robot_rows = before.hypothesis.rows(len(recording.robot))
-    farthest = np.argsort(-before.fit.residuals)[:_MOST_OUTLIERS]
-    pairs = combinations(np.sort(before.rows[farthest]), 2)
-    swaps = (
-        replace(before.hypothesis, swap=tuple(robot_rows[list(pair)].tolist())) for pair in pairs
-    )
-    tried = [_with_swap(recording, before, swap) for swap in swaps]
-    best, second = sorted(tried, key=lambda item: -item.log_posterior)[:2]
-    rival = max(before.log_posterior, second.log_posterior)
-    # About one axis, the positions are closed by chance, and rotations alone show an exchange.
-    if _is_poor(recording, before):
-        moved = np.isin(robot_rows[before.rows], best.hypothesis.swap)
-        is_turned = before.fit.angle[moved].min() > CLOSING_SCORE > best.fit.angle[moved].max()
-        rival = rival if is_turned else np.inf
+    both = recording.robot.present & np.isfinite(recording.chain).all(axis=(1, 2))
+    rows = thinned(np.flatnonzero(both))
+    poses = candidate.hypothesis.robot.poses(recording.robot.rows(rows))
+    readable = np.isfinite(poses).all(axis=(1, 2))
+    if readable.sum() < FEWEST_ROWS:
+        return None
+    return robust_fit(invert(poses[readable]), recording.chain[rows[readable]])
+
+
+def _exchanged(best: Candidate) -> Candidate | None:
+    """The reading with two rows exchanged that explains two outlier views; None if unclear."""
+    recording, rows = best.recording, best.recording.common_rows
+    if not best.is_readable or (len(rows) <= _MOST_OUTLIERS and _is_poor(best)):
+        return None
+    robot, camera = (side[0] for side in chains(recording, [best.hypothesis], rows))
+    residuals = distances(robot, camera, best.fit.lever, (best.fit.x, best.fit.z)).residuals
+    farthest = np.argsort(-np.nan_to_num(residuals, nan=-1.0))[:_MOST_OUTLIERS]
+    of_robot = best.hypothesis.rows(len(recording.robot))
+    swaps = [
+        of_exchanged_rows(tuple(of_robot[list(pair)].tolist()), recording.robot.places)
+        for pair in combinations(np.sort(rows[farthest]), 2)
+        if (of_robot[list(pair)] >= 0).all()
+    ]
+    looked = np.union1d(thinned(rows), rows[farthest])
+    readings = [best.hypothesis, *(swap.of(best.hypothesis) for swap in swaps)]
+    before, *tried = fitted(recording, readings, looked, 0)
+    if len(tried) < 2 or before.agreeing == before.rows:
+        return None
+    found, second = sorted(tried, key=lambda item: -item.log_posterior)[:2]
+    if _is_poor(before):
+        # About one axis, the positions are closed by chance, and rotations alone show an exchange.
+        moved = np.isin(of_robot[before.of_rows], found.hypothesis.swap)
+        if not before.fit.angle[moved].min() > CLOSING_SCORE > found.fit.angle[moved].max():
+            return None
+        none = -np.inf
     else:
-        rival = max(rival, best.log_posterior - best.log_odds)
-    return best if best.log_posterior > rival + CLEAR else None
+        none = found.log_posterior - found.log_odds
+    rival = max(before.log_posterior, second.log_posterior, none)
+    return found if found.log_posterior > rival + _CLEAR else None
 
 
-def _with_swap(recording: Recording, before: Scored, changed: Hypothesis) -> Scored:
-    """The fit with two rows exchanged; among many, which left these out, with the same edges."""
-    after, rows, fit = fitted(recording, changed, before.rows, 0), before.rows, before.fit
-    if len(rows) <= _MOST_OUTLIERS:
-        return after
-    robot, camera = changed.chain(recording.robot, recording.camera)
-    same_edges = distances(robot[rows], camera[rows], fit.lever, (fit.x, fit.z))
-    return replace(after, fit=same_edges)
-
-
-def _are_same(recording: Recording, best: Scored, rival: Scored) -> bool:
+def _are_same(best: Candidate, rival: Candidate) -> bool:
     """Whether two readings give the same poses, so that choosing does not matter."""
-    rows = np.intersect1d(best.rows, rival.rows)
-    (first, _), (second, _) = (
-        item.hypothesis.chain(recording.robot, recording.camera) for item in (best, rival)
-    )
-    difference = invert(first[rows]) @ second[rows]
+    rows = np.intersect1d(best.of_rows, rival.of_rows)
+    pair = [best.hypothesis, rival.hypothesis]
+    first, second = chains(best.recording, pair, rows)[0]
+    difference = invert(first) @ second
     shift, angle = best.fit.rms
     return bool(
         np.sqrt(np.mean(rotation_angle(difference) ** 2)) <= _SAME * angle
@@ -201,83 +267,138 @@ def _are_same(recording: Recording, best: Scored, rival: Scored) -> bool:
     )
 
 
-def _is_poor(recording: Recording, best: Scored) -> bool:
+def _is_poor(best: Candidate) -> bool:
     """Whether the camera turns about one axis at most."""
     if not best.is_readable:
         return False
-    _, camera = best.hypothesis.chain(recording.robot, recording.camera)
-    return is_about_one_axis(camera[best.rows[best.fit.kept], :3, :3])
+    kept = best.recording.camera.rows(best.of_rows[best.fit.kept])
+    return is_about_one_axis(best.hypothesis.camera.poses(kept)[:, :3, :3])
 
 
-def _is_half_turned(recording: Recording, hypothesis: Hypothesis) -> bool:
-    """Whether the base is turned by 180 degrees about z relative to the model's."""
-    fit = chain_fit(recording, hypothesis)
-    if fit is None or fit.score > CLOSING_SCORE:
-        return False
-    away_mm, away_deg = pose_difference(HALF_TURN, fit.x)
-    return away_mm < _NEAR_MM and away_deg < _NEAR_DEG
-
-
-def _beside_other_mount(recording: Recording, best: Scored) -> float:
+def _beside_other_mount(best: Candidate) -> float:
     """Log posterior by which the mount is chosen; the changes alone decide nothing."""
     # Inverted poses close the chain under the wrong mount as well as the poses do under the right
     # one.
-    return EVIDENCE * best.fit.log_likelihood + plausibility(recording, best)
+    return EVIDENCE * best.fit.log_likelihood + _plausibility(best)
 
 
-def _check_mount(likelier: tuple[Recording, Scored], other: tuple[Recording, Scored]) -> None:
+def _check_mount(likelier: Candidate, other: Candidate) -> None:
     """Refuses a choice between two mounts that fit alike."""
-    first, second = likelier[1].hypothesis.mount, other[1].hypothesis.mount
-    is_clear = _beside_other_mount(*likelier) > _beside_other_mount(*other) + CLEAR
-    closes = likelier[1].fit.score <= CLOSING_SCORE
-    if first == second or not closes or (is_clear and not _is_poor(*likelier)):
+    first, second = likelier.hypothesis.mount, other.hypothesis.mount
+    is_clear = _beside_other_mount(likelier) > _beside_other_mount(other) + _CLEAR
+    if first == second or not likelier.closes or (is_clear and not _is_poor(likelier)):
         return
-    pair = sorted((likelier, other), key=lambda item: MOUNTS.index(item[0].mount))
-    readings = " and ".join(
-        f"{best.hypothesis.mount} ({_candidate(recording, best).words})" for recording, best in pair
-    )
+    pair = sorted((likelier, other), key=lambda item: MOUNTS.index(item.declared.mount))
+    readings = " and ".join(f"{best.hypothesis.mount} ({best.words})" for best in pair)
     raise DataError(
         f"The mount is not given, and the poses fit both ways of mounting: {readings}.",
         next_step="Say where the camera is with --mount.",
     )
 
 
-def _guess(
-    recording: Recording, scored: list[Scored], best: Scored, *, is_mount_given: bool
-) -> Guess:
-    candidates = {id(item): _candidate(recording, item) for item in scored}
-    declared, chosen = candidates[id(scored[0])], candidates[id(best)]
-    ranked = sorted(candidates.values(), key=lambda item: (item is not chosen, -item.log_posterior))
-    ranked = ranked[:_LISTED]
+def _guess(tried: list[Candidate], best: Candidate, *, is_mount_given: bool) -> Guess:
+    declared = tried[0]
+    ranked = sorted(tried, key=lambda item: (item is not best, -item.log_posterior))[:_LISTED]
     if declared not in ranked:
         ranked[-1] = declared
-    is_poor, is_other = _is_poor(recording, best), chosen is not declared
-    words = tuple(notes(recording, best, is_declared=not is_other, is_poor=is_poor))
-    if not is_mount_given and best.fit.score <= CLOSING_SCORE:
-        on_flange_m, at_base_m = flange_and_cell_m(best)
-        mount = (
+    notes = [*_notes(best, is_declared=best is declared)]
+    if not is_mount_given and best.closes:
+        on_flange_m, at_base_m = _flange_and_cell_m(best)
+        notes.insert(
+            0,
             f"The mount was not given and is taken for {best.hypothesis.mount}: what sits on the "
             f"flange then is {1e3 * on_flange_m:.0f} mm from it, and what stands at the base "
-            f"{1e3 * at_base_m:.0f} mm. --mount says another."
+            f"{1e3 * at_base_m:.0f} mm. --mount says another.",
         )
-        words = (mount, *words)
-    finding = sentence(declared, chosen, ranked, is_poor=is_poor)
-    return Guess(declared, tuple(ranked), chosen, is_other, finding, words)
+    return Guess(declared, tuple(ranked), best, _sentence(declared, best, ranked), tuple(notes))
 
 
-def _candidate(recording: Recording, scored: Scored) -> Candidate:
-    shift, angle = scored.fit.rms
-    other = scored.other_mount
-    return Candidate(
-        hypothesis=scored.hypothesis,
-        declared=recording.declared,
-        differences=recording.changes(scored.hypothesis),
-        rms_mm=1e3 * shift,
-        rms_deg=float(np.rad2deg(angle)),
-        score=scored.fit.score,
-        log_posterior=scored.log_posterior,
-        agreeing=scored.fit.agreeing,
-        rows=len(scored.fit.residuals),
-        is_board=recording.is_measured,
-        other_mount=() if other is None else recording.changes(other),
+def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate]) -> str:
+    """States the finding, with its figures."""
+    if best is not declared:
+        return _best_sentence(declared, best)
+    if not declared.is_readable:
+        return (
+            "As declared, the rotations of the robot or of the camera are none, and no other "
+            "reading of the numbers stands out."
+        )
+    rivals = [candidate for candidate in ranked if candidate is not declared]
+    others = f"the next, {rivals[0].words}, to {_figures(rivals[0])}" if rivals else ""
+    closes = f"the chain closes to {_figures(declared)}"
+    if _is_poor(declared):
+        return (
+            "The motion cannot distinguish readings: all views turn about one axis at most. As "
+            f"declared, {closes}{others and f'; {others}'}. Add views tilted about different axes."
+        )
+    is_beaten = any(rival.log_posterior > declared.log_posterior + _CLEAR for rival in rivals)
+    if not declared.closes or is_beaten:
+        return (
+            f"No reading that was tried stands out: as declared, {closes}"
+            f"{others and f'; {others}'}."
+        )
+    return f"The poses fit as declared: {closes}; {others or 'no other reading comes near'}."
+
+
+def _best_sentence(declared: Candidate, best: Candidate) -> str:
+    closes = f"With {best.words}, the chain closes to {_figures(best)}"
+    if not declared.is_readable:
+        return f"{closes}; as declared, the numbers are no rotations."
+    if best.hypothesis.robot.half_turned:
+        return (
+            f"{closes}, and the poses are those of the joint angles; as declared, the chain closes "
+            f"to {_figures(declared)}."
+        )
+    if best.hypothesis.swap and len(best.differences) == 1:
+        return f"{closes}; as declared, {declared.agreeing} of {declared.rows} views agree."
+    also = "; ".join(name for name in best.other_mount if name not in best.differences)
+    own = "; ".join(name for name in best.differences if name not in best.other_mount)
+    other = f"; {also} in place of {own} fits as well" if also else ""
+    return f"{closes} instead of {_figures(declared)}{other}."
+
+
+def _figures(candidate: Candidate) -> str:
+    agreeing, rows = candidate.agreeing, candidate.rows
+    return f"{candidate.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
+
+
+def _notes(best: Candidate, *, is_declared: bool) -> Iterator[str]:
+    """States what residuals cannot show here."""
+    reading = best.hypothesis
+    others = _likelier_labels(best) if is_declared else best.labels
+    # Other units for both sides only scale the cell.
+    also = " or with ".join(
+        "; ".join(other.changes)
+        for other in others
+        if other != reading and other.robot.unit == reading.robot.unit
     )
+    if also and not is_declared:
+        yield (
+            f"The views close the chain in the same way with {also}. It was chosen by what lies "
+            "nearer to the flange, or by the joints."
+        )
+    elif also and not _is_poor(best):
+        yield (
+            f"The views close the chain in the same way with {also}, which is likelier: as "
+            "declared, what sits on the flange is far from it, or the target behind the camera."
+        )
+    if reading.robot.signs == "mirror":
+        yield (
+            "Mirrored images look the same, and are the usual cause: turn those back instead of "
+            "changing poses that are right. Which axis is mirrored cannot be seen in the views: "
+            "another one turns the base and the flange by half a turn. y was taken."
+        )
+    if best.recording.chain is None:
+        yield (
+            "A base turned about its z (base_link for base) does not show without joint angles "
+            "and the robot's model."
+        )
+
+
+def _likelier_labels(declared: Candidate) -> list[Hypothesis]:
+    """The simplest readings that close the chain as the declared one with a likelier cell."""
+    rows, limit = thinned(declared.recording.common_rows), _plausibility(declared) + _CLEAR
+    unit = declared.hypothesis.robot.unit
+    labels = [label for label in declared.labels if label.changes and label.robot.unit == unit]
+    tried = fitted(declared.recording, labels, rows, STARTS)
+    likelier = [item.hypothesis for item in tried if _plausibility(item) > limit]
+    return [label for label in likelier if label.cost == min(item.cost for item in likelier)]

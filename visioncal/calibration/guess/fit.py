@@ -1,4 +1,4 @@
-"""Robust fit of both unknown edges of the chain, its closing error without unit, its likelihood.
+"""Robust fits of both unknown edges of the chain, their closing errors without unit, likelihoods.
 
 Distances of the target's positions are divided by the typical distance between camera and target,
 and combined with angles in radians. So a reading that makes everything tiny gains nothing.
@@ -7,6 +7,7 @@ The likelihood is by which readings are compared: a view is gaussian, with the s
 of its own fit, or one of a few outliers, with a broad tail.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,20 +16,22 @@ import numpy as np
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.robust import trimmed_start
 
-# Share of the views that is fitted: two rows exchanged among eight are a quarter.
-KEPT_SHARE = 0.7
-# Fewer views would agree with any reading.
-_FEWEST_KEPT = 5
+# Random small subsets from which a fit starts where views may be wrong.
+STARTS = 12
+# Share of the views that is fitted: two rows exchanged among eight are a quarter; fewer than the
+# second would agree with any reading.
+_KEPT_SHARE, _FEWEST_KEPT = 0.7, 5
 _SUBSET = 4
+# Starts that are followed, concentration steps, and fits in one batch, which memory limits.
+_FOLLOWED, _STEPS, _BATCH = 3, 6, 64
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the equations of a view.
 _UNKNOWNS, _PER_VIEW = 12, 6
 # Standard deviation by axis [rad, or share of the distance]: readings are not distinguished by less
 # than the first, and beyond the second no reading explains the views.
-LEAST_SIGMA, UNEXPLAINED_SIGMA = 5e-4, 0.12
+_LEAST_SIGMA, _UNEXPLAINED_SIGMA = 5e-4, 0.12
 # Prior probability of an outlier view, and rounds in which outliers are weighted down.
 _OUTLIER_PRIOR, _ROUNDS = 0.05, 5
 
@@ -52,7 +55,7 @@ class Fit:
     @cached_property
     def kept(self) -> IntArray:
         """The rows with the smallest residuals, smallest first."""
-        return np.argsort(self.residuals, kind="stable")[: kept_count(len(self.residuals))]
+        return np.argsort(self.residuals, kind="stable")[: _kept_count(len(self.residuals))]
 
     @cached_property
     def score(self) -> float:
@@ -64,10 +67,25 @@ class Fit:
         mean_square = float(np.mean(self.residuals[self.kept] ** 2))
         return float(np.sqrt(mean_square * _PER_VIEW * count / freedom))
 
+    @property
+    def rms(self) -> tuple[float, float]:
+        """RMS (distance in the poses' units, angle [rad]) of the kept rows."""
+        if not len(self.kept):
+            return np.inf, np.pi
+        squares = np.array([self.shift, self.angle])[:, self.kept] ** 2
+        shift, angle = np.sqrt(squares.mean(axis=1)).tolist()
+        return shift, angle
+
     @cached_property
     def log_likelihood(self) -> float:
         """Restricted log-likelihood of the views under this reading, at its own noise."""
         return self._log_likelihood(self._estimate[0]) if np.isfinite(self.score) else -np.inf
+
+    @cached_property
+    def unexplained(self) -> float:
+        """Log-likelihood of the residuals if positions, or rotations, remain unexplained."""
+        beyond = np.where(np.eye(2), _UNEXPLAINED_SIGMA, self._estimate[0])
+        return max(map(self._log_likelihood, beyond))
 
     @cached_property
     def agreeing(self) -> int:
@@ -75,34 +93,27 @@ class Fit:
         return int((self._estimate[1] > 0.5).sum())
 
     @cached_property
-    def unexplained(self) -> float:
-        """Log-likelihood of the residuals if positions, or rotations, remain unexplained."""
-        beyond = np.where(np.eye(2), UNEXPLAINED_SIGMA, self._estimate[0])
-        return max(map(self._log_likelihood, beyond))
-
-    @cached_property
     def _estimate(self) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
-        sigma, squares = np.full(2, UNEXPLAINED_SIGMA), self._squares
+        sigma, squares = np.full(2, _UNEXPLAINED_SIGMA), self._squares
         weights = np.isin(np.arange(len(self.angle)), self.kept) * np.isfinite(self.score)
         for _ in range(_ROUNDS if np.isfinite(self.score) else 0):
             # Three equations a view each, less the six unknowns of the edges.
             freedom = max(3.0 * weights.sum() - 0.5 * _UNKNOWNS, 3.0)
-            sigma = np.clip(np.sqrt(squares @ weights / freedom), LEAST_SIGMA, UNEXPLAINED_SIGMA)
+            sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _UNEXPLAINED_SIGMA)
             inlier, outlier = self._densities(sigma)
             weights = 1.0 / (1.0 + np.exp(np.clip(outlier - inlier, -500.0, 500.0)))
         return sigma, weights
 
-    @property
+    @cached_property
     def _squares(self) -> FloatArray:
         """(2, n) squared residuals of position and rotation, without unit."""
         return np.array([self.shift / self.lever, self.angle]) ** 2
 
     def _densities(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) log densities of inlier and outlier views, each times its prior probability."""
-        squares = self._squares
-        inlier = -3.0 * np.log(sigma).sum() - 0.5 * (squares.T / sigma**2).sum(axis=1)
-        outlier = -3.0 * np.log1p(squares).sum(axis=0)
+        inlier = -3.0 * np.log(sigma).sum() - 0.5 * (self._squares.T / sigma**2).sum(axis=1)
+        outlier = -3.0 * np.log1p(self._squares).sum(axis=0)
         return inlier + np.log1p(-_OUTLIER_PRIOR), outlier + np.log(_OUTLIER_PRIOR)
 
     def _log_likelihood(self, sigma: FloatArray) -> float:
@@ -115,14 +126,6 @@ class Fit:
         total = float(views.sum() + lost)
         return total * max(1.0 - _UNKNOWNS / (_PER_VIEW * max(count, 1)), 0.0)
 
-    @property
-    def rms(self) -> tuple[float, float]:
-        """RMS (distance in the poses' units, angle [rad]) of the kept rows."""
-        shift, angle = self.shift[self.kept], self.angle[self.kept]
-        if not len(shift):
-            return np.inf, np.pi
-        return float(np.sqrt(np.mean(shift**2))), float(np.sqrt(np.mean(angle**2)))
-
 
 def is_about_one_axis(rotations: FloatArray) -> bool:
     """Whether (n, 3, 3) rotations differ by turns about one axis at most."""
@@ -132,51 +135,84 @@ def is_about_one_axis(rotations: FloatArray) -> bool:
     return bool(singular[2] < max(_SECOND_AXIS * singular[0], _LEAST_TURN_RAD))
 
 
-def kept_count(rows: int) -> int:
-    """Number of rows that a fit of this many keeps."""
-    return max(int(np.ceil(KEPT_SHARE * rows)), min(rows, _FEWEST_KEPT))
-
-
 def no_fit(rows: int) -> Fit:
     """The fit of rows that cannot be read: infinite residuals."""
     return Fit(np.eye(4), np.eye(4), np.full(rows, np.inf), np.full(rows, np.pi), lever=1.0)
 
 
-def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
-    """Solves `robot * x * camera = z` by the views that agree best (trimmed least squares).
+def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[Fit]:
+    """Solves `robot * x * camera = z` for k readings by the views that agree best.
+
+    Least trimmed squares with concentration steps (Rousseeuw and Van Driessen 1999).
 
     Args:
-        robot: (n, 4, 4) the robot's part of the chain.
-        camera: (n, 4, 4) `cam_from_target`.
+        robot: (k, n, 4, 4) the robot's part of the chain.
+        camera: (k, n, 4, 4) `cam_from_target`.
         starts: Number of random small subsets to start from, besides all views.
     """
-    lever = max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-12)
-    rng, count = np.random.default_rng(0), len(robot)
-    fits = [_fit(robot, camera, lever, np.arange(count))]
-    if count > _SUBSET and starts:
+    size = max(_BATCH // (starts + 1), 1)
+    batches = (slice(at, at + size) for at in range(0, len(robot), size))
+    return [fit for part in batches for fit in _fits(robot[part], camera[part], starts)]
+
+
+def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
+    """The same for one reading, of (n, 4, 4) poses."""
+    return robust_fits(robot[None], camera[None], starts)[0]
+
+
+def _fits(robot: FloatArray, camera: FloatArray, starts: int) -> Iterator[Fit]:
+    count = robot.shape[1]
+    kept = _kept_count(count)
+    lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
+
+    def solved(rows: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Edges (k, s, 2, 4, 4) by (k, s, m) rows, trimmed sums (k, s), rows with the least."""
+        sides = (np.take_along_axis(side[:, None], rows[..., None, None], 2) for side in parts)
+        edges = SOLVERS["park"](*sides)
+        shift, angle = _away(robot[:, None], camera[:, None], (edges.x, edges.z))
+        squares = (shift / lever[:, None, None]) ** 2 + angle**2
+        nearest = np.argpartition(squares, kept - 1)[..., :kept]
+        sums = np.take_along_axis(squares, nearest, axis=2).sum(axis=2)
+        return np.stack([edges.x, edges.z], axis=2), sums, nearest
+
+    parts = robot, camera
+    every = np.broadcast_to(np.arange(count), (len(robot), 1, count))
+    edges, sums, nearest = solved(every)
+    if starts and count > _SUBSET:
+        rng = np.random.default_rng(0)
         subsets = np.array([rng.choice(count, _SUBSET, replace=False) for _ in range(starts)])
-        solutions = SOLVERS["park"](robot[subsets], camera[subsets])
-        edges = zip(solutions.x, solutions.z, strict=True)
-        fits += [distances(robot, camera, lever, item) for item in edges]
-    return trimmed_start(
-        fits,
-        lambda fit: fit.residuals**2,
-        lambda mask, _: _fit(robot, camera, lever, np.flatnonzero(mask)),
-        kept_count(count),
-        len(fits),
-    )[1]
+        more = solved(np.broadcast_to(subsets, (len(robot), *subsets.shape)))
+        edges, sums = np.hstack([edges, more[0]]), np.hstack([sums, more[1]])
+        followed = np.arange(len(robot))[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
+        nearest = np.hstack([nearest, more[2]])[followed]
+        edges, sums = edges[followed], sums[followed]
+    for _ in range(_STEPS):
+        trial, lower, rows = solved(nearest)
+        falls = lower < sums
+        if not falls.any():
+            break
+        edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
+    for at, start in enumerate(sums.argmin(axis=1)):
+        yield distances(robot[at], camera[at], float(lever[at]), tuple(edges[at, start]))
 
 
-def _fit(robot: FloatArray, camera: FloatArray, lever: float, rows: IntArray) -> Fit:
-    solution = SOLVERS["park"](robot[rows], camera[rows])
-    return distances(robot, camera, lever, (solution.x, solution.z))
+def _away(
+    robot: FloatArray, camera: FloatArray, edges: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """(..., n) distances and angles [rad] of targets from Z."""
+    x, z = edges
+    placed = robot @ x[..., None, :, :] @ camera
+    shift = np.linalg.norm(placed[..., :3, 3] - z[..., None, :3, 3], axis=-1)
+    return shift, rotation_angle(invert(z)[..., None, :, :] @ placed)
 
 
 def distances(
     robot: FloatArray, camera: FloatArray, lever: float, edges: tuple[FloatArray, FloatArray]
 ) -> Fit:
-    """Computes the residuals of every view for given edges (x, z)."""
-    x, z = edges
-    placed = robot @ x @ camera
-    shift = np.linalg.norm(placed[:, :3, 3] - z[:3, 3], axis=1)
-    return Fit(x, z, shift, rotation_angle(invert(z) @ placed), lever)
+    """Computes the residuals of every view, of (n, 4, 4) poses, for given edges (x, z)."""
+    return Fit(*edges, *_away(robot, camera, edges), lever)
+
+
+def _kept_count(rows: int) -> int:
+    """Number of rows that a fit of this many keeps."""
+    return max(int(np.ceil(_KEPT_SHARE * rows)), min(rows, _FEWEST_KEPT))

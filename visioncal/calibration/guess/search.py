@@ -1,205 +1,232 @@
-"""Search of all readings for the few that close the chain.
+"""Search of the table of readings: at most two mistakes at once, all fitted together.
 
-What is cheap and independent goes first: relative angles (forms, shifted rows), then rotations
-(inverse or not), then positions (units, signs), each leaving a handful to the next; the last
-handful
-is fitted in full. With the rotations known the chain is linear in the positions of both unknown
-edges, and all variants are solved for at once: they share the left side of the equations.
+The angle of a relative motion between two views is the same for robot and camera, whatever the
+unknown edges are (Chen 1991, "A screw motion approach to uniqueness analysis of head-eye
+geometry"). So forms of rotations and orders of rows are screened without solving for anything. The
+angle is also the same for a pose and its inverse: inverses, and all that concerns positions, are
+distinguished by the fits.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import kept_count
-from visioncal.calibration.guess.forms import (
-    SHIFTS,
-    Forms,
-    Pairing,
-    camera_forms,
-    robot_forms,
-    screen,
-)
-from visioncal.calibration.guess.hypothesis import (
-    SIGNS,
+from visioncal.calibration.guess.fit import STARTS, Fit, no_fit, robust_fits
+from visioncal.calibration.guess.readings import (
+    Change,
     Hypothesis,
     SideReading,
-    Signs,
-    strangeness,
+    changes,
+    of_another_size,
 )
-from visioncal.calibration.guess.recording import (
-    CLEAR,
-    Recording,
-    Scored,
-    fitted,
-    is_likely_unit,
-    plausibility,
-)
-from visioncal.core.conventions import UNITS_M
-from visioncal.core.transforms import compose, nearest_rotation, rotation_angle
-from visioncal.core.types import MOUNTS, FloatArray, IntArray
-from visioncal.estimation.closed_form import SOLVERS
+from visioncal.core.conventions import UNITS_M, PoseNumbers
+from visioncal.core.number_format import figure
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, IntArray, Mount
 
-# Most rows that are fitted: more add time and no certainty.
-_FITTED_ROWS = 40
-# A stage hands on what is within this ratio of its best score, and at most the numbers that follow.
-_RATIO, _PAIRINGS, _TURNED, _LABELLED, _FITTED = 3.0, 32, 24, 80, 12
-# Half a degree, which noisy poses of few views add to any bound.
-_SLACK_RAD = 5e-3
-# Relative penalty of a score per change of the declared reading.
-_PENALTY, _FLOOR = 0.3, 1e-4
-_STARTS = 12
-
-# Units of poses; micrometres are for instruments. Nobody has a robot in inches and a camera in
-# centimetres, but a target of another size than stated looks like it.
-_UNITS = ("m", "mm", "cm", "inch")
-UNIT_PAIRS = tuple(pair for pair in product(_UNITS, _UNITS) if {*pair} != {"cm", "inch"})
-
+# With fewer views too many readings agree; more than the second add time and no certainty.
+FEWEST_ROWS, _FITTED_ROWS = 4, 30
+# Share of the log-likelihood that counts: the errors of an arm, a lens and a board are common to
+# the views, which count as half as many independent ones.
+EVIDENCE = 0.5
+# Log prior odds against a change of the declared reading, and against a cell that cannot be.
+_CHANGE, IMPOSSIBLE = 4.0, 20.0
+# A right reading closes the chain to this share of the distance, or angle [rad]: poses with 10 mm
+# and 1 degree of noise leave less, wrong readings ten times more.
+CLOSING_SCORE = 0.05
+# Plausible distances between camera and board [m].
+_BOARD_DISTANCE_M = (0.02, 30.0)
+# A stage hands on what is within this ratio of its best score, plus half a degree, which noisy
+# poses of few views add to any bound; and at most so many.
+_RATIO, _SLACK_RAD, _TURNED, _WITH_OTHERS, _REFINED = 3.0, 5e-3, 100, 16, 12
+# Relative penalty of a score per mistake; rewritten angles are tried where no reading is sure.
+_PENALTY, _FLOOR, _SURE = 0.3, 1e-4, 0.01
+# Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
+_PAIRS_SHARE = 0.35
 # Limits of a target's size relative to the stated one, as logarithms: up to a half more or less is
 # fitted elsewhere. Fewer views than the last number fit any size.
 _SMALLEST, _LARGEST, _FEWEST_SIZED = np.log(1.5), np.log(20.0), 5
+_LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
 
 @dataclass(frozen=True, eq=False)
-class TurnedPairing:
-    """A pairing with the unknown rotation solved for.
+class Recording:
+    """Declared poses of robot and camera as they were recorded."""
 
-    `robot` and `camera` are (n, 3, 3) rotations of the chain's parts, `transposed` is whether
-    those are the transposes of what the forms give.
-    """
+    robot: PoseNumbers
+    camera: PoseNumbers
+    mount: Mount
+    is_measured: bool  # Whether the camera's poses were measured from images.
+    chain: FloatArray | None = None  # (n, 4, 4) the robot's poses by its joints; NaN without.
 
-    pairing: Pairing
-    transposed: tuple[bool, bool]
-    rows: IntArray
-    robot: FloatArray
-    camera: FloatArray
-    x: FloatArray
-    kept: IntArray
-    score: float
+    @cached_property
+    def declared(self) -> Hypothesis:
+        """The declared reading."""
+        readings = self.robot.reading, self.camera.reading
+        robot, camera = (SideReading.as_declared(reading) for reading in readings)
+        return Hypothesis(robot, camera, self.mount)
 
+    @cached_property
+    def common_rows(self) -> IntArray:
+        """The rows with a pose of both sides."""
+        return np.flatnonzero(self.robot.present & self.camera.present)
 
-@dataclass(frozen=True)
-class Variant:
-    """A reading of the positions beside given rotations.
+    def is_likely(self, tried: Hypothesis) -> bool:
+        """Whether the unit of the camera's positions puts the target at a likely distance."""
+        low, high = _BOARD_DISTANCE_M
+        return bool(low < UNITS_M[tried.camera.unit] * self._distance < high)
 
-    The inverse of both sides is the same chain with its unknown edges exchanged, so that the
-    camera's positions can stay as they are.
-    """
-
-    carried: bool  # Whether the robot's are those of the inverse pose: rotated and negated.
-    signs: Signs  # As in `SideReading`.
-    ratio: float  # The robot's unit over the camera's.
-    changes: int  # Number of differences from the declared reading.
-    scale: float = 1.0  # Further factor of the camera's positions.
-
-
-def solve_turn(
-    pairing: Pairing, transposed: tuple[bool, bool], rows: IntArray, sides: tuple[FloatArray, ...]
-) -> TurnedPairing:
-    """Solves for X's rotation by the views that agree best."""
-    robot, camera = (
-        np.swapaxes(side, 1, 2) if flip else side
-        for side, flip in zip(sides, transposed, strict=True)
-    )
-    zero, kept = np.zeros(3), np.arange(len(rows))
-    x, angles = np.eye(3), np.zeros(len(rows))
-    for _ in range(3):
-        solve = SOLVERS["park"](compose(robot[kept], zero), compose(camera[kept], zero))
-        x = solve.x[:3, :3]
-        placed = robot @ x @ camera
-        angles = rotation_angle(nearest_rotation(placed[kept].mean(axis=0)).T @ placed)
-        kept = np.sort(np.argsort(angles)[: kept_count(len(rows))])
-    score = float(np.sqrt(np.mean(angles[kept] ** 2)))
-    return TurnedPairing(pairing, transposed, rows, robot, camera, x, kept, score)
+    @cached_property
+    def _distance(self) -> float:
+        return float(np.nanmedian(np.linalg.norm(self.camera.positions, axis=1)))
 
 
-def score_variants(recording: Recording, turned: TurnedPairing) -> Iterator[tuple[float, Variant]]:
-    """Scores all readings of the positions at once.
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A reading of the poses, and how well it closes the chain."""
 
-    `R_i t_X - t_Z = -(p_i + R_i R_X c_i)` for all views; subtracting means eliminates t_Z. All
-    variants share the left side.
-    """
-    variants = tuple(_variants(recording))
-    right, lever = _right_sides(recording, turned, variants)
-    kept = turned.kept
-    matrix = turned.robot - turned.robot[kept].mean(axis=0)
-    right -= right[kept].mean(axis=0)
-    left = matrix[kept].reshape(-1, 3)
-    solution = -np.linalg.pinv(left, rcond=1e-3) @ right[kept].reshape(len(left), -1)
-    distances = np.linalg.norm(right + matrix @ solution, axis=1) / lever
-    nearest = np.partition(distances, len(kept) - 1, axis=0)[: len(kept)]
-    scores = np.hypot(np.sqrt(np.mean(nearest**2, axis=0)), turned.score)
-    yield from zip(scores, variants, strict=True)
-    yield from _scaled_variants(recording, turned, variants, matrix)
+    hypothesis: Hypothesis  # The reading.
+    recording: Recording  # The poses as declared.
+    fit: Fit  # Both edges, and the residuals.
+    of_rows: IntArray  # The camera's rows in the fit.
+    # All readings that close the chain in the same way.
+    labels: tuple[Hypothesis, ...] = field(default=(), repr=False)
+    # Differences of an equally good and likely reading with the other mount; empty without one.
+    other_mount: tuple[str, ...] = ()
+
+    @property
+    def declared(self) -> Hypothesis:
+        """The declared reading."""
+        return self.recording.declared
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """Words for each difference from the declared reading."""
+        return self.hypothesis.changes
+
+    @property
+    def words(self) -> str:
+        """The differences from the declared reading, in words."""
+        return "; ".join(self.differences) or "as declared"
+
+    @property
+    def rows(self) -> int:
+        """Number of views in the fit."""
+        return len(self.of_rows)
+
+    @property
+    def agreeing(self) -> int:
+        """Number of views that agree with each other."""
+        return self.fit.agreeing
+
+    @property
+    def log_prior(self) -> float:
+        """Log prior odds, by the changes that it implies."""
+        impossible = IMPOSSIBLE * (not self.recording.is_likely(self.hypothesis))
+        return -_CHANGE * self.hypothesis.cost - impossible
+
+    @property
+    def log_posterior(self) -> float:
+        """Log posterior of the reading, up to a constant of the views."""
+        return EVIDENCE * self.fit.log_likelihood + self.log_prior
+
+    @property
+    def log_odds(self) -> float:
+        """Log posterior odds of the reading against none."""
+        return self.log_posterior - EVIDENCE * self.fit.unexplained
+
+    @property
+    def score(self) -> float:
+        """Closing error without unit."""
+        return self.fit.score
+
+    @property
+    def closes(self) -> bool:
+        """Whether the chain closes as well as under a right reading."""
+        return self.score <= CLOSING_SCORE
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether the numbers can be read as rotations at all."""
+        return bool(np.isfinite(self.score))
+
+    @property
+    def figures(self) -> str:
+        """The closing error, in words."""
+        if not self.is_readable:
+            return "no rotations"
+        shift_m, angle = self.fit.rms
+        is_long = 1e3 * shift_m > _LONG_MM
+        length = f"{_short(shift_m)} m" if is_long else f"{_short(1e3 * shift_m)} mm"
+        return f"{length} and {_short(float(np.rad2deg(angle)))} deg"
+
+    @property
+    def board_scale(self) -> float:
+        """Factor for the board's sizes, where images were measured; else 1."""
+        camera, unit = self.hypothesis.camera, self.declared.camera.unit
+        return camera.scale * UNITS_M[camera.unit] / UNITS_M[unit] if self.is_measured else 1.0
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the camera's poses were measured from images."""
+        return self.recording.is_measured
 
 
-def _scaled_variants(
-    recording: Recording, turned: TurnedPairing, variants: Sequence[Variant], matrix: FloatArray
-) -> Iterator[tuple[float, Variant]]:
-    """Scores the positions, or the inverse's, with the size of the target unknown."""
-    # `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
-    # stated one are fitted elsewhere; here, units would be mistaken for them.
-    declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
-    kept = turned.kept
-    for item in variants:
-        if item.ratio != declared or item.signs:
-            continue
-        right, lever = _right_sides(recording, turned, (item, replace(item, ratio=0.0)))
-        right = (right - right[kept].mean(axis=0)) / lever
-        # With a ratio of 0 only the camera's positions remain.
-        of_camera = right[..., 1]
-        left = np.concatenate([matrix, right[..., :1] - right[..., 1:]], axis=2)
-        inverse = np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3)
-        solution = -inverse @ of_camera[kept].reshape(-1)
-        scale = 1.0 / solution[3] if solution[3] > 0.0 else np.inf
-        if len(kept) < _FEWEST_SIZED or not _SMALLEST < abs(np.log(scale)) < _LARGEST:
-            continue
-        distances = np.sort(np.linalg.norm(of_camera + left @ solution, axis=1))[: len(kept)]
-        score = float(np.hypot(np.sqrt(np.mean(distances**2)), turned.score))
-        yield score, replace(item, changes=item.changes + 1, scale=float(scale))
+def _short(value: float) -> str:
+    """Formats two digits; whole numbers from a hundred on."""
+    return f"{value:.0f}" if value > _WHOLE_FROM else figure(value)
 
 
-def _variants(recording: Recording) -> Iterator[Variant]:
-    ratios = sorted({_ratio(*pair) for pair in UNIT_PAIRS})
-    declared = recording.declared
-    inverse = declared.robot.inverse != (recording.mount == "eye-to-hand")
-    is_carried = inverse != declared.camera.inverse
-    declared_ratio = _ratio(declared.robot.unit, declared.camera.unit)
-    for carried, signs, ratio in product((False, True), SIGNS, ratios):
-        changes = (carried != is_carried) + (signs != "") + (ratio != declared_ratio)
-        yield Variant(carried, signs, ratio, changes)
+def chains(
+    recording: Recording, tried: Sequence[Hypothesis], rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """(k, m, 4, 4) the robot's part of the chain and `cam_from_target` at rows; NaN without."""
+    of_robot = np.array([reading.rows(len(recording.robot))[rows] for reading in tried])
+    looked, at = np.unique(of_robot, return_inverse=True)
+    robot, camera = recording.robot.rows(np.maximum(looked, 0)), recording.camera.rows(rows)
+    by_robot = {side: side.poses(robot) for side in {reading.robot for reading in tried}}
+    by_camera = {side: side.poses(camera) for side in {reading.camera for reading in tried}}
+    poses = np.empty((len(tried), len(rows), 4, 4))
+    for part, reading, index in zip(poses, tried, at.reshape(of_robot.shape), strict=True):
+        part[:] = by_robot[reading.robot][index]
+    outside = np.array([reading.mount == "eye-to-hand" for reading in tried])
+    poses[outside] = invert(poses[outside])
+    poses[of_robot < 0] = np.nan
+    return poses, np.array([by_camera[reading.camera] for reading in tried])
 
 
-def _ratio(robot_unit: str, camera_unit: str) -> float:
-    return round(UNITS_M[robot_unit] / UNITS_M[camera_unit], 9)
+def fitted(
+    recording: Recording, tried: Iterable[Hypothesis], rows: IntArray, starts: int
+) -> list[Candidate]:
+    """Fits both edges under each of some readings, by the rows that are readable under it."""
+    tried = [*tried]
+    if not tried:
+        return []
+    robot, camera = chains(recording, tried, rows)
+    readable = np.isfinite(robot).all(axis=(2, 3)) & np.isfinite(camera).all(axis=(2, 3))
+    masks, groups = np.unique(readable, axis=0, return_inverse=True)
+    found: dict[int, Candidate] = {}
+    for group, mask in enumerate(masks):
+        members, count = np.flatnonzero(groups.ravel() == group), int(mask.sum())
+        # A shift leaves a row without its partner.
+        if count < FEWEST_ROWS - 1:
+            fits = [no_fit(count)] * len(members)
+        else:
+            part = np.ix_(members, np.flatnonzero(mask))
+            fits = robust_fits(robot[part], camera[part], starts)
+        for member, fit in zip(members.tolist(), fits, strict=True):
+            of_all = replace(fit, lost=len(rows) - count)
+            found[member] = Candidate(tried[member], recording, of_all, rows[mask])
+    return [found[at] for at in range(len(tried))]
 
 
-def _right_sides(
-    recording: Recording, turned: TurnedPairing, variants: Sequence[Variant]
-) -> tuple[FloatArray, float]:
-    """(n, 3, v) right sides p_i + R_i R_X c_i, and the lever, in the camera's unit."""
-    p = recording.robot.positions[turned.rows + turned.pairing.shift]
-    c = recording.camera.positions[turned.rows]
-    of_camera = (turned.robot @ turned.x @ c[..., None])[..., 0]
-    of_robot = {}
-    for signs in SIGNS:
-        signed = p * _sign(signs)
-        of_robot[signs, False] = signed
-        of_robot[signs, True] = -(turned.robot @ signed[..., None])[..., 0]
-    right = [
-        variant.ratio * of_robot[variant.signs, variant.carried] + of_camera for variant in variants
-    ]
-    lever = max(float(np.median(np.linalg.norm(c, axis=1))), 1e-12)
-    return np.stack(right, axis=2), lever
-
-
-def _sign(signs: Signs) -> FloatArray:
-    """Factors of the positions: a mirrored frame is equivalent to negating all of them."""
-    if signs == "mirror":
-        return -np.ones(3)
-    return np.where(np.arange(3) == "xyz".find(signs or "-"), -1.0, 1.0)
+def closes(recording: Recording) -> bool:
+    """Whether the chain closes as declared; true with too few rows to show it."""
+    rows = recording.common_rows
+    return len(rows) < FEWEST_ROWS or fitted(recording, [recording.declared], rows, 0)[0].closes
 
 
 def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
@@ -208,167 +235,132 @@ def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
     return rows if len(rows) <= most else np.asarray(rows[spread])
 
 
-def search(recording: Recording) -> list[Scored]:
+def search(recording: Recording) -> list[Candidate]:
     """Finds the readings that close the chain best.
 
     Returns:
-        The declared reading first; then the others, best first, one for each class of readings
-        that residuals can distinguish.
+        The declared reading first; then others, one for each class of readings that residuals
+        cannot distinguish.
     """
-    kept = thinned(recording.common_rows())
-    looked_at = _with_neighbours(kept, len(recording.robot))
-    part, rows = recording.part(looked_at), np.searchsorted(looked_at, kept)
-    robot = robot_forms(part.robot)
-    camera = camera_forms(part.camera, is_measured=part.is_measured)
-    pairings = _plausible(robot, camera, screen(robot, camera, rows))
-    turned = _solved_pairings(part, robot, camera, pairings, rows)
-    own, classes = _classes(part, robot, camera, turned)
-    declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
-    others = [_best_label(part, labels, rows) for labels in classes]
-    others.sort(key=lambda other: -other.log_posterior)
-    return [replace(scored, rows=looked_at[scored.rows]) for scored in (declared, *others)]
-
-
-def _with_neighbours(rows: IntArray, count: int) -> IntArray:
-    """Rows and those that shifts pair them with; their indices keep the shifts."""
-    near = np.unique(np.add.outer(rows, SHIFTS))
-    return np.asarray(near[(near >= 0) & (near < count)])
-
-
-def _classes(
-    recording: Recording, robot: Forms, camera: Forms, turned: Sequence[TurnedPairing]
-) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
-    """The declared reading's class, and the simplest readings of the other classes to fit."""
-    scored = [
-        (float(score), turn, variant)
-        for turn in turned
-        for score, variant in score_variants(recording, turn)
-        # Misread angles and a left-handed frame, or transposes, are never mistaken together.
-        if not (
-            robot.turns[turn.pairing.robot].written
-            and (variant.signs or turn.transposed[0] != variant.carried)
-        )
+    rows, declared = thinned(recording.common_rows), recording.declared
+    for rewritten in (None, recording.robot.rows(rows)):
+        readings = sorted(_readings(recording, rows, rewritten), key=lambda reading: reading.cost)
+        classes: dict[Hashable, tuple[Hypothesis, ...]] = {}
+        for reading in readings:
+            key = reading.chain_class, recording.is_likely(reading)
+            classes[key] = (*classes.get(key, ()), reading)
+        labels = {of_class[0]: of_class for of_class in classes.values()}
+        screened = fitted(recording, labels, rows, 0)
+        least = min(item.score for item in screened)
+        if least < _SURE:
+            break
+    limit = _RATIO * least + _SLACK_RAD
+    near = [item for item in screened if item.score <= limit and item.hypothesis != declared]
+    near.sort(key=lambda item: (item.score + _FLOOR) * (1.0 + _PENALTY * item.hypothesis.cost))
+    singles = [reading for reading in readings if len(reading.changes) < 2]
+    refined = [declared, *(item.hypothesis for item in near[:_REFINED])]
+    refined += _of_other_sizes(recording, singles, rows)
+    return [
+        replace(item, labels=labels.get(item.hypothesis, ()))
+        for item in fitted(recording, refined, rows, STARTS)
     ]
-    best = min((score for score, *_ in scored), default=0.0)
-    close = [pair for pair in scored if pair[0] <= _RATIO * best + _SLACK_RAD]
-    close.sort(key=lambda pair: _penalised(pair[0], _cheap_cost(robot, camera, pair[1], pair[2])))
-    own: list[Hypothesis] = []
-    classes = []
-    for score, turn, variant in close[:_LABELLED]:
-        labels = list(_labels(recording, robot, camera, turn, variant))
-        if recording.declared in labels:
-            own = labels
-            continue
-        costs = [recording.cost(label) for label in labels]
-        least = min(costs)
-        simplest = [label for label, cost in zip(labels, costs, strict=True) if cost == least]
-        classes.append((_penalised(score, least), simplest))
-    classes.sort(key=lambda pair: pair[0])
-    return own, [labels for _, labels in classes[:_FITTED]]
 
 
-def _penalised(score: float, cost: float) -> float:
-    """Score that ranks simple readings before equally good others."""
-    return (score + _FLOOR) * (1.0 + _PENALTY * cost)
-
-
-def _cheap_cost(robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant) -> float:
-    """Approximates `Recording.cost` of a class's simplest reading, without building it."""
-    transposed = (turned.transposed[0] != variant.carried) + turned.transposed[1]
-    return _pairing_cost(robot, camera, turned.pairing) + variant.changes + transposed
-
-
-def _pairing_cost(robot: Forms, camera: Forms, pairing: Pairing) -> float:
-    """Approximates `Recording.cost` of a pairing alone."""
-    of_robot = 1.0 + strangeness(robot.turns[pairing.robot]) if pairing.robot else 0.0
-    of_camera = 1.0 + strangeness(camera.turns[pairing.camera]) if pairing.camera else 0.0
-    return of_robot + of_camera + (pairing.shift != 0)
-
-
-def _labels(
-    recording: Recording, robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant
+def _readings(
+    recording: Recording, rows: IntArray, rewritten: PoseNumbers | None
 ) -> Iterator[Hypothesis]:
-    """All readings that give the same chain."""
-    # Inverting the robot's poses, inverting the camera's and changing the mount are equivalent;
-    # units go in pairs.
-    pairing = turned.pairing
-    of_robot, of_camera = robot.turns[pairing.robot], camera.turns[pairing.camera]
-    transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
-    pairs = [
-        (a, b)
-        for a, b in UNIT_PAIRS
-        if np.isclose(UNITS_M[a] / UNITS_M[b], variant.ratio, rtol=1e-6)
+    """The declared reading, and those with one or two mistakes that turn as the camera does."""
+    declared, is_measured = recording.declared, recording.is_measured
+    mismatch = _Mismatch(recording, rows)
+    table = [*changes(declared, is_measured=is_measured, rewritten=rewritten)]
+    of_rotations = [change for change in table if change.is_of_rotations]
+    others = [change for change in table if not change.is_of_rotations]
+    # Rewritten angles are strange enough.
+    plain = [change for change in of_rotations if not change.is_rewritten]
+    turned: dict[tuple[Change, ...], Hypothesis] = {(): declared}
+    turned |= {(change,): change.of(declared) for change in of_rotations}
+    turned.update(_pairs(declared, plain))
+    away = {made: mismatch.of(reading) for made, reading in turned.items()}
+    limit = _RATIO * min(away.values()) + _SLACK_RAD
+    near = [made for made in turned if made and away[made] <= limit]
+    near.sort(key=lambda made: (away[made] + _FLOOR) * (1.0 + _PENALTY * turned[made].cost))
+    for rank, made in enumerate(((), *near[:_TURNED])):
+        reading = turned[made]
+        yield reading
+        if len(made) < 2 and rank <= _WITH_OTHERS:
+            with_made = (other for other in others if all(item.goes_with(other) for item in made))
+            yield from (other.of(reading) for other in with_made)
+    yield from (reading for _, reading in _pairs(declared, others))
+
+
+def _pairs(
+    declared: Hypothesis, table: Sequence[Change]
+) -> Iterator[tuple[tuple[Change, Change], Hypothesis]]:
+    for first, second in combinations(table, 2):
+        if first.goes_with(second):
+            yield (first, second), second.of(first.of(declared))
+
+
+class _Mismatch:
+    """Differences between the angles by which robot and camera turn between two views."""
+
+    def __init__(self, recording: Recording, rows: IntArray) -> None:
+        self._recording, self._rows = recording, rows
+        self._camera_numbers = recording.camera.rows(rows)
+        self._angles: dict[Hashable, FloatArray] = {}
+
+    def of(self, reading: Hypothesis) -> float:
+        """Low quantile of the differences [rad]; infinite with too few to compare."""
+        robot = self._angles.get((reading.robot.turns, reading.order))
+        if robot is None:
+            rows = reading.rows(len(self._recording.robot))[self._rows]
+            numbers = self._recording.robot.rows(np.maximum(rows, 0))
+            rotations = reading.robot.turns.rotations(numbers)
+            rotations[rows < 0] = np.nan
+            robot = _relative_angles(rotations)
+            self._angles[reading.robot.turns, reading.order] = robot
+        camera = self._angles.get(reading.camera.turns)
+        if camera is None:
+            camera = _relative_angles(reading.camera.turns.rotations(self._camera_numbers))
+            self._angles[reading.camera.turns] = camera
+        difference = np.nan_to_num(np.abs(robot - camera), nan=np.inf)
+        rank = int(_PAIRS_SHARE * len(difference))
+        return float(np.partition(difference, rank)[rank])
+
+
+def _relative_angles(rotations: FloatArray) -> FloatArray:
+    """(p,) angles [rad] of the relative rotations of all pairs of views."""
+    flat = rotations.reshape(-1, 9)
+    traces = (flat @ flat.T)[np.triu_indices(len(flat), 1)]
+    return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+
+
+def _of_other_sizes(
+    recording: Recording, singles: Sequence[Hypothesis], rows: IntArray
+) -> Iterator[Hypothesis]:
+    """Readings with a target of the size that closes the chain, beside one other mistake."""
+    # `R_i t_X + s R_i R_X c_i - t_Z = -p_i`. Sizes near the stated one are fitted elsewhere; here,
+    # units would be mistaken for them.
+    declared = recording.declared
+    bases = [
+        base
+        for base in singles
+        if (base.robot.unit, base.camera.unit) == (declared.robot.unit, declared.camera.unit)
+        and not base.robot.signs
     ]
-    if variant.scale != 1.0:
-        pairs = [(recording.declared.robot.unit, recording.declared.camera.unit)]
-    likely = [pair for pair in pairs if is_likely_unit(recording, pair[1])]
-    inverses = (False,) if recording.is_measured else (False, True)
-    for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
-        yield Hypothesis(
-            SideReading(
-                of_robot,
-                unit,
-                variant.carried != ((mount == "eye-to-hand") != inverse),
-                transposed[0],
-                variant.signs,
-            ),
-            SideReading(of_camera, camera_unit, inverse, transposed[1], scale=variant.scale),
-            mount,
-            pairing.shift,
-        )
-
-
-def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
-    """Chooses the reading with the most plausible cell among those of one class."""
-    tried = [fitted(recording, label, rows, _STARTS) for label in labels]
-    likely = {item.hypothesis: plausibility(recording, item) for item in tried}
-    chosen = max(tried, key=lambda item: likely[item.hypothesis])
-    least = likely[chosen.hypothesis] - CLEAR
-    as_likely = (
-        label
-        for label in labels
-        if label.mount != chosen.hypothesis.mount and likely[label] > least
-    )
-    return replace(chosen, labels=tuple(labels), other_mount=next(as_likely, None))
-
-
-def _with_likelier(
-    recording: Recording, declared: Scored, own: Sequence[Hypothesis], rows: IntArray
-) -> Scored:
-    """Adds the simplest labels of the declared reading's class with a more plausible cell."""
-    unit, limit = declared.hypothesis.robot.unit, plausibility(recording, declared) + CLEAR
-    tried = [fitted(recording, item, rows, _STARTS) for item in own if item.robot.unit == unit]
-    likelier = [item for item in tried if plausibility(recording, item) > limit]
-    most = max((item.log_prior for item in likelier), default=0.0)
-    labels = (item.hypothesis for item in likelier if item.log_prior == most)
-    return replace(declared, labels=tuple(labels))
-
-
-def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
-    """The declared pairing, then those with the least mismatch, simple ones first."""
-    bound = _RATIO * min(pairing.mismatch_rad for pairing in pairings) + _SLACK_RAD
-    near = [pairing for pairing in pairings[1:] if pairing.mismatch_rad <= bound]
-    near.sort(key=lambda item: _penalised(item.mismatch_rad, _pairing_cost(robot, camera, item)))
-    return [pairings[0], *near[: _PAIRINGS - 1]]
-
-
-def _solved_pairings(
-    recording: Recording, robot: Forms, camera: Forms, pairings: Sequence[Pairing], rows: IntArray
-) -> list[TurnedPairing]:
-    """Solves for the rotations of each pairing, with each side as given and transposed."""
-    solved = []
-    cameras = (False,) if recording.is_measured else (False, True)
-    for pairing in pairings:
-        forms = robot.rotations[pairing.robot], camera.rotations[pairing.camera]
-        inside = rows[(rows + pairing.shift >= 0) & (rows + pairing.shift < forms[0].shape[0])]
-        readable = np.isfinite(forms[0][inside + pairing.shift]).all(axis=(1, 2))
-        inside = inside[readable & np.isfinite(forms[1][inside]).all(axis=(1, 2))]
-        if len(inside) < 3:
+    robot, camera = chains(recording, bases, rows)
+    whole = np.isfinite(robot).all(axis=(1, 2, 3)) & np.isfinite(camera).all(axis=(1, 2, 3))
+    robot, camera, zero = robot[whole], camera[whole], np.zeros(3)
+    fits = robust_fits(compose(robot[..., :3, :3], zero), compose(camera[..., :3, :3], zero))
+    limit = _RATIO * min((fit.score for fit in fits), default=0.0) + _SLACK_RAD
+    for at, (base, fit) in enumerate(zip(np.flatnonzero(whole), fits, strict=True)):
+        kept, lever = fit.kept, float(np.median(np.linalg.norm(camera[at, :, :3, 3], axis=1)))
+        if fit.score > limit or len(kept) < _FEWEST_SIZED or not lever > 0.0:
             continue
-        sides = forms[0][inside + pairing.shift], forms[1][inside]
-        transposed = product((False, True), cameras)
-        solved += [solve_turn(pairing, pair, inside, sides) for pair in transposed]
-    best = min((turned.score for turned in solved), default=0.0)
-    near = [turned for turned in solved if turned.score <= _RATIO * best + _SLACK_RAD]
-    near.sort(key=lambda item: _penalised(item.score, _pairing_cost(robot, camera, item.pairing)))
-    return near[:_TURNED]
+        turn = robot[at, kept, :3, :3]
+        seen = turn @ fit.x[:3, :3] @ camera[at, kept, :3, 3, None] / lever
+        columns = np.concatenate([turn, seen, robot[at, kept, :3, 3:]], axis=2)
+        columns = (columns - columns.mean(axis=0)).reshape(-1, 5)
+        size = np.linalg.lstsq(columns[:, :4], -columns[:, 4], rcond=1e-3)[0][3] / lever
+        if size > 0.0 and _SMALLEST < abs(np.log(size)) < _LARGEST:
+            yield of_another_size(float(size)).of(bases[base])

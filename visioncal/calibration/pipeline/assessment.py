@@ -164,7 +164,8 @@ def assess_fit(
     solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, tests))
     beside = covariance_from_other_sources(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
-    faults, held_out, middles = pose_faults(solved), left_out(solved), middles_of(solved.cell)
+    held_out = left_out(solved, is_misread=observed.is_misread)
+    faults, middles = pose_faults(solved), middles_of(solved.cell)
     return FitAssessment(
         solved,
         part,

@@ -26,8 +26,8 @@ from visioncal.vision.targets import corner_positions
 _SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 
-def left_out(solved: CellFit) -> HeldOutResiduals:
-    """Residuals of the inliers, each by a fit without its stop."""
+def left_out(solved: CellFit, *, is_misread: bool) -> HeldOutResiduals:
+    """Residuals of the inliers, each by a fit without its stop; by that of all if misread."""
     fit, used, mount = (
         solved.inlier_fit.fit,
         np.flatnonzero(solved.inlier_fit.used),
@@ -36,6 +36,8 @@ def left_out(solved: CellFit) -> HeldOutResiduals:
     part = solved.inlier_problem
 
     def refit(kept: Mask) -> State:
+        if is_misread:
+            return fit.state
         if solved.solver == "joint" or mount is None:
             return solve_without(part, fit, kept)
         return closed_form_state(part.subset(kept), solved.solver, fit.state, mount)

@@ -5,9 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.guess import Candidate, guess_reading
-from visioncal.calibration.guess.changed_rows import changed_rows
-from visioncal.calibration.guess.recording import FEWEST_ROWS, Recording, closes
+from visioncal.calibration.guess import Candidate
+from visioncal.calibration.guess.fit import distances, robust_fit
+from visioncal.calibration.guess.readings import SHIFTS, Hypothesis, changes
+from visioncal.calibration.guess.search import (
+    CLOSING_SCORE,
+    FEWEST_ROWS,
+    Recording,
+    chains,
+    closes,
+)
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_numbers,
@@ -33,20 +40,21 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.columns import POSE, POSITION
-from visioncal.session.table import unit_warning
+from visioncal.session.columns import POSE
 
 _MISREAD = "misread_poses"
-# A robot that turns by at most the first did not move; a target that turns by at least the second
-# did, even with ambiguous poses [deg].
-_STILL_DEG, _TURNED_DEG = 0.5, 10.0
-# Positions that differ by less are the same [m].
-_STILL_M = 1e-3
+# A robot that turns and moves by less did not move; a target that turns by at least the last did,
+# even with ambiguous poses.
+_STILL_DEG, _STILL_M, _TURNED_DEG = 0.5, 1e-3, 10.0
+# Fewest rows at one end that determine both edges, and fewest that show another reading.
+_REFERENCE, _FEWEST = 6, 3
+# Least share of rows that agree with their reading, and largest share with a wrong one.
+_AGREEING_SHARE, _WRONG_SHARE = 0.9, 0.2
 # Robot and camera turn alike between two views where the angles differ by less [deg].
 _ALIKE_DEG = 3.0
 # Rows are taken for shuffled where less than a third of them belong to their views: then less than
@@ -70,22 +78,10 @@ _UNRECORDED = Remedy(
     "0, 0, 0 or rotations as 0, 0, 0, 1, gives no calibration. Record them again, at the same time "
     "as the images."
 )
-_NOT_ALONE = (
-    "With this unit alone, robot, camera and target do not agree either: something else is wrong, "
-    "too."
-)
-_UNIT_FIRST = Remedy(
-    "Write x_m, y_m and z_m of views.csv in metres, and calibrate again: what else is wrong is "
-    "said then.",
-    CALIBRATE,
-)
 _UNPAIRED = Remedy(
     "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
-    "views.csv of another run. Write into column image which file belongs to each row."
-)
-_UNPAIRED_JOINTS = Remedy(
-    "Look first whether [robot] model in session.toml is this arm, through which the joint angles "
-    f"become poses. {_UNPAIRED.words}"
+    "views.csv of another run; and, where joint angles become poses, whether [robot] model in "
+    "session.toml is this arm. Write into column image which file belongs to each row."
 )
 _BESIDE_JOINTS = Remedy(
     "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete these "
@@ -96,7 +92,7 @@ _BESIDE_JOINTS = Remedy(
 
 def misread_pose_finding(run: RunState) -> Finding | None:
     """Finding on the reading of the poses that closes the chain, if any; after the stage `pnp`."""
-    hint = _constant_rotations(run) or _changed_midway(run)
+    hint = _unrecorded(run, "rotations") or _changed_midway(run)
     if hint is not None:
         return hint
     try:
@@ -108,13 +104,11 @@ def misread_pose_finding(run: RunState) -> Finding | None:
         if guess.declared.closes:
             return None
         contradicted = _poses_contradicting_joints(run, guess.declared)
-        return contradicted or _constant_positions(run) or _other_unit(run) or _unpaired(run)
-    best, views = guess.best, run.session.views
-    is_mirrored = best.hypothesis.robot.signs == "mirror"
+        return contradicted or _unrecorded(run, "positions") or _unpaired(run)
+    best, step = guess.best, READ_AGAIN
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
-    exchanged = tuple(views[row].number for row in swap)
-    step = READ_AGAIN
-    if is_mirrored:
+    exchanged = tuple(run.session.views[row].number for row in swap)
+    if best.hypothesis.robot.signs == "mirror":
         step = _MIRRORED_CORNERS if session_is_mirrored(run.session) else _MIRRORED
     return Finding(_MISREAD, guess.sentence, step, exchanged)
 
@@ -134,71 +128,98 @@ def session_is_mirrored(session: Session) -> bool:
     return share_from_behind(views) > MOST_FROM_BEHIND
 
 
-def _constant_rotations(run: RunState) -> Finding | None:
-    """Finding that the robot's rotations were not recorded: they are constant, the camera's not."""
+def _unrecorded(run: RunState, what: str) -> Finding | None:
+    """Finding that rotations, or positions, were not recorded: they are constant, as none seen."""
     robot, camera = robot_numbers(run), camera_numbers(run)
     both = robot.present & camera.present
     if both.sum() < FEWEST_ROWS:
         return None
     of_robot, of_camera = robot.poses()[both], camera.poses()[both]
     motions = invert(of_robot[:1]) @ of_robot
-    most = float(np.rad2deg(rotation_angle(motions).max()))
-    median = float(np.rad2deg(np.median(rotation_angle(invert(of_camera[:1]) @ of_camera))))
-    if most > _STILL_DEG or median < _TURNED_DEG:
+    turns = np.rad2deg(rotation_angle(motions)).max() > _STILL_DEG
+    moves = np.abs(motions[:, :3, 3]).max() > _STILL_M
+    seen_deg = np.rad2deg(np.median(rotation_angle(invert(of_camera[:1]) @ of_camera)))
+    if (turns or seen_deg < _TURNED_DEG) if what == "rotations" else moves:
         return None
-    fact, wrong = f"The robot's poses turn by {most:.2g} deg at most", "rotations"
-    if np.abs(motions[:, :3, 3]).max() < _STILL_M:
-        fact, wrong = "All rows have one pose of the robot", "poses"
-    words = (
-        f"{fact}, and between the same views the camera sees the target turn by {median:.2g} deg: "
-        f"the recorded {wrong} are not those of the views."
+    one = "pose" if not turns and not moves else what[:-1]
+    return Finding(
+        _MISREAD,
+        f"All rows have one {one} of the robot, and between the same views the camera sees the "
+        f"target turn by {seen_deg:.2g} deg: the recorded {one}s are not those of the views.",
+        _UNRECORDED,
     )
-    return Finding(_MISREAD, words, _UNRECORDED)
 
 
 def _changed_midway(run: RunState) -> Finding | None:
     """Finding that the robot's poses need another reading from some view on, or up to one."""
-    changed = changed_rows(_recording(run))
+    # A driver that is set up anew midway writes other units or rotations; an image that was lost,
+    # or a pose that was recorded twice, shifts all rows behind it.
+    recording = _recording(run)
+    rows = recording.common_rows
+    changed = None
+    if len(rows) >= _REFERENCE + _FEWEST:
+        changed = _changed_rows(recording, rows) or _changed_rows(recording, rows[::-1])
     if changed is None:
         return None
-    views = tuple(run.session.views[row].number for row in changed.rows)
+    at, reading = changed
+    views = tuple(run.session.views[row].number for row in np.sort(at))
     when, others = f"From view {views[0]} on", "before them"
-    if not changed.is_behind:
+    if at[-1] < at[0]:
         when, others = f"Up to view {views[-1]}", "behind them"
     words = (
-        f"{when}, the robot's poses are not those of the others: with "
-        f"{' and '.join(changed.words)}, these views fit the ones {others}, and as declared they "
-        "do not."
+        f"{when}, the robot's poses are not those of the others: with {reading.changes[0]}, these "
+        f"views fit the ones {others}, and as declared they do not."
     )
-    rows = f"rows {views[0]} to {views[-1]} of views.csv"
-    shift = changed.reading.shift
-    step = (
-        f"In {rows}, move the poses {'up' if shift > 0 else 'down'} by "
-        f"{'one row' if abs(shift) == 1 else f'{abs(shift)} rows'}, delete rows that are left "
-        "without a pose, and look why an image or a pose is missing there."
-        if shift
-        else f"Correct the poses in {rows} (base_from_flange in metres, quaternion x, y, z, w), or "
-        "delete these rows; and look what was set up anew in between."
-    )
+    step = f"In rows {views[0]} to {views[-1]} of views.csv, "
+    if shift := SHIFTS.get(reading.order, 0):
+        step += (
+            f"move the poses {'up' if shift > 0 else 'down'} by "
+            f"{'one row' if abs(shift) == 1 else f'{abs(shift)} rows'}, delete rows that are left "
+            "without a pose, and look why an image or a pose is missing there."
+        )
+    else:
+        step += (
+            "correct the poses (base_from_flange in metres, quaternion x, y, z, w), or delete "
+            "these rows; and look what was set up anew in between."
+        )
     return Finding(_MISREAD, words, Remedy(step, CALIBRATE), views)
 
 
-def _constant_positions(run: RunState) -> Finding | None:
-    """Finding that the robot's positions are constant, where that does not fit the camera."""
-    robot = robot_numbers(run)
-    positions = robot.poses()[robot.present, :3, 3]
-    is_one = len(positions) >= FEWEST_ROWS and np.ptp(positions, axis=0).max() < _STILL_M
-    words = (
-        "All rows have one position of the robot, and that does not explain what the camera sees: "
-        "the recorded positions are not those of the views."
-    )
-    return Finding(_MISREAD, words, _UNRECORDED) if is_one else None
+def _changed_rows(recording: Recording, rows: IntArray) -> tuple[IntArray, Hypothesis] | None:
+    """The last of some rows, which only another reading explains, and that; None without."""
+    declared = recording.declared
+    robot, camera = (side[0] for side in chains(recording, [declared], rows))
+    count = _REFERENCE
+    for _ in range(2):
+        fit = robust_fit(robot[:count], camera[:count])
+        edges = fit.x, fit.z
+        agrees = distances(robot, camera, fit.lever, edges).residuals < CLOSING_SCORE
+        count = _rows_before_change(agrees)
+        if count < _REFERENCE or len(rows) - count < _FEWEST:
+            return None
+    tried = [
+        change.of(declared)
+        for change in changes(declared, is_measured=True)
+        if change.name in ("unit", "turns", "inverse") or change.words in SHIFTS
+    ]
+    robots, cameras = chains(recording, tried, rows[count:])
+    for reading, robot, camera in zip(tried, robots, cameras, strict=True):
+        residuals = distances(robot, camera, fit.lever, edges).residuals
+        # A shift leaves as many rows without a partner: at the table's end where images are lost,
+        # at its beginning where poses are.
+        paired = len(residuals) - abs(SHIFTS.get(reading.order, 0))
+        if np.sum(residuals < CLOSING_SCORE) >= max(_FEWEST, _AGREEING_SHARE * paired):
+            return rows[count:], reading
+    return None
 
 
-def _other_unit(run: RunState) -> Finding | None:
-    """Finding that the robot's positions are in another unit, which alone does not explain all."""
-    words = unit_warning(run.session.views, POSITION)
-    return Finding(_MISREAD, f"{words} {_NOT_ALONE}", _UNIT_FIRST) if words else None
+def _rows_before_change(agrees: Mask) -> int:
+    """Number of rows before the change point; 0 without a clear one."""
+    agreeing = np.append(0, np.cumsum(agrees))
+    change = int(np.argmax(2 * agreeing - np.arange(len(agreeing))))
+    share_behind = float(np.mean(agrees[change:])) if change < len(agrees) else 0.0
+    is_clear = agreeing[change] >= _AGREEING_SHARE * change and share_behind <= _WRONG_SHARE
+    return change if is_clear else 0
 
 
 def _unpaired(run: RunState) -> Finding | None:
@@ -225,8 +246,7 @@ def _unpaired(run: RunState) -> Finding | None:
         "The robot's poses are not those of the images: of all pairs of views, robot and camera "
         f"turn alike in {percent(share)}, and in {percent(by_chance)} if rows are shuffled."
     )
-    is_reported = numbers_in(run.session, POSE).present.any()
-    return Finding(_MISREAD, words, _UNPAIRED if is_reported else _UNPAIRED_JOINTS)
+    return Finding(_MISREAD, words, _UNPAIRED)
 
 
 def _pairwise_angles(poses: FloatArray) -> FloatArray:
@@ -246,23 +266,21 @@ def _poses_contradicting_joints(run: RunState, declared: Candidate) -> Finding |
     if chain is None or (matched.joints_rad and not matched.contradicting):
         return None
     robot = PoseNumbers.of_poses(chain, places_of(session))
-    for camera in camera_pose_choices(run, robot):
-        guess = guess_reading(robot, camera, session.mount, is_measured=bool(run.corners))
-        if guess.declared.closes:
-            words = (
-                f"The reported poses are wrong: with them the chain closes to {declared.figures} "
-                "only, with the joint angles and the robot's model to "
-                f"{guess.declared.figures}."
-            )
-            return Finding(_MISREAD, words, _BESIDE_JOINTS)
-    return None
+    choices = camera_pose_choices(run, robot)
+    if not any(closes(_recording(run, robot, camera)) for camera in choices):
+        return None
+    words = (
+        f"The reported poses are wrong: with them the chain closes to {declared.figures} only, and "
+        "it closes with the joint angles and the robot's model."
+    )
+    return Finding(_MISREAD, words, _BESIDE_JOINTS)
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
     """Findings on misread poses, where chains do not close as declared; after the stage `pnp`."""
     if run.mount is None:
         yield from _misreadings_in_cell(run)
-    elif not closes(_recording(run)) and (hint := misread_pose_finding(run)) is not None:
+    elif not _closes(run) and (hint := misread_pose_finding(run)) is not None:
         yield hint
 
 
@@ -279,7 +297,7 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
             if view.has_corners and view.number in run.poses and session.board_of(view) == name
         ]
         found = numbering_finding(corners, target, name if len(session.boards) > 1 else "")
-        if found is not None and (run.mount is None or closes(_recording(run))):
+        if found is not None and (run.mount is None or _closes(run)):
             yield found
 
 
@@ -288,13 +306,12 @@ def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
 
     Each camera is tested with one target and one robot alone, those of most views first.
     """
-    session = run.session
     mirrored: set[str] = set()
     is_first = True
-    for robot in session.robots:
+    for robot in run.session.robots:
         tried = set(mirrored)
         for pair in pairs_of(run, robot):
-            if pair.camera in tried or _closes(run, robot, pair):
+            if pair.camera in tried or _closes_in_cell(run, robot, pair):
                 continue
             # Exchanged names are tested first: that is cheaper, and unambiguous.
             exchanged = exchanged_names(run) if is_first else None
@@ -303,54 +320,63 @@ def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
                 return
             is_first = False
             tried.add(pair.camera)
-            try:
-                part = RunState(session.of(pair.camera, robot, pair.target), None, run.threads)
-                for stage in stages_before("solve"):
-                    part = stage.run(part)
-            except VisioncalError:
-                # Too few views of this pair.
-                continue
-            hint = next(misreadings(part), None)
+            hint = _misread_in_pair(run, robot, pair)
             if hint is None:
                 continue
-            if hint.do not in (_MIRRORED, _MIRRORED_CORNERS):
-                step = (
-                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
-                    "quaternion x, y, z, w), and calibrate again."
-                )
-                yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Remedy(step))
-                # All cameras would show the same.
-                break
-            mirrored.add(pair.camera)
-            named = replace(hint, words=f"Camera {pair.camera}: {hint.words}")
-            if hint.do == _MIRRORED_CORNERS:
+            if hint.do in (_MIRRORED, _MIRRORED_CORNERS):
+                mirrored.add(pair.camera)
                 # The command that writes a copy takes one camera and one robot only.
-                yield replace(named, do=Remedy(COUNTED_BACKWARDS))
+                words = COUNTED_BACKWARDS if hint.do == _MIRRORED_CORNERS else _MIRRORED.words
+                yield replace(hint, words=f"Camera {pair.camera}: {hint.words}", do=Remedy(words))
                 continue
             step = (
-                f"Look at an image of {pair.camera} first: where it is mirrored (a flip in the "
-                "camera's driver, a mirror before the lens), turn its images back, and calibrate "
-                "anew."
+                f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
+                "quaternion x, y, z, w), and calibrate again."
             )
-            yield replace(named, do=Remedy(step))
+            yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Remedy(step))
+            # All cameras would show the same.
+            break
 
 
-def _closes(run: RunState, robot: str, pair: CameraTargetPair) -> bool:
+def _misread_in_pair(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
+    try:
+        part = RunState(run.session.of(pair.camera, robot, pair.target), None, run.threads)
+        for stage in stages_before("solve"):
+            part = stage.run(part)
+    except VisioncalError:
+        # Too few views of this pair.
+        return None
+    return next(misreadings(part), None)
+
+
+def _closes_in_cell(run: RunState, robot: str, pair: CameraTargetPair) -> bool:
     """Whether the chain of a pair closes as declared."""
     reported = run.robots[robot].base_from_flange
     views = [pose for pose in pair.poses if pose in reported]
     places = tuple(f"view {view}" for view in views)
-    robot_poses = np.array([reported[view] for view in views]).reshape(-1, 4, 4)
-    camera_poses = [pair.poses[view].cam_from_target[0] for view in views]
-    of_robot = PoseNumbers.of_poses(robot_poses, places)
-    of_camera = PoseNumbers.of_poses(np.array(camera_poses).reshape(-1, 4, 4), places)
+
+    def numbers(poses: list[FloatArray]) -> PoseNumbers:
+        return PoseNumbers.of_poses(np.array(poses).reshape(-1, 4, 4), places)
+
+    of_robot = numbers([reported[view] for view in views])
+    of_camera = numbers([pair.poses[view].cam_from_target[0] for view in views])
     return closes(Recording(of_robot, of_camera, pair.mount, is_measured=True))
 
 
-def _recording(run: RunState) -> Recording:
-    """The poses of robot and camera as declared, those of the camera the best by each image."""
+def _closes(run: RunState) -> bool:
+    """Whether the chain closes as declared."""
+    return closes(_recording(run))
+
+
+def _recording(
+    run: RunState, robot: PoseNumbers | None = None, camera: PoseNumbers | None = None
+) -> Recording:
+    """The poses of robot and camera, as declared where None, of the camera the best by image."""
     return Recording(
-        robot_numbers(run), camera_numbers(run), run.session.mount, is_measured=bool(run.corners)
+        robot or robot_numbers(run),
+        camera or camera_numbers(run),
+        run.session.mount,
+        is_measured=bool(run.corners),
     )
 
 

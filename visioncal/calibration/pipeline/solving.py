@@ -140,6 +140,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     if level != "hand-eye" and not observed.is_misread:
         solved = _with_functions(solved)
     solved = replace(solved, inlier_fit=with_repeats(solved.inlier_fit))
+    if observed.is_misread:
+        return solved
     return replace(
         solved, arms=with_pose_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
     )

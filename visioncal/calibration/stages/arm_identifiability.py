@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.guess.joint_readings import JointReading
+from visioncal.calibration.guess.joints import JointReading
 from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure, listed
 from visioncal.core.threads import one_blas_thread

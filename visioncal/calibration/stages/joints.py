@@ -7,9 +7,13 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances
-from visioncal.calibration.guess.hypothesis import HALF_TURN
-from visioncal.calibration.guess.joint_guess import FEWEST_JOINT_ROWS, JointGuess, guess_joints
-from visioncal.calibration.guess.joint_readings import JointReading
+from visioncal.calibration.guess.joints import (
+    FEWEST_JOINT_ROWS,
+    JointGuess,
+    JointReading,
+    guess_joints,
+)
+from visioncal.calibration.guess.readings import HALF_TURN
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference

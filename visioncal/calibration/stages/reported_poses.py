@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.guess.joint_readings import JointReading
+from visioncal.calibration.guess.joints import JointReading
 from visioncal.calibration.stages.joints import MatchedJoints, match_joints
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference

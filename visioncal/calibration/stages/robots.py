@@ -7,13 +7,13 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.guess.fit import distances
-from visioncal.calibration.guess.joint_guess import (
+from visioncal.calibration.guess.joints import (
     FEWEST_JOINT_ROWS,
     FITS_SEEN,
     JointGuess,
+    JointReading,
     guess_joints,
 )
-from visioncal.calibration.guess.joint_readings import JointReading
 from visioncal.calibration.stages.joints import EXPORT_ARM, MatchedJoints, zero_taken
 from visioncal.calibration.stages.motion import lacks_robot_state
 from visioncal.calibration.stages.observed import Observed

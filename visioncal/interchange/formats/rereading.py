@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from visioncal.calibration.guess import Candidate, Guess
-from visioncal.calibration.guess.hypothesis import MIRROR_WORDS, Hypothesis
+from visioncal.calibration.guess.readings import MIRROR_WORDS, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
@@ -210,7 +210,7 @@ def reread(
     if camera.present.any():
         corrected = pose_cells(reading.camera_numbers(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
-    if candidate.changes:
+    if candidate.differences:
         changes += (f"The poses are read otherwise than declared: {candidate.words}.",)
     document, target = {**session.document, "mount": reading.mount}, session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
@@ -299,15 +299,9 @@ def _mirrored_back(
         "instead: the camera's frame is turned by 180 deg about its z else."
     )
     reading = candidate.hypothesis
-    reading = replace(reading, robot=replace(reading.robot, signs=""))
-    differences = tuple(
-        difference for difference in candidate.differences if difference != MIRROR_WORDS
-    )
-    return (
-        replace(corners, px=px),
-        (words,),
-        replace(candidate, hypothesis=reading, differences=differences),
-    )
+    changes = tuple(change for change in reading.changes if change != MIRROR_WORDS)
+    reading = replace(reading, robot=replace(reading.robot, signs=""), changes=changes)
+    return replace(corners, px=px), (words,), replace(candidate, hypothesis=reading)
 
 
 def _check_applies(candidate: Candidate, session: Session, robot: PoseNumbers) -> None:

@@ -1,0 +1,326 @@
+"""Readings of joint angles and of the robot model, tried by poses that belong to the angles.
+
+Reported poses, and those that a camera sees, are `base_from_model @ FK(q) @ flange_from_reported`
+with two unknown constant transforms: frames of world and tool, or the unknown edges of the chain.
+A reading of the joints is right where this holds for most rows.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fits
+from visioncal.calibration.guess.search import thinned
+from visioncal.core.number_format import mm_and_deg
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.robot import Robot, load_robot, other_convention, robot_names
+
+# Two constant transforms and a zero have thirteen unknowns; fewer rows fit anything.
+FEWEST_JOINT_ROWS = 5
+# Largest deviation of an arm from its model, as a share of its reach and an angle [rad]: 2 mm and 3
+# mrad a link add up to half of it. Another arm of the same shape deviates by as much again.
+_MODEL_DEVIATION = 0.03
+# Below these scores the declared reading is right: controllers print their poses more finely.
+# Cameras do not see better, and most mistakes leave more, unless they change nothing.
+_FLOOR = 1e-4
+_FITS, FITS_SEEN = 3.0 * _FLOOR, 2e-3
+# Ratio of the declared reading's score to that of one that replaces it.
+_STANDS_OUT = 3.0
+# Ratio to the best score within which readings are equivalent: the one with the fewest mistakes is
+# chosen. Equally simple ones within the second ratio are rivals.
+_EQUIVALENT, _RIVALS = 2.0, 1.5
+# Rows of the first screening, readings refined, and the share of the declared score below which.
+_SCREENED, _REFINED, _REFINED_SHARE = 16, 6, 0.6
+# The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its minimum.
+# Where most of it is gone as recorded, the zero is nearer than that. A shift of 180 degrees is left
+# out: it looks like an opposite sign of the joint before or behind it. The last: the finest step.
+_STEP_RAD, _NEAR_RAD, _FARTHEST_RAD, _FINEST_RAD = 0.25, 0.5, 2.75, 1e-6
+# Outliers have residuals beyond this many scores.
+_OUTLIER = 5.0
+# Joint 3 counted from the link before it, or from the horizontal: joint 2's share in it.
+_COUPLINGS = (
+    (1.0, "from the link before it", "Add q2_rad to"),
+    (-1.0, "from the horizontal", "Subtract q2_rad from"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class JointReading:
+    """One reading of a session's joint angles."""
+
+    robot: Robot  # The model.
+    mixing: FloatArray  # (n, n) the true angles are `mixing @ recorded + zeros`.
+    zeros: FloatArray  # (n,) correction of each joint's zero [rad].
+    # The difference from the declared reading; empty for the declared reading itself.
+    words: str = ""
+    fix: str = ""  # What the user can do about it.
+    columns: tuple[int, ...] = ()  # The columns concerned, numbered from 0; empty for all.
+    cost: float = 1.0  # Number of mistakes it implies; a lost zero counts more than one.
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether it changes a joint's zero, and nothing else."""
+        return bool(np.any(self.zeros))
+
+    def poses(self, recorded: FloatArray) -> FloatArray:
+        """(m, 4, 4) `base_from_flange` [m] for (m, n) recorded angles [rad]."""
+        return self.robot.base_from_flange(recorded @ self.mixing.T + self.zeros)
+
+
+def declared_reading(robot: Robot) -> JointReading:
+    """The joint angles as recorded."""
+    return JointReading(robot, np.eye(robot.joint_count), np.zeros(robot.joint_count), cost=0.0)
+
+
+def unit_readings(robot: Robot) -> Iterator[JointReading]:
+    """The readings with angles in degrees, or in radians that were taken for degrees."""
+    revolute, declared = ~robot.chain.prismatic, declared_reading(robot)
+    for factor, words, change in (
+        (np.pi / 180.0, "in degrees", "pi / 180"),
+        (180.0 / np.pi, "in radians that were taken for degrees", "180 / pi"),
+    ):
+        yield replace(
+            declared,
+            mixing=np.diag(np.where(revolute, factor, 1.0)),
+            words=f"the angles {words}",
+            fix="Where the angles are recorded, multiply q1_rad to "
+            f"q{len(revolute)}_rad by {change}.",
+            cost=1.0,
+        )
+
+
+def joint_readings(robot: Robot) -> Iterator[JointReading]:
+    """All other readings but lost zeros: one mistake, then two."""
+    units, signs = [*unit_readings(robot)], [*_signs(robot)]
+    columns = [*_orders(robot), *signs]
+    yield from (*units, *columns, *_couplings(robot), *_models(robot))
+    yield from (_combined(unit, column) for unit in units for column in columns)
+    yield from (_combined(*pair) for pair in combinations(signs, 2))
+
+
+def _entry(
+    robot: Robot, mixing: FloatArray, words: str, fix: str, columns: Sequence[int] = ()
+) -> JointReading:
+    return JointReading(robot, mixing, np.zeros(len(mixing)), words, fix, tuple(columns))
+
+
+def _orders(robot: Robot) -> Iterator[JointReading]:
+    names = robot.joint_names
+    count = len(names)
+    # ROS's joint_states are sorted by the joints' names.
+    alphabetical = [sorted(names).index(name) for name in names]
+    for order, words in (
+        (alphabetical, "the order of the names' alphabet"),
+        ([*range(count)][::-1], "reverse order"),
+    ):
+        changed = [at for at in range(count) if order[at] != at]
+        if len(changed) > 2:
+            fix = "Put the columns into the order from the base to the flange."
+            mixing, what = np.eye(count)[order], f"the columns of the joints in {words}"
+            yield _entry(robot, mixing, what, fix, changed)
+    for pair in combinations(range(count), 2):
+        order = [*range(count)]
+        order[pair[0]], order[pair[1]] = pair[1], pair[0]
+        both = " and ".join(f"q{at + 1}_rad" for at in pair)
+        words = f"the columns {both} exchanged"
+        if order == alphabetical:
+            words += ", as in ROS's joint_states, which sorts joints by their names"
+        fix = f"Exchange the headings {both} in views.csv."
+        yield _entry(robot, np.eye(count)[order], words, fix, pair)
+
+
+def _signs(robot: Robot) -> Iterator[JointReading]:
+    for at, name in enumerate(robot.joint_names):
+        signs = np.where(np.arange(robot.joint_count) == at, -1.0, 1.0)
+        fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
+        yield _entry(robot, np.diag(signs), f"q{at + 1}_rad of the opposite sign", fix, [at])
+
+
+def _couplings(robot: Robot) -> Iterator[JointReading]:
+    """Joint 3 counted from the horizontal: palletisers and arms with a parallelogram do so."""
+    if robot.joint_count > 2:
+        for share, words, fix in _COUPLINGS:
+            mixing = np.eye(robot.joint_count)
+            mixing[2, 1] = share
+            what = f"q3_rad counted {words}, unlike the model"
+            yield _entry(robot, mixing, what, f"{fix} q3_rad.", [2])
+
+
+def _models(robot: Robot) -> Iterator[JointReading]:
+    same, other = np.eye(robot.joint_count), other_convention(robot)
+    if other is not None:
+        table, convention = other
+        fix = f'Write convention = "{convention}" into the table of {robot.name}.'
+        yield _entry(table, same, f"the table of {robot.name} read as {convention}", fix)
+    for name in robot_names():
+        model = load_robot(name)
+        if name != robot.name and model.joint_count == robot.joint_count:
+            fix = f'In session.toml, write [robot] model = "{name}".'
+            yield _entry(model, same, f"the arm a {name} and not a {robot.name}", fix)
+
+
+def _combined(first: JointReading, second: JointReading) -> JointReading:
+    return replace(
+        first,
+        mixing=first.mixing @ second.mixing,
+        words=f"{first.words} and {second.words}",
+        fix=f"{first.fix} {second.fix}",
+        columns=() if not first.columns else (*first.columns, *second.columns),
+        cost=first.cost + second.cost,
+    )
+
+
+def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
+    """The reading in which one joint's zero is shifted."""
+    name, degrees = robot.joint_names[joint], np.rad2deg(zero_rad)
+    return replace(
+        declared_reading(robot),
+        zeros=np.where(np.arange(robot.joint_count) == joint, zero_rad, 0.0),
+        words=f"the zero of {name} (q{joint + 1}_rad) moved by {degrees:.2f} deg",
+        fix=f"Home {name} anew, or add {degrees:.2f} deg to q{joint + 1}_rad; --level offsets "
+        "finds it to the precision of the views.",
+        columns=(joint,),
+        # A fitted number explains more by chance.
+        cost=1.5,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FittedJoints:
+    """A reading of the joints, and the fit of both constant transforms under it."""
+
+    reading: JointReading
+    fit: Fit
+
+    @property
+    def score(self) -> float:
+        """The fit's score, not below a least one."""
+        return max(self.fit.score, _FLOOR)
+
+    @property
+    def figures(self) -> str:
+        """RMS residual of the kept rows, in words."""
+        shift, angle = self.fit.rms
+        return mm_and_deg(1e3 * shift, np.rad2deg(angle))
+
+
+@dataclass(frozen=True, eq=False)
+class JointGuess:
+    """The reading of the joints that is right, and its rivals."""
+
+    declared: FittedJoints  # The joints as recorded.
+    # The reading that explains the poses; the declared one where none stands out.
+    best: FittedJoints
+    # Other readings that explain them as well and are as simple.
+    rivals: tuple[JointReading, ...] = ()
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether another reading than the declared one is clearly right."""
+        return self.best is not self.declared
+
+    @property
+    def zero(self) -> JointReading | None:
+        """The reading with one joint's zero shifted; None where something else may be wrong.
+
+        Of joints with parallel axes it is the more likely one: only a fit of all determines which.
+        """
+        return self.best.reading if all(reading.is_zero for reading in self._readings) else None
+
+    @property
+    def _readings(self) -> tuple[JointReading, ...]:
+        return self.best.reading, *self.rivals
+
+    def sentence(self, what: str) -> str:
+        """States the finding; `what` is what the joints are compared with."""
+        words = " or with ".join(reading.words for reading in self._readings)
+        residuals = self.best.fit.residuals
+        agree = int(np.sum(residuals <= _OUTLIER * self.best.score))
+        rows = f" in {agree} of {len(residuals)} views" if agree < len(residuals) else ""
+        return (
+            f"With {words}, they fit {what} to {self.best.figures}{rows}; as recorded, to "
+            f"{self.declared.figures}."
+        )
+
+    @property
+    def fix(self) -> str:
+        """What the user can do about it."""
+        return " Or: ".join(reading.fix for reading in self._readings)
+
+
+def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
+    """Tries the common mistakes with joint angles and finds the one that explains the poses.
+
+    Args:
+        robot: The declared model.
+        q: (m, n) joint angles as recorded [rad], of `FEWEST_JOINT_ROWS` rows or more.
+        poses: (m, 4, 4) `base_from_flange` of the same rows, up to a constant on either side.
+        fits: Score at which the declared reading is accepted without trying others.
+
+    Returns:
+        The reading; the declared one where it is right, where no other is clearly better, or where
+        the poses turn about one axis at most and determine nothing.
+    """
+    rows, recorded = thinned(np.arange(len(q))), declared_reading(robot)
+    with one_blas_thread():
+        (declared,) = _fitted([recorded], q, poses, rows, STARTS)
+        if declared.score <= fits or is_about_one_axis(poses[:, :3, :3]):
+            return JointGuess(declared, declared)
+        few = thinned(rows, _SCREENED)
+        start, *tried = _fitted([recorded, *joint_readings(robot)], q, poses, few)
+        tried.sort(key=lambda item: item.score * (1.0 + item.reading.cost))
+        farthest = _NEAR_RAD if declared.score < _MODEL_DEVIATION else _FARTHEST_RAD
+        tried = [*tried[:_REFINED], *_with_zeros(robot, q, poses, few, farthest)]
+        near = [item.reading for item in tried if item.score < _REFINED_SHARE * start.score]
+        tried = _fitted(near, q, poses, rows, STARTS)
+    least = min((item.score for item in tried), default=np.inf)
+    equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
+    equivalent.sort(key=lambda item: (item.reading.cost, item.score))
+    if least > _MODEL_DEVIATION or declared.score <= _STANDS_OUT * equivalent[0].score:
+        return JointGuess(declared, declared)
+    best, *others = equivalent
+    limit, cost = _RIVALS * best.score, best.reading.cost
+    rivals = (item.reading for item in others if item.reading.cost == cost and item.score < limit)
+    return JointGuess(declared, best, tuple(rivals))
+
+
+def _with_zeros(
+    robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray, farthest_rad: float
+) -> list[FittedJoints]:
+    """The best zero of each inner joint; those of the first and last hide in the constants."""
+    joints = np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1
+    grid = np.arange(-farthest_rad, farthest_rad + _STEP_RAD, _STEP_RAD)
+    zeros, step, best = np.zeros(len(joints)), _STEP_RAD, []
+    while len(joints) and step > _FINEST_RAD:
+        tried = [
+            _with_zero(robot, joint, zero + more)
+            for joint, zero in zip(joints.tolist(), zeros.tolist(), strict=True)
+            for more in grid.tolist()
+        ]
+        fits = _fitted(tried, q, poses, rows)
+        of_joints = [fits[at : at + len(grid)] for at in range(0, len(fits), len(grid))]
+        best = [min(fits, key=lambda item: item.fit.score) for fits in of_joints]
+        zeros = np.array([fit.reading.zeros.sum() for fit in best])
+        step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0
+    return best
+
+
+def _fitted(
+    tried: Sequence[JointReading], q: FloatArray, poses: FloatArray, rows: IntArray, starts: int = 0
+) -> list[FittedJoints]:
+    """Fits both constant transforms by some rows; residuals are of all rows where these are few."""
+    if not tried:
+        return []
+    flange_from_base = invert(poses)
+    by_joints = np.array([reading.poses(q[rows]) for reading in tried])
+    fits = robust_fits(np.broadcast_to(flange_from_base[rows], by_joints.shape), by_joints, starts)
+    if starts and len(rows) < len(q):
+        fits = [
+            distances(flange_from_base, reading.poses(q), fit.lever, (fit.x, fit.z))
+            for reading, fit in zip(tried, fits, strict=True)
+        ]
+    return [FittedJoints(reading, fit) for reading, fit in zip(tried, fits, strict=True)]
