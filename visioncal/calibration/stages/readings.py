@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Self, TypeVar
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from visioncal.core.number_format import counted, did_you_mean, figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
 from visioncal.estimation.positions import find_mounting, mounting_problem
-from visioncal.estimation.procrustes import align
+from visioncal.estimation.procrustes import align, spreads
 from visioncal.session import Session, View
 from visioncal.session.kinds import (
     Instrument,
@@ -25,8 +25,6 @@ from visioncal.session.kinds import (
     name_of,
     stated_instrument,
 )
-
-_V = TypeVar("_V")
 
 # Largest distance that a tracker reads [m].
 _FARTHEST_M = 160.0
@@ -39,6 +37,13 @@ _LEAST_SCATTER_M = 1e-7
 _LINE = 0.1
 
 
+class Reading(NamedTuple):
+    """One reading of an instrument."""
+
+    pose: FloatArray  # (4, 4) `instrument_from_probe`; with the identity for a position alone.
+    point: int  # Index of the point.
+
+
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Readings of an instrument."""
@@ -46,30 +51,20 @@ class Readings:
     instrument: Instrument  # Its noise.
     # The points in the order in which they first appear; a single one may have no name.
     names: tuple[str, ...]
-    read_m: Mapping[int, FloatArray]  # (3,) by view, in the instrument's frame [m].
-    points: Mapping[int, int]  # Index of the point, by view.
-    # (4, 4) `instrument_from_probe` by view, where poses were read; else None.
-    probes: Mapping[int, FloatArray] | None
+    views: Mapping[int, Reading]  # The readings, by view.
+    are_poses: bool  # Whether the probe's rotation was read, too.
     rejections: tuple[Rejection, ...]  # Rows that are of no use.
-
-    @property
-    def are_poses(self) -> bool:
-        """Whether the probe's rotation was read, too."""
-        return self.probes is not None
 
     @property
     def sigma_m(self) -> float:
         """Median noise of a coordinate [m]."""
-        return float(np.median(self.instrument.sigmas_m(np.array(list(self.read_m.values())))))
+        places = np.array([reading.pose[:3, 3] for reading in self.views.values()])
+        return float(np.median(self.instrument.sigmas_m(places)))
 
     def without(self, views: Collection[int]) -> Self:
         """Removes the readings of some views."""
-
-        def kept(items: Mapping[int, _V]) -> dict[int, _V]:
-            return {view: item for view, item in items.items() if view not in views}
-
-        probes = None if self.probes is None else kept(self.probes)
-        return replace(self, read_m=kept(self.read_m), points=kept(self.points), probes=probes)
+        kept = {view: reading for view, reading in self.views.items() if view not in views}
+        return replace(self, views=kept)
 
 
 def read_instrument(session: Session) -> Readings:
@@ -93,9 +88,8 @@ def read_instrument(session: Session) -> Readings:
     return Readings(
         instrument,
         names,
-        {view.number: _read(view) for view in used},
-        {view.number: names.index(view.point) for view in used},
-        {view.number: _probe(view) for view in used} if are_poses else None,
+        {view.number: Reading(_probe(view), names.index(view.point)) for view in used},
+        are_poses,
         (*missing, *rejected),
     )
 
@@ -106,22 +100,25 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     Without a probe they are fitted to all points of a stop, relative to the first complete stop;
     empty with fewer than three points, or with points on a line.
     """
-    if readings.probes is not None:
-        return dict(readings.probes)
-    stop_of = {observation.view.number: observation.station for observation in session.observations}
+    if readings.are_poses:
+        return {view: reading.pose for view, reading in readings.views.items()}
+    stop_of, count = _stops(session), len(readings.names)
     stops: dict[Hashable, dict[int, int]] = defaultdict(dict)
-    for view, point in readings.points.items():
-        stops[stop_of[view]][point] = view
-    numbers = range(len(readings.names))
-    views = [[stop[at] for at in numbers] for stop in stops.values() if len(stop) == len(numbers)]
-    positions = np.array([[readings.read_m[view] for view in group] for group in views])
-    if len(numbers) < 3 or not views:
+    for view, reading in readings.views.items():
+        stops[stop_of[view]][reading.point] = view
+    views = [[stop[at] for at in range(count)] for stop in stops.values() if len(stop) == count]
+    if count < 3 or not views:
         return {}
-    centred = positions[0] - positions[0].mean(axis=0)
-    sizes = np.linalg.svd(centred, compute_uv=False)
-    if sizes[1] < _LINE * sizes[0]:
+    positions = np.array([[readings.views[view].pose[:3, 3] for view in group] for group in views])
+    extents = spreads(positions[0])[0]
+    if extents[1] < _LINE * extents[0]:
         return {}
     return {view[0]: align(at, positions[0]) for view, at in zip(views, positions, strict=True)}
+
+
+def _stops(session: Session) -> dict[int, Hashable]:
+    """The stop of each view."""
+    return {observation.view.number: observation.station for observation in session.observations}
 
 
 def read_instruments(session: Session) -> dict[int, ViewPoses]:
@@ -139,16 +136,13 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
         _check_unit(of_instrument)
         instrument = _instrument(session, of_instrument)
         for view in of_instrument:
-            sightings[view.number] = _sighting(view.number, _probe(view), instrument)
+            probe = _probe(view)
+            sigma_m = float(instrument.sigmas_m(probe[None, :3, 3])[0])
+            variances = np.repeat([(instrument.sigma_rad or 0.0) ** 2, sigma_m**2], 3)
+            sightings[view.number] = ViewPoses(
+                view.number, None, probe[None], (0,), np.diag(variances)[None], np.zeros((1, 6, 0))
+            )
     return sightings
-
-
-def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses:
-    """A reading (4, 4) as a view with covariance."""
-    covariance = np.zeros((6, 6))
-    covariance[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
-    covariance[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
-    return ViewPoses(view, None, probe[None], (0,), covariance[None], np.zeros((1, 6, 0)))
 
 
 def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection, ...]:
@@ -158,22 +152,16 @@ def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection,
         DataError: No view can be used.
         DegenerateError: There are too few stops.
     """
-    stop_of = {
-        observation.view.number: observation.station
-        for observation in observed.session.observations
-    }
-    poses = observed.base_from_flange
-    views = [
-        index for index in readings.read_m if index in poses and index not in observed.held_back
-    ]
+    stop_of, poses = _stops(observed.session), observed.base_from_flange
+    views = [view for view in readings.views if view in poses and view not in observed.held_back]
     if not views:
         raise nothing_seen(observed)
     stops = np.unique([stop_of[view] for view in views], return_inverse=True)[1]
     _check_stops(readings, stops)
     problem = mounting_problem(
         np.array([poses[view] for view in views]),
-        np.array([readings.read_m[view] for view in views]),
-        np.array([readings.points[view] for view in views], dtype=np.int64),
+        np.array([readings.views[view].pose[:3, 3] for view in views]),
+        np.array([readings.views[view].point for view in views], dtype=np.int64),
     )
     with one_blas_thread():
         mounting, errors = find_mounting(problem, stops)
@@ -203,17 +191,12 @@ def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection,
     return tuple(rejections)
 
 
-def _read(view: View) -> FloatArray:
-    read = view.reading_m
-    return np.zeros(3) if read is None else read
-
-
 def _probe(view: View) -> FloatArray:
     """(4, 4) the probe's pose; for a position alone, with the identity as rotation."""
-    pose, matrix = view.instrument_from_probe(), np.eye(4)
+    pose, matrix, read_m = view.instrument_from_probe(), np.eye(4), view.reading_m
     if pose is not None:
         return np.asarray(pose.as_matrix())
-    matrix[:3, 3] = _read(view)
+    matrix[:3, 3] = np.zeros(3) if read_m is None else read_m
     return matrix
 
 
@@ -241,7 +224,7 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
 
 
 def _check_unit(rows: Sequence[View]) -> None:
-    distance_m = float(np.median([np.linalg.norm(_read(view)) for view in rows]))
+    distance_m = float(np.median([np.linalg.norm(_probe(view)[:3, 3]) for view in rows]))
     if distance_m > _FARTHEST_M:
         raise DataError(
             f"views.csv: the median distance of the readings (meas_x_m, meas_y_m, meas_z_m) from "
@@ -253,16 +236,16 @@ def _check_unit(rows: Sequence[View]) -> None:
 
 
 def _are_poses(rows: Sequence[View]) -> bool:
-    has_rotation = [view.instrument_from_probe() is not None for view in rows]
-    if any(has_rotation) and not all(has_rotation):
-        without = [str(row.number) for row in rows if row.instrument_from_probe() is None]
+    without = [str(row.number) for row in rows if row.instrument_from_probe() is None]
+    if 0 < len(without) < len(rows):
         raise DataError(
-            f"views.csv: {sum(has_rotation)} of {len(rows)} readings have the probe's rotation "
-            f"(meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} have none.",
+            f"views.csv: {len(rows) - len(without)} of {len(rows)} readings have the probe's "
+            f"rotation (meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} "
+            "have none.",
             culprits=[f"views.csv: view {name}" for name in without],
             next_step="Fill it in everywhere, or leave its columns out.",
         )
-    return all(has_rotation)
+    return not without
 
 
 def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], list[Rejection]]:
@@ -288,23 +271,20 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
             "points are read.",
         )
     alone = {name: views[0] for name, views in by_name.items() if len(views) == 1}
-    rejections = [_read_once(name, view, by_name) for name, view in alone.items()]
     if len(alone) == len(by_name):
         return tuple(by_name), []
-    return tuple(name for name in by_name if name not in alone), rejections
-
-
-def _read_once(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
-    names = [word for word, views in others.items() if len(views) > 1]
-    hint = did_you_mean(name, names)
-    if hint:
-        raise DataError(
-            f"views.csv: view {view} reads a point {name!r} that no other row names; the points "
-            f"are {some_of(names)}.",
-            culprits=[f"views.csv: view {view}, point"],
-            next_step=hint,
-        )
-    return Rejection(view, f"its point {name!r} was read once, and so determines nothing")
+    names = [name for name in by_name if name not in alone]
+    for name, number in alone.items():
+        hint = did_you_mean(name, names)
+        if hint:
+            raise DataError(
+                f"views.csv: view {number} reads a point {name!r} that no other row names; the "
+                f"points are {some_of(names)}.",
+                culprits=[f"views.csv: view {number}, point"],
+                next_step=hint,
+            )
+    words = "its point {!r} was read once, and so determines nothing"
+    return tuple(names), [Rejection(view, words.format(name)) for name, view in alone.items()]
 
 
 def _check_stops(readings: Readings, stops: IntArray) -> None:

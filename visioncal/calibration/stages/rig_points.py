@@ -6,9 +6,9 @@ numbered wrongly.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -16,9 +16,8 @@ import numpy as np
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import skew
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
+from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.numbering import find_numbering
 from visioncal.estimation.poses import determines_pose
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import first_corners
@@ -36,39 +35,28 @@ _VIEWS, _SHARE = 3, 0.8
 _OUTLIER_PX, _TIMES = 3.0, 8.0
 _SIGMAS = 6.0
 _TRIALS, _SURE = 300, 0.9999
+# A point is where another is drawn within this share of its shift.
+_NEAR = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class _RigView:
-    """One view of a rig, with the pose that most of its points agree on.
+class _Ray(NamedTuple):
+    """One point in one view."""
 
-    Attributes:
-        at: (n,) indices of the seen points in the table.
-        rays: (n, 3) rays in the camera, z = 1.
-        cam_from_target: (4, 4).
-        agrees: (n,) inlier points.
-        focal_px: Focal length: pixels per unit of x and y of a ray.
-    """
-
-    indices: IntArray
-    rays: FloatArray
-    cam_from_target: FloatArray
-    inliers: Mask
-    focal_px: float
+    ray: FloatArray  # (3,) in the camera, z = 1.
+    cam_from_rig: FloatArray  # (4, 4) the pose that most points of the view agree on.
+    is_outlier: bool
+    focal_px: float  # Pixels per unit of x and y of a ray.
 
 
 def leave_out_wrong_points(observed: T) -> T:
     """Reports and removes points of rigs that are not where their tables have them."""
-    targets = tuple(observed.session.boards.values())
-    for first, (name, target) in zip(
-        first_corners(targets).tolist(), observed.session.boards.items(), strict=True
-    ):
-        if not target.is_rig:
-            continue
-        positions = _wrong_points(observed, target, first)
+    boards = observed.session.boards
+    firsts = first_corners(tuple(boards.values())).tolist()
+    for first, (name, target) in zip(firsts, boards.items(), strict=True):
+        positions = _wrong_points(observed, target, first) if target.is_rig else {}
         if not positions:
             continue
-        label = name if len(targets) > 1 else target.name
+        label = name if len(boards) > 1 else target.name
         observed = observed.noting((), (_finding(target, positions, label),))
         wrong = np.array([first + point for point in positions])
         for frame, look in observed.cameras.items():
@@ -82,44 +70,44 @@ def leave_out_wrong_points(observed: T) -> T:
 
 def _wrong_points(observed: Observed, target: Target, first: int) -> dict[int, FloatArray]:
     """Measured positions of wrong points in the rig's frame [m], by index in the table."""
-    table = np.array(target.points_m)
-    rig_views: list[_RigView] = []
+    table, sigmas_m = np.array(target.points_m), target.point_sigmas_m
+    rays: dict[int, list[_Ray]] = defaultdict(list)
     for look in observed.cameras.values():
-        if look.lens is None:
-            continue
         for view, corners in look.corners.items():
             of_rig = (corners.ids >= first) & (corners.ids < first + len(table))
-            if view not in observed.reasons and view not in observed.held_back and of_rig.any():
+            unused = view in observed.reasons or view in observed.held_back
+            if look.lens is not None and not unused and of_rig.any():
                 indices = corners.ids[of_rig] - first
-                rig_views += _rig_views(indices, corners.px[of_rig], table, look.lens.camera)
-    return _consistent_positions(rig_views, table, target.point_sigmas_m)
-
-
-def _consistent_positions(
-    rig_views: Sequence[_RigView], table: FloatArray, sigmas_m: Sequence[float]
-) -> dict[int, FloatArray]:
-    """Positions that most views agree on and that differ from the table."""
-    by_point: dict[int, list[tuple[_RigView, int]]] = defaultdict(list)
-    for rig_view in rig_views:
-        for row, point in enumerate(rig_view.indices.tolist()):
-            by_point[point].append((rig_view, row))
+                found = _rays(indices, corners.px[of_rig], table, look.lens.camera)
+                for point, ray in found:
+                    rays[point].append(ray)
     positions = {}
-    for point, rows in sorted(by_point.items()):
-        is_outlier = [not rig_view.inliers[row] for rig_view, row in rows]
-        if len(rows) < _VIEWS or np.mean(is_outlier) < _SHARE:
+    for point, seen in sorted(rays.items()):
+        if len(seen) < _VIEWS or np.mean([ray.is_outlier for ray in seen]) < _SHARE:
             continue
-        position, left_px = _triangulated(rows)
+        normals = [skew(ray.ray)[:2] for ray in seen]
+        poses = [ray.cam_from_rig for ray in seen]
+        pairs = list(zip(normals, poses, strict=True))
+        factors = np.concatenate([normal @ pose[:3, :3] for normal, pose in pairs])
+        values = np.concatenate([-normal @ pose[:3, 3] for normal, pose in pairs])
+        position = np.linalg.lstsq(factors, values, rcond=None)[0]
+        in_camera = [pose[:3, :3] @ position + pose[:3, 3] for pose in poses]
+        left_px = [
+            ray.focal_px * np.linalg.norm(place[:2] / place[2] - ray.ray[:2])
+            for ray, place in zip(seen, in_camera, strict=True)
+        ]
         shift_m = float(np.linalg.norm(position - table[point]))
-        if left_px < _OUTLIER_PX and shift_m > _SIGMAS * (sigmas_m[point] if sigmas_m else 0.0):
+        least_m = _SIGMAS * (sigmas_m[point] if sigmas_m else 0.0)
+        if np.median(left_px) < _OUTLIER_PX and shift_m > least_m:
             positions[point] = position
     # With more points elsewhere than not, it is unknown which are wrong.
-    return positions if len(positions) <= (1.0 - _MOST_AGREE) * len(by_point) else {}
+    return positions if len(positions) <= (1.0 - _MOST_AGREE) * len(rays) else {}
 
 
-def _rig_views(
+def _rays(
     indices: IntArray, px: FloatArray, table: FloatArray, camera: Camera
-) -> Iterator[_RigView]:
-    """The view with the pose that most of its points agree on; empty without one."""
+) -> Iterator[tuple[int, _Ray]]:
+    """A view's points by the pose that most of them agree on; none without one."""
     plane = normalise(camera, px)
     usable = np.isfinite(plane).all(axis=1)
     indices, plane = indices[usable], plane[usable]
@@ -134,8 +122,7 @@ def _rig_views(
     least = max(_LEAST_AGREE, int(np.ceil(_MOST_AGREE * len(indices))))
     if not is_solved or agreeing is None or len(agreeing) < least:
         return
-    inliers = np.zeros(len(indices), dtype=bool)
-    inliers[agreeing.ravel()] = True
+    inliers = np.isin(np.arange(len(indices)), agreeing)
     if not determines_pose(points[inliers]):
         return
     for _ in range(2):
@@ -150,49 +137,26 @@ def _rig_views(
             return
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    yield _RigView(indices, np.column_stack([plane, np.ones(len(indices))]), pose, inliers, focal)
+    for point, ray, is_inlier in zip(indices.tolist(), plane, inliers.tolist(), strict=True):
+        yield point, _Ray(np.append(ray, 1.0), pose, not is_inlier, focal)
 
 
-def _triangulated(rows: Sequence[tuple[_RigView, int]]) -> tuple[FloatArray, float]:
-    """Intersection of a point's rays in the rig's frame [m], and the median residual [px]."""
-    factors, values = [], []
-    for rig_view, row in rows:
-        normals = skew(rig_view.rays[row])[:2]
-        factors.append(normals @ rig_view.cam_from_target[:3, :3])
-        values.append(-normals @ rig_view.cam_from_target[:3, 3])
-    position = np.linalg.lstsq(np.concatenate(factors), np.concatenate(values), rcond=None)[0]
-    residuals = []
-    for rig_view, row in rows:
-        point = rig_view.cam_from_target[:3, :3] @ position + rig_view.cam_from_target[:3, 3]
-        difference = point[:2] / point[2] - rig_view.rays[row, :2]
-        residuals.append(rig_view.focal_px * np.linalg.norm(difference))
-    return position, float(np.median(residuals))
-
-
-def _finding(target: Target, positions: Mapping[int, FloatArray], name: str) -> Finding:
-    """Reports the wrong points, and the correction."""
+def _finding(target: Target, positions: dict[int, FloatArray], name: str) -> Finding:
+    """Reports the wrong points, and where they are."""
     table, labels = np.array(target.points_m), [str(number) for number in target.point_numbers]
-    measured = table.copy()
+    listing = []
     for point, position in positions.items():
-        measured[point] = position
-    numbering = find_numbering(measured, table)
-    reordered = set(numbering.moved.tolist()) if numbering.is_wrong else set()
-    reordered = reordered if reordered <= set(positions) else set()
-    parts, steps = [], []
-    if reordered:
-        parts.append(f"the numbers of points are not those of its table: {numbering.words(labels)}")
-        steps.append("correct the numbers of these points in corners.csv or in the rig's table")
-    others = [point for point in positions if point not in reordered]
-    if others:
-        listing = ", ".join(
-            f"{labels[other]} by "
-            f"{figure(1e3 * float(np.linalg.norm(positions[other] - table[other])))} mm, at "
-            f"({', '.join(f'{1e3 * x:.1f}' for x in positions[other])}) mm"
-            for other in others
-        )
-        parts.append(f"points are elsewhere than its table has them: {listing}")
-        steps.append("measure these points again, and correct the rig's table")
-    words = f"target {name}: {'; '.join(parts)}, by the views' other points. They were left out."
-    step = " and ".join(steps)
-    remedy = Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE)
-    return Finding("rig_points", words[0].upper() + words[1:], remedy)
+        shift_m = float(np.linalg.norm(position - table[point]))
+        away_m = np.linalg.norm(table - position, axis=1)
+        nearest = int(np.argmin(away_m))
+        if nearest != point and away_m[nearest] < _NEAR * shift_m:
+            listing.append(f"{labels[point]} is where it has {labels[nearest]}")
+        else:
+            at_mm = ", ".join(f"{1e3 * value:.1f}" for value in position)
+            listing.append(f"{labels[point]} by {figure(1e3 * shift_m)} mm, at ({at_mm}) mm")
+    return Finding(
+        "rig_points",
+        f"Target {name}: points are elsewhere than its table has them: {', '.join(listing)}, by "
+        "the views' other points. They were left out.",
+        Remedy("Correct their numbers, or measure them again and correct the table.", CALIBRATE),
+    )
