@@ -8,20 +8,18 @@ import numpy as np
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.core.finding_kinds import LENS_CHANGED
 from visioncal.core.number_format import figure
-from visioncal.core.types import Camera, FloatArray, IntArray
+from visioncal.core.types import Camera, FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements, distances
 from visioncal.estimation.lens_levels import SIGNIFICANT
-from visioncal.estimation.lens_step import LensStep, lens_step
+from visioncal.estimation.lens_step import lens_step
 from visioncal.estimation.residual_tests import common_errors, lens_field
 from visioncal.results.lens import LensField
 
 # Variance of displacements that is negligible beside that of corners; grid points per image axis.
 _NEGLIGIBLE, _GRID = 1e-4, 12
-# Components of a lens step that are named, in sigmas.
-_CLEARLY = 3.0
 
 
 @dataclass(frozen=True)
@@ -46,15 +44,16 @@ def lens_errors(solved: CellFit) -> dict[str, LensErrors]:
     seen = solved.linearised_corners
     if seen is None:
         return {}
+    optics = seen.camera_parameters
     return {
         name: LensErrors(
             problem.levels or LensLevels(),
             seen.sigmas_px[which],
-            _is_of_lens(seen.camera_parameters, name),
+            _is_of_lens(optics, name),
             _distance_m(seen, which),
-            float(np.mean(seen.camera_parameters.camera(name).matrix[:2])),
+            float(np.mean(optics.camera(name).matrix[:2])),
         )
-        for which, (name, problem) in enumerate(seen.camera_parameters.problems.items())
+        for which, (name, problem) in enumerate(optics.problems.items())
     }
 
 
@@ -69,6 +68,12 @@ def _is_of_lens(optics: CameraParameters, camera: str) -> bool:
     by_cell = lens_field(stack.px, residuals, problem.scene.camera.resolution, shares)
     by_corner = common_errors(stack.ids, residuals, shares)
     return by_cell.is_significant and by_cell.mahalanobis_sq > by_corner.mahalanobis_sq
+
+
+def _distance_m(seen: LinearisedCorners, which: int) -> float:
+    """The mean distance of one camera's views."""
+    stack = [*seen.camera_parameters.problems.values()][which].stack
+    return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
 
 
 def lens_field_of(
@@ -94,18 +99,16 @@ def lens_field_of(
     if (coefficients := seen.compressed[which].coefficients) is not None:
         # Coefficients depend on lens and boards, and on those directions of themselves that also
         # move the poses, which are unknowns of the fit.
-        is_free, beyond = np.isin(places, seen.free), _lens_error_columns(solved, which)
-        shared = solved.columns_of(places[is_free])
+        sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
+        first, is_free = sum(sizes[:which]), np.isin(places, seen.free)
+        beyond = solved.field_columns[first : first + sizes[which]]
         jacobian = np.zeros((len(coefficients.mean), len(covariance)))
-        jacobian[:, shared] = coefficients.slope[:, is_free]
+        jacobian[:, solved.columns_of(places[is_free])] = coefficients.slope[:, is_free]
         jacobian[:, beyond] = coefficients.moving_roots
         values = solved.inlier_fit.problem.values_of(LENSES, solved.inlier_fit.fit.state)
-        change = values[: len(seen.free)] - optics.values[seen.free]
-        fitted = values[beyond - solved.lens_columns.start]
-        mean = (
-            coefficients.mean + coefficients.slope[:, is_free] @ change[np.isin(seen.free, places)]
-        )
-        mean = (mean + coefficients.moving_roots @ fitted) / noise_px
+        change = (values[: len(seen.free)] - optics.values[seen.free])[np.isin(seen.free, places)]
+        fitted = coefficients.moving_roots @ values[beyond - solved.lens_columns.start]
+        mean = (coefficients.mean + coefficients.slope[:, is_free] @ change + fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
         own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
         root = _root(own, optics.camera(camera), levels)
@@ -122,20 +125,6 @@ def lens_field_of(
         intrinsics_covariance=with_lens,
         edge_covariance=jacobian @ covariance[:, :edges] / noise_px,
     )
-
-
-def _lens_error_columns(solved: CellFit, which: int) -> IntArray:
-    """The problem's columns of one lens's errors beyond its model."""
-    seen = solved.linearised_corners
-    sizes = [] if seen is None else [compressed.by_field.shape[2] for compressed in seen.compressed]
-    first = sum(sizes[:which])
-    return solved.field_columns[first : first + sizes[which]]
-
-
-def _distance_m(seen: LinearisedCorners, which: int) -> float:
-    """The mean distance of one camera's views."""
-    stack = [*seen.camera_parameters.problems.values()][which].stack
-    return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
 
 
 def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatArray:
@@ -156,9 +145,8 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         return
     stations = {row.view: row.station for row in solved.cell.rows}
     for which, (name, problem) in enumerate(optics.problems.items()):
-        views = problem.stack.views
         # Images for the intrinsics alone have no time.
-        timed = np.array([view in stations for view in views])
+        timed = np.array([view in stations for view in problem.stack.views])
         stack = replace(problem.stack, zooms=None)
         stack = stack.with_points(optics.points[stack.ids]).keep(timed[stack.view_of])
         order = np.argsort([stations[view] for view in stack.views], kind="stable")
@@ -166,18 +154,20 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
         if compressed.coefficients is not None and problem.levels is not None:
             far = distances(stack, poses)[stack.view_of]
-            field = replace(problem.levels, breathing=0.0)
-            columns = displacements(stack.px, camera, far, field)
+            columns = displacements(stack.px, camera, far, replace(problem.levels, breathing=0.0))
             beyond = columns @ compressed.coefficients.mean[: columns.shape[2]]
         step = lens_step(stack, camera, poses, beyond, order)
         if step is None:
             continue
-        first = stations[stack.views[int(order[step.first])]]
-        of = "The lens" if len(optics.problems) == 1 else f"The lens of {name}"
+        first, (x, y) = stations[stack.views[int(order[step.first])]], step.centre_px
         yield Finding(
             LENS_CHANGED,
-            f"{of} changed: {solved.cell.start_words(first)}, {_step_words(step)}, by the corners "
-            "alone; the result is between both lenses.",
+            f"{_named(name, len(optics.problems))} changed: {solved.cell.start_words(first)}, its "
+            f"focal length is {figure(100.0 * abs(step.zoom))} % "
+            f"{'longer' if step.zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * step.sigmas[0])} "
+            f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
+            f"{figure(max(step.sigmas[1:]))} px), by the corners alone; the result is between both "
+            "lenses.",
             solved.cell.or_separately(
                 "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
             ),
@@ -185,28 +175,14 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         )
 
 
-def _step_words(step: LensStep) -> str:
-    parts = []
-    if abs(step.zoom) > _CLEARLY * step.sigmas[0]:
-        longer = "longer" if step.zoom > 0.0 else "shorter"
-        parts.append(
-            f"its focal length is {figure(100.0 * abs(step.zoom))} % {longer} (sigma "
-            f"{figure(100.0 * step.sigmas[0])} %)"
-        )
-    x, y = step.centre_px
-    if max(abs(x) / step.sigmas[1], abs(y) / step.sigmas[2]) > _CLEARLY:
-        parts.append(
-            f"its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
-            f"{figure(max(step.sigmas[1:]))} px)"
-        )
-    return " and ".join(parts) or "its focal length and principal point are others"
+def _named(camera: str, count: int) -> str:
+    return "The lens" if count == 1 else f"The lens of {camera}"
 
 
 def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
     """Findings on significant lens errors."""
     for name, lens in lenses.items():
-        of = "The lens" if len(lenses) == 1 else f"The lens of {name}"
-        field, breathing, jitter = lens.levels.gains
+        of, levels, (field, *changes) = _named(name, len(lenses)), lens.levels, lens.levels.gains
         if lens.is_of_lens:
             yield Finding(
                 "lens_field",
@@ -219,17 +195,18 @@ def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 mahalanobis_sq=field,
                 up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
             )
-        if max(breathing, jitter) > SIGNIFICANT:
-            share, change = 100.0 * lens.noise_px, max(lens.levels.breathing, lens.levels.jitter)
-            how = []
-            if breathing > SIGNIFICANT:
-                how += [f"by {figure(share * lens.levels.breathing)} % where the distance doubles"]
-            if jitter > SIGNIFICANT:
-                how += [f"by {figure(share * lens.levels.jitter)} % from view to view"]
+        percents = [100.0 * lens.noise_px * share for share in (levels.breathing, levels.jitter)]
+        when = ("where the distance doubles", "from view to view")
+        how = [
+            f"by {figure(percent)} % {words}"
+            for percent, words, gain in zip(percents, when, changes, strict=True)
+            if gain > SIGNIFICANT
+        ]
+        if how:
             yield Finding(
                 "focus",
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
                 Remedy("Fix the focus (no autofocus), or work at one distance."),
-                mahalanobis_sq=max(breathing, jitter),
-                up_to_mm=10.0 * share * change * lens.distance_m,
+                mahalanobis_sq=max(changes),
+                up_to_mm=10.0 * max(percents) * lens.distance_m,
             )

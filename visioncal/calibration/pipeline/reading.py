@@ -21,7 +21,7 @@ from visioncal.calibration.stages.robots import check_joints, check_read_joints,
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.session import STREAMS, Session
+from visioncal.session import STREAMS
 
 # Beginning of warnings about the robot's model; phrases in warnings about unknown names.
 _OF_MODEL, _UNKNOWN_NAMES = "session.toml: robot.model:", ("is ignored", "was not read")
@@ -89,38 +89,30 @@ def _suspicious(warning: str) -> Finding:
     return Finding("remark", warning, Remedy(f"In {file}, correct or delete {place}."))
 
 
-def _without_times(session: Session) -> str:
-    """Advice to fill in times where the poses are in a stream; empty if that does not apply."""
-    stream = stream_of(session, "")
-    if not stream or any(view.stamp_s is not None for view in session.views):
-        return ""
-    return (
-        f"Fill in stamp_s, when each image was taken, and {STREAMS}/{stream}.csv gives the poses; "
-        "or x_m to qw."
-    )
-
-
 def _reported(run: RunState) -> RunState:
     """Reads the robots' reported poses."""
-    run = read_robots(run)
+    run, session = read_robots(run), run.session
     if run.mount is None:
         return run
     matched = run.reported.matched
     if matched is not None and matched.misread:
         check_level_is_possible(run.level, can=False, misread=matched.misread)
     if not run.base_from_flange:
-        warnings = run.session.warnings
-        of_model = [warning for warning in warnings if warning.startswith(_OF_MODEL)]
-        message = f"session {run.session.name!r}: no view has a pose of the robot."
+        of_model = [warning for warning in session.warnings if warning.startswith(_OF_MODEL)]
+        step = _MODEL_STEP if of_model else " ".join(session.warnings)
+        stream = stream_of(session, "")
+        if stream and all(view.stamp_s is None for view in session.views):
+            step = (
+                f"Fill in stamp_s, when each image was taken, and {STREAMS}/{stream}.csv gives the "
+                "poses; or x_m to qw."
+            )
         raise DataError(
-            " ".join([*of_model, message]),
+            " ".join([*of_model, f"session {session.name!r}: no view has a pose of the robot."]),
             culprits=run.lost_views,
-            next_step=_without_times(run.session)
-            or (_MODEL_STEP if of_model else " ".join(warnings))
-            or "Fill in x_m to qw, or joint angles and [robot] model.",
+            next_step=step or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     views = tuple(run.base_from_flange)
-    declared = {view.number: view.stop for view in run.session.views}
+    declared = {view.number: view.stop for view in session.views}
     check_stops(run.loads(views), views, [declared[view] for view in views])
     return run
 

@@ -106,12 +106,9 @@ class RunState(Observed):
     @property
     def pixel_px(self) -> float | None:
         """Standard deviation of a corner coordinate of the only camera, after the fit [px]."""
-        if (
-            self.cell_fit_or_none is not None
-            and self.cell_fit_or_none.linearised_corners is not None
-        ):
-            return self.cell_fit_or_none.linearised_corners.sigmas_px[0]
-        return super().pixel_px
+        fit = self.cell_fit_or_none
+        seen = None if fit is None else fit.linearised_corners
+        return super().pixel_px if seen is None else seen.sigmas_px[0]
 
     @property
     def used(self) -> tuple[int, ...]:
@@ -129,20 +126,18 @@ def _there(value: _T | None, name: str) -> _T:
 def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
     """Loads the session and checks the options: the state before the first stage."""
     threads, solver = asked.get("threads"), asked.get("solver", "joint")
-    level, convention = asked.get("level", "auto"), asked.get("convention")
     if threads is not None and threads < 1:
         raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
-    check_level(level)
-    loaded = session if isinstance(session, Session) else Session.load(session)
+    check_level(asked.get("level", "auto"))
     state = RunState(
-        loaded,
+        session if isinstance(session, Session) else Session.load(session),
         asked.get("progress"),
         threads or 0,
         dense={} if asked.get("dense") else None,
         pictures=asked.get("pictures", False),
         solver=solver,
-        level=level,
-        convention=convention,
+        level=asked.get("level", "auto"),
+        convention=asked.get("convention"),
     )
     if state.mount is None and solver != "joint":
         raise DataError(
