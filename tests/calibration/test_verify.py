@@ -15,7 +15,6 @@ from support.pages import Page
 from visioncal import calibrate, verify
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.verification import (
-    facts_of,
     load_policy,
     outcomes,
     to_document,
@@ -200,6 +199,31 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_stops_that_repeat_calibrated_ones_show_what_the_arms_errors_hide(mount):
+    wrong = {"dh_sigma_m": 1e-4, "dh_sigma_rad": 1e-4, "branches": True, "roll_rad": np.pi}
+    cell = simulate(CellOptions(mount=mount, views=25, seed=11, **wrong))
+    calibration = result_of(calibrated(cell, joints=False))
+    # The arm is off by its posture, and without joint angles that is noise.
+    assert calibration.noise["robot_translation_mm"] > 0.1
+    prior = CalibrationPrior.of(calibration)
+
+    def seen(rng, change):
+        known = known_of(again(cell, rng, change, repeated=25), joints=False)
+        return check(predict_detected(known, prior), prior)
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        same = seen(rng, None)
+        assert same.passed
+        assert same.repeated == 5
+        assert "(5 of them where the calibration's stood)" in verdict_of(same).reasons[0]
+        bumped = seen(rng, Change(camera=knock(rng, 0.4, 0.0)))
+        assert names(bumped)[0] == "camera"
+        # The arm's errors are no more in what is expected, and what is new is its repeatability.
+        assert bumped.named[0].explained.new_share < 0.3
+
+
 @pytest.mark.slow
 def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     options = CellOptions(dh_sigma_m=5e-4, dh_sigma_rad=1e-3, seed=3)
@@ -347,14 +371,10 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
     calibration = replace(place.calibration, means={"ambient_c": 21.0}, created=created.isoformat())
     session = session_of(place.cell.only(range(5)))
     warm = tuple(replace(view, numbers={"ambient_c": 33.0}) for view in session.views)
-    facts = facts_of(
-        replace(session, views=warm),
-        calibration,
-        failed=False,
-        collision=True,
-        now=created + timedelta(days=200),
-    )
-    told = {outcome.trigger.quantity: outcome for outcome in outcomes(load_policy(), facts)}
+    facts = replace(session, views=warm), calibration
+    also = {"failed": False, "collision": True, "now": created + timedelta(days=200)}
+    evaluated = outcomes(load_policy(), *facts, **also)
+    told = {outcome.trigger.quantity: outcome for outcome in evaluated}
     assert {name: outcome.state for name, outcome in told.items()} == {
         "failed_check": "quiet",
         "collision": "fired",
@@ -366,7 +386,7 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
     assert told["age_days"].value == 200.0
     strict = tmp_path / "strict.toml"
     strict.write_text('[[trigger]]\nquantity = "age_days"\nlimit = 30\n')
-    (only,) = outcomes(load_policy(strict), facts)
+    (only,) = outcomes(load_policy(strict), *facts, **also)
     assert only.state == "fired"
     strict.write_text('[[trigger]]\nquantity = "age"\nlimit = 30\n')
     with pytest.raises(DataError, match="trigger 1: quantity is 'age'"):

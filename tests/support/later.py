@@ -52,7 +52,12 @@ def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
 
 
 def again(
-    cell: SimulatedCell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+    cell: SimulatedCell,
+    rng: np.random.Generator,
+    change: Change | None = None,
+    stops: int = 5,
+    *,
+    repeated: int = 0,
 ) -> SimulatedCell:
     """Fresh stops of a cell at postures that its calibration has not seen, with noise of their own.
 
@@ -61,9 +66,11 @@ def again(
         rng: Which postures, and the noise.
         change: What has changed since; nothing where None.
         stops: How many.
+        repeated: Number of first views of which some postures are repeated; 0 for new postures.
     """
-    change = change or Change()
-    rows = FITTED + rng.choice(len(cell.robot.joints) - FITTED, stops, replace=False)
+    change, count = change or Change(), len(cell.robot.joints) - FITTED
+    first, among = (0, repeated) if repeated else (FITTED, count)
+    rows = first + rng.choice(among, stops, replace=False)
     fresh, options = cell.only(rows.tolist()), cell.options
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))

@@ -6,7 +6,6 @@ import sys
 import typer
 
 from visioncal.calibration.verification import (
-    facts_of,
     load_policy,
     outcomes,
     to_document,
@@ -43,8 +42,9 @@ def verify_command(options: VerifyOptions) -> None:
         check = verify(
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
         )
-    facts = facts_of(loaded, calibration, failed=not check.passed, collision=options.collision)
-    fired = outcomes(triggers, facts)
+    fired = outcomes(
+        triggers, loaded, calibration, failed=not check.passed, collision=options.collision
+    )
     verdict = verdict_of(check).with_paths(options.session, against, ["visioncal", *sys.argv[1:]])
     document = json.dumps(to_document(check, fired, verdict), indent=2, allow_nan=False) + "\n"
     written = (

@@ -6,27 +6,52 @@ Marginal likelihoods compare causes with any number of unknowns fairly (Kass and
 section 3): flexible causes are penalised. Everything is Gaussian except for the noise's common
 scale, which the calibration estimated with some degrees of freedom: integrated out, it gives
 Student's distribution (Box and Tiao 1973, section 2.7).
+
+Where stops stand again at postures of the calibration, the arm's errors there are known from its
+residuals: new residuals y are predicted from those r of the calibrated stops as by a Gaussian
+process with an unknown mean (universal kriging; Rasmussen and Williams 2006, section 2.7):
+
+    G = S_yr S_rr^-1       y ~ N(G r, (A_y - G A_r) C (A_y - G A_r)' + S_yy - G S_ry)
+
+with the errors' covariances S, the unknowns' Jacobians A and their covariance C by noise; errors of
+other sources are those of the calibration again. How much of the robot's noise is the same again is
+unknown, and averaged over.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.problem import Linear, Problem
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 
 # Sizes of changes: from a tenth of a millimetre to a tenth of a metre, by half decades.
 SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
 # A change of a millimetre rotates by 4 mrad.
 TURN_PER_M = 4.0
+# Shares of the noise's variance that are new at a repeated posture: sigmas are halved in each step.
+_NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
 # Steps of a cause converge after two or three, to far below any arm's repeatability.
 _ROUNDS, _CONVERGED = 6, 1e-7
 # Least sigma [rad and m]: exact data would otherwise be compared with rounding.
 _LEAST_SIGMA = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedStops:
+    """Calibrated observations that n observations of a check repeat: the same board at a stop."""
+
+    repeats: IntArray  # (r,) for each, the check's observation that repeats it.
+    residuals: FloatArray  # (r, 6) their residuals in the calibration.
+    # (n + r, n + r) correlation of the arm's errors at the check's observations, then at these.
+    correlation: FloatArray
+    stops: IntArray  # (n + r,) the stops of all these; those of the calibration differ.
+    by_noise: FloatArray  # (p, p) the part of the posterior's covariance that is by noise.
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +62,7 @@ class CalibrationPosterior:
     covariance: FloatArray  # (p, p) of their steps.
     noise: Noise
     freedom: float  # Degrees of freedom of its scale; infinite where it is known.
+    repeated: RepeatedStops | None = None  # Calibrated stops that are repeated; None for none.
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +70,14 @@ class ChangeHypothesis:
     """A change that may have happened since the calibration, of p unknowns."""
 
     name: str
-    by_sensor: FloatArray  # (n, 6, p) right perturbations of the measured poses that undo it.
-    # (s, 6, p) right perturbations of the flange at each stop that undo it.
-    flange_jacobian: FloatArray
     units: FloatArray  # (p,) the size of each unknown, for a change of one metre.
-    start: FloatArray  # (p,) start of the search.
+    # (n, 6, p) right perturbations of the measured poses that undo it; None for none.
+    by_sensor: FloatArray | None = None
+    # (s, 6, p) right perturbations of the flange at each stop that undo it; None for none.
+    flange_jacobian: FloatArray | None = None
+    start: FloatArray | None = None  # (p,) start of the search; None for zero.
     # Factors on the noise of the stops, where larger noise is the change.
-    noise_factors: tuple[float, ...] = ()
-
-    @property
-    def trials(self) -> tuple[tuple[float, float], ...]:
-        """Sizes [m] and noise factors to try, with equal prior probability."""
-        if self.noise_factors:
-            return tuple((0.0, factor) for factor in self.noise_factors)
-        return tuple((size, 1.0) for size in SIZES_M)
+    noise_factors: tuple[float, ...] = (1.0,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +88,10 @@ class HypothesisEvidence:
     values: FloatArray  # (p,) its unknowns, by the stops alone.
     covariance: FloatArray  # (p, p) of these.
     noise_factor: float  # Most likely factor on the noise.
+    new_share: float  # Most likely share of the noise's variance that repeated stops do not share.
     misfit: float  # Squared Mahalanobis distance that the cause leaves unexplained.
     freedom: int  # Degrees of freedom of the misfit.
+    deviance: float  # Twice the negative log-likelihood at the values, up to a common constant.
 
 
 def evidence_of(
@@ -79,99 +101,129 @@ def evidence_of(
 
     The problem has all unknowns of `belief`.
     """
-    cause = cause or _nothing(problem)
-    units, (widest_m, factor) = cause.units, cause.trials[-1]
-    stops = _converged(problem, belief, cause, widest_m * units, factor)
-    scores = []
-    for size_m, factor_tried in cause.trials:
-        if factor_tried != factor:
-            stops = _linearised(problem, belief, cause, stops.values, factor_tried)
-        scores.append(_score(stops, size_m * units, belief.freedom))
-    factor_tried = cause.trials[int(np.argmax(scores))][1]
-    stops = _linearised(problem, belief, cause, stops.values, factor_tried)
+    cause = cause or ChangeHypothesis("nothing", np.zeros(0))
+    shares = (1.0,) if belief.repeated is None else _NEW_SHARES
+    sizes_m, widest = SIZES_M if len(cause.units) else SIZES_M[:1], SIZES_M[-1] * cause.units
+    values = np.zeros(len(cause.units)) if cause.start is None else cause.start
+    for _ in range(_ROUNDS):
+        stops = _linearised(problem, belief, cause, values)
+        variants = {trial: stops.whitened(*trial) for trial in product(cause.noise_factors, shares)}
+        likeliest = max(variants, key=lambda trial: variants[trial].score(widest, belief.freedom))
+        before, values = values, variants[likeliest].posterior(widest)[0]
+        if np.abs(values - before).max(initial=0.0) < _CONVERGED:
+            break
+    scores = [
+        variant.score(size_m * cause.units, belief.freedom)
+        for variant, size_m in product(variants.values(), sizes_m)
+    ]
     # With the widest prior on the change's size, which hardly shrinks it.
-    mean, covariance = _posterior(stops, widest_m * units)
-    prior_misfit = float(np.sum((mean / (widest_m * units)) ** 2))
+    mean, covariance = variants[likeliest].posterior(widest)
+    white = variants[likeliest]
+    remaining = white.residuals + white.jacobian @ mean
+    misfit = float(remaining @ remaining)
     return HypothesisEvidence(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
         mean,
         covariance,
-        factor_tried,
-        _misfit(stops, widest_m * units)[0] - prior_misfit,
-        len(stops.residuals) - len(units),
+        *likeliest,
+        misfit,
+        len(remaining) - len(mean),
+        misfit + white.log_det,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _StopResiduals:
-    """Residuals (n,) of all stops, linearised in a cause's unknowns around some values.
+class _White:
+    """Whitened residuals (6 n,) at zero values of a cause, and their Jacobian (6 n, p) by these."""
 
-    `residuals` are those at zero, by that linearisation; `jacobian` is (n, p), and `covariance` (n,
-    n) that of the noise and of the calibration's unknowns together, which stay at the calibration.
-    """
-
-    values: FloatArray
     residuals: FloatArray
     jacobian: FloatArray
-    covariance: FloatArray
+    log_det: float  # Logarithm of the determinant of the covariance that was taken out.
+
+    def score(self, sigmas: FloatArray, freedom: float) -> float:
+        """Log marginal likelihood for (p,) prior sigmas, up to a constant common to all causes."""
+        scaled = self.jacobian * sigmas
+        inner = np.eye(len(sigmas)) + scaled.T @ scaled
+        projected = scaled.T @ self.residuals
+        squares = self.residuals @ self.residuals - projected @ np.linalg.solve(inner, projected)
+        log_det = self.log_det + float(np.linalg.slogdet(inner)[1])
+        if np.isinf(freedom):
+            return -0.5 * (log_det + float(squares))
+        count = len(self.residuals)
+        return -0.5 * (log_det + (freedom + count) * float(np.log1p(squares / freedom)))
+
+    def posterior(self, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (p, p) of a cause's values."""
+        information = self.jacobian.T @ self.jacobian + np.diag(sigmas**-2.0)
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        return -covariance @ (self.jacobian.T @ self.residuals), covariance
 
 
-def _nothing(problem: Problem) -> ChangeHypothesis:
-    """The cause of no change, without unknowns."""
-    (poses,) = problem.poses.values()
-    sensor, flange, values = (
-        np.zeros((len(problem), 6, 0)),
-        np.zeros((len(poses), 6, 0)),
-        np.zeros(0),
-    )
-    return ChangeHypothesis("nothing", sensor, flange, values, values, (1.0,))
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Residuals of n observations, linearised in a cause's values, with what they depend on."""
 
+    residuals: FloatArray  # (6 n,) at zero values, by the linearisation.
+    by_cause: FloatArray  # (6 n, p).
+    by_unknowns: FloatArray  # (n, 6, k) by the calibration's unknowns.
+    by_flange: FloatArray  # (n, 6, 6) by the robot's noise.
+    sensor: FloatArray  # (n, 6, 6) covariance of the sensor's noise.
+    belief: CalibrationPosterior
+    stops: IntArray  # (n,) their stops.
 
-def _converged(
-    problem: Problem,
-    belief: CalibrationPosterior,
-    cause: ChangeHypothesis,
-    sigmas: FloatArray,
-    factor: float,
-) -> _StopResiduals:
-    """Linearises at a cause's most likely values, by iteration."""
-    stops = _linearised(problem, belief, cause, cause.start, factor)
-    for _ in range(_ROUNDS if len(sigmas) else 0):
-        values = _posterior(stops, sigmas)[0]
-        step = np.abs(values - stops.values).max()
-        stops = _linearised(problem, belief, cause, values, factor)
-        if step < _CONVERGED:
-            break
-    return stops
+    def whitened(self, factor: float, new_share: float) -> _White:
+        """The residuals whitened, for a factor on the noise and a share that does not repeat."""
+        belief, count = self.belief, len(self.stops)
+        again = belief.repeated
+        repeats = np.zeros(0, dtype=np.int64) if again is None else again.repeats
+        rows = np.append(np.arange(count), repeats)
+        stops = self.stops if again is None else again.stops
+        one_stop = (stops[:, None] == stops).astype(float)
+        shared = one_stop if again is None else again.correlation
+        weights = new_share * one_stop + (1.0 - new_share) * shared
+        weights[:count, :count] += (factor**2 - 1.0) * one_stop[:count, :count]
+        by_flange = self.by_flange[rows] * np.repeat(belief.noise.robots[0], 3)
+        errors = np.einsum("ij,iab,jcb->iajc", weights, by_flange, by_flange)
+        size, end = 6 * len(rows), 6 * count
+        covariance = errors.reshape(size, size) + block_diag(*self.sensor[rows])
+        covariance += _LEAST_SIGMA**2 * np.eye(size)
+        jacobian = self.by_unknowns.reshape(end, len(belief.covariance))
+        residuals, total, by_noise = self.residuals, covariance[:end, :end], belief.covariance
+        if again is not None:
+            by_noise = again.by_noise
+            cross = covariance[end:, :end]
+            gain = np.linalg.solve(covariance[end:, end:], cross).T
+            residuals = residuals - gain @ again.residuals.reshape(-1)
+            total = total - gain @ cross
+            elsewhere = jacobian * np.repeat(~np.isin(np.arange(count), repeats), 6)[:, None]
+            total += elsewhere @ (belief.covariance - by_noise) @ elsewhere.T
+            jacobian = jacobian - gain @ self.by_unknowns[repeats].reshape(size - end, -1)
+        root = cholesky(total + jacobian @ by_noise @ jacobian.T, lower=True)
+        log_det = 2.0 * float(np.log(np.diag(root)).sum())
+        return _White(
+            solve_triangular(root, residuals, lower=True),
+            solve_triangular(root, self.by_cause, lower=True),
+            log_det,
+        )
 
 
 def _linearised(
-    problem: Problem,
-    belief: CalibrationPosterior,
-    cause: ChangeHypothesis,
-    values: FloatArray,
-    factor: float,
-) -> _StopResiduals:
+    problem: Problem, belief: CalibrationPosterior, cause: ChangeHypothesis, values: FloatArray
+) -> _Linearised:
     """Linearises at some values (p,) of a cause."""
     without, calibrated = undone(problem, cause, values), len(belief.covariance)
     linear = without.linear(with_change(belief.state, cause))
-    noise = replace(belief.noise, robots=factor * belief.noise.robots)
-    jacobian = linear.jacobian.reshape(-1, without.size)
-    known, own = jacobian[:, :calibrated], jacobian[:, calibrated:]
-    covariance = _total_covariance(without, linear, noise) + known @ belief.covariance @ known.T
-    covariance += _LEAST_SIGMA**2 * np.eye(len(covariance))
-    return _StopResiduals(values, linear.residuals.reshape(-1) - own @ values, own, covariance)
-
-
-def _total_covariance(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
-    """(6 n, 6 n) covariance of all residuals: those of one unit share the flange's error."""
-    covariance, (unit_of, _) = block_diag(*problem.covariance(noise)), problem.units
-    for unit, errors in enumerate(problem.error_covariance(noise)):
-        rows = np.flatnonzero(unit_of == unit)
-        columns = (6 * rows[:, None] + np.arange(6)).ravel()
-        jacobian = linear.by_errors[rows].reshape(-1, errors.shape[0])
-        covariance[np.ix_(columns, columns)] += jacobian @ errors @ jacobian.T
-    return np.asarray(covariance)
+    jacobian = linear.jacobian
+    by_cause = jacobian[:, :, calibrated:].reshape(6 * len(problem), len(values))
+    return _Linearised(
+        linear.residuals.reshape(-1) - by_cause @ values,
+        by_cause,
+        jacobian[:, :, :calibrated],
+        linear.by_errors,
+        without.covariance(belief.noise),
+        belief,
+        problem.observations.stops,
+    )
 
 
 def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Problem:
@@ -179,19 +231,18 @@ def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Pro
 
     Changes may be large: a board may have turned by any angle.
     """
-    by_sensor, flange_jacobian = (
-        _stepped(jacobian, values) for jacobian in (cause.by_sensor, cause.flange_jacobian)
-    )
-    adjoints, observations = adjoint(invert(by_sensor.moved)), problem.observations
-    no_prior = PriorInformation.flat(len(values))
     ((robot, poses),) = problem.poses.items()
-    changed = Effect.free("change", no_prior, by_sensor.jacobian, {robot: flange_jacobian.jacobian})
+    observations = problem.observations
+    sensor, by_sensor = _stepped(cause.by_sensor, values, len(problem))
+    flange, by_flange = _stepped(cause.flange_jacobian, values, len(poses))
+    adjoints, no_prior = adjoint(invert(sensor)), PriorInformation.flat(len(values))
+    changed = Effect.free("change", no_prior, by_sensor, {robot: by_flange})
     return replace(
         problem,
-        poses={robot: poses @ flange_jacobian.moved},
+        poses={robot: poses @ flange},
         observations=replace(
             observations,
-            measured=observations.measured @ by_sensor.moved,
+            measured=observations.measured @ sensor,
             covariance=adjoints @ observations.covariance @ np.swapaxes(adjoints, 1, 2),
         ),
     ).with_effects([*(effect.carried(adjoints) for effect in problem.effects), changed])
@@ -202,49 +253,14 @@ def with_change(state: State, cause: ChangeHypothesis) -> State:
     return State(state.edges, np.concatenate([state.values, np.zeros(len(cause.units))]))
 
 
-@dataclass(frozen=True, eq=False)
-class _LinearisedMotions:
+def _stepped(
+    jacobian: FloatArray | None, values: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
     """Motions (m, 4, 4) for some values, and their right Jacobian (m, 6, p)."""
-
-    moved: FloatArray
-    jacobian: FloatArray
-
-
-def _stepped(jacobian: FloatArray, values: FloatArray) -> _LinearisedMotions:
+    if jacobian is None:
+        return np.tile(np.eye(4), (count, 1, 1)), np.zeros((count, 6, len(values)))
     twists = jacobian @ values
     # The series does not converge beyond; no cause that leads there explains anything.
     near = np.linalg.norm(twists[:, :3], axis=1) < np.pi
     right_jacobian_inverse = inverse_right_jacobian(np.where(near[:, None], twists, 0.0))
-    return _LinearisedMotions(
-        exp(twists), np.asarray(np.linalg.solve(right_jacobian_inverse, jacobian), dtype=float)
-    )
-
-
-def _score(stops: _StopResiduals, sigmas: FloatArray, freedom: float) -> float:
-    """Logarithm of the marginal likelihood, up to a constant common to all causes."""
-    squares, log_det = _misfit(stops, sigmas)
-    if np.isinf(freedom):
-        return -0.5 * (log_det + squares)
-    count = len(stops.residuals)
-    return -0.5 * (log_det + (freedom + count) * float(np.log1p(squares / freedom)))
-
-
-def _misfit(stops: _StopResiduals, sigmas: FloatArray) -> tuple[float, float]:
-    """Squared Mahalanobis length of the residuals, and their covariance's log-determinant."""
-    root, lower = _root(stops, sigmas)
-    squares = float(stops.residuals @ cho_solve((root, lower), stops.residuals))
-    return squares, 2.0 * float(np.log(np.diag(root)).sum())
-
-
-def _posterior(stops: _StopResiduals, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (p,) and covariance (p, p) of a cause's values, given the residuals."""
-    cross = stops.jacobian * sigmas**2
-    gain = cho_solve(_root(stops, sigmas), cross)
-    return -gain.T @ stops.residuals, np.diag(sigmas**2) - cross.T @ gain
-
-
-def _root(stops: _StopResiduals, sigmas: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor of the residuals' covariance, for a cause of some size."""
-    total = stops.covariance + (stops.jacobian * sigmas**2) @ stops.jacobian.T
-    root, lower = cho_factor(total, lower=True)
-    return np.asarray(root), bool(lower)
+    return exp(twists), np.asarray(np.linalg.solve(right_jacobian_inverse, jacobian))

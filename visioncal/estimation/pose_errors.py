@@ -259,6 +259,11 @@ def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterato
     yield _Model("drift", _PRIOR["drift"], (process,), white)
 
 
+def posture_correlation(poses: FloatArray) -> FloatArray:
+    """(s, s) correlation of the errors at (s, 4, 4) postures, of the shortest range considered."""
+    return np.exp(-_squared_distances(poses) / (2.0 * _RANGES[0] ** 2))
+
+
 def _squared_distances(poses: FloatArray) -> FloatArray:
     """(s, s) squared distances of postures; 2 (1 - cos) of an angle [rad^2]."""
     places, turns = (poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))

@@ -197,6 +197,18 @@ class FittedArm:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class FittedStops:
+    """Stops of a fit, which later stops of a verification may repeat."""
+
+    views: tuple[int, ...]  # (m,) the first view of each board at each stop.
+    boards: tuple[int, ...]  # (m,) index of the board in `JointFit.boards`.
+    poses: Matrix  # (m, 6) exponential coordinates of `base_from_flange` [rad, m].
+    residuals: Matrix  # (m, 6) residual of the board's pose, in its frame [rad, m].
+    # (k, k) covariance of `JointFit` by noise alone: errors of other sources repeat themselves.
+    by_noise: Covariance
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class JointFit(Section):
     """Parameters of the fit and their covariance, for verification: `joint_fit`."""
 
@@ -207,6 +219,7 @@ class JointFit(Section):
     # (k, k) of both transforms, of lens and targets, of further targets' poses relative to the
     # first, and of the arm's errors.
     covariance: Covariance
+    stops: FittedStops | None = None  # Its stops; None of a part of a whole cell.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

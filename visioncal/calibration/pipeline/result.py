@@ -20,13 +20,15 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
+from visioncal.calibration.stages.random_effects import of_random_effects
 from visioncal.calibration.stages.validate import predict_corners
-from visioncal.core.transforms import adjoint, invert
+from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimation.arm import misfit_jacobian, stops_of
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
+from visioncal.estimation.problem_parts import State
 from visioncal.results import (
     HELD_BACK,
     Calibration,
@@ -47,6 +49,7 @@ from visioncal.results.sections import (
     CellUncertainty,
     DenseResult,
     FittedArm,
+    FittedStops,
     ImageBlur,
     InstrumentResult,
     Intervals,
@@ -285,12 +288,38 @@ def _joint_fit(run: RunState) -> JointFit | None:
     boards, seen = run.session.boards, run.cell_fit.linearised_corners
     unknown = run.assessment.problem.unknown
     names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in unknown]
+    covariance, by_noise = _written_covariance(run)
     return JointFit(
         targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),
         looks=() if seen is None else tuple(seen.free.tolist()),
         arm=_fitted_arm(run, run.robot_arm),
-        covariance=_written_covariance(run),
+        covariance=covariance,
+        stops=_fitted_stops(run, by_noise),
+    )
+
+
+def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
+    """The residuals of each board at each stop; None where a frame or a clock moved."""
+    assessment, beside = run.assessment, run.cell_fit.other_effects
+    growing = {effect.name for effect in of_random_effects(beside)}
+    if assessment.moved or len(growing) < len(beside):
+        return None
+    # Of what grew with time or reach, a check knows nothing: it is in the residuals.
+    whole, state = assessment.problem, assessment.state
+    problem = whole.with_effects([part for part in whole.effects if part.name not in growing])
+    values = [whole.values_of(part.name, state) for part in problem.effects]
+    merged = problem.merged()
+    linear = merged.linear(State(state.edges, np.concatenate([np.zeros(0), *values])))
+    first = np.unique(problem.of_one_stop, return_index=True)[1]
+    views = np.array([row.view for row in run.cell_fit.cell.rows])[run.cell_fit.inlier_fit.used]
+    (poses, *_), observations = merged.poses.values(), merged.observations
+    return FittedStops(
+        views=tuple(views[first].tolist()),
+        boards=tuple(merged.unknown[name] - 1 for name in observations.observed),
+        poses=log(poses[observations.stops]),
+        residuals=np.round(linear.residuals, 9),
+        by_noise=by_noise,
     )
 
 
@@ -323,8 +352,11 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _written_covariance(run: RunState) -> FloatArray:
-    """Covariance of the unknowns as they are written, and of the arm's that are not estimated."""
+def _written_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the unknowns as they are written, and of the arm's that are not estimated.
+
+    The second is the part by noise, and by errors that change with time.
+    """
     # Further boards are written relative to the first; clocks and drift are left out.
     answer, arm, seen = run.assessment, run.robot_arm, run.cell_fit.linearised_corners
     problem, boards, rows = answer.problem, answer.state.edges[1:], np.eye(answer.problem.size)
@@ -337,14 +369,21 @@ def _written_covariance(run: RunState) -> FloatArray:
     of_errors = of_errors if arm.model is None else of_errors[arm.model.is_kept]
     optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
     written = np.concatenate([rows[:12], rows[optics], *further, of_errors])
-    own = np.asarray(written @ answer.covariance @ written.T)
-    if arm.errors is None or arm.errors.is_estimated or not arm.errors.of_links:
-        return own
-    jacobian = written @ misfit_jacobian(problem, answer.state, answer.noise, arm.robot, arm.errors)
-    size, variance = jacobian.shape[1], arm.errors.sigma**2
+    by_noise = answer.covariance - sum(answer.covariance_by_source.values(), np.zeros(()))
+    parts = [np.asarray(written @ part @ written.T) for part in (answer.covariance, by_noise)]
+    errors = arm.errors
+    if errors is None or errors.is_estimated:
+        return parts[0], parts[1]
+    jacobian = written @ misfit_jacobian(problem, answer.state, answer.noise, arm.robot, errors)
+    size, variance = jacobian.shape[1], errors.sigma**2
+    lasting = jacobian[:, errors.is_time_correlated]
+    parts[1] += variance * lasting @ lasting.T
+    if not errors.of_links:
+        return parts[0], parts[1]
     # The fit deviates by its Jacobian times the errors; the truth deviates from it the other way.
     cross = -variance * jacobian
-    return np.block([[own, cross], [cross.T, variance * np.eye(size)]])
+    whole = np.block([[parts[0], cross], [cross.T, variance * np.eye(size)]])
+    return whole, np.pad(parts[1], (0, size))
 
 
 def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:

@@ -2,20 +2,13 @@
 
 from visioncal.calibration.verification.check import Check, Suspect, verify
 from visioncal.calibration.verification.messages import to_document, verdict_of
-from visioncal.calibration.verification.policy import (
-    Outcome,
-    Trigger,
-    facts_of,
-    load_policy,
-    outcomes,
-)
+from visioncal.calibration.verification.policy import Outcome, Trigger, load_policy, outcomes
 
 __all__ = [
     "Check",
     "Outcome",
     "Suspect",
     "Trigger",
-    "facts_of",
     "load_policy",
     "outcomes",
     "to_document",

@@ -7,8 +7,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import adjoint, invert, log
-from visioncal.core.types import FloatArray, Target
+from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.estimation.appearance import (
     Appearance,
     LensBoardParameters,
@@ -17,15 +17,18 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
+from visioncal.estimation.model_evidence import RepeatedStops
+from visioncal.estimation.pose_errors import posture_correlation
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.results import Calibration
 from visioncal.results.sections import BoardResult, FittedArm, JointFit, RigResult
 from visioncal.robot import Robot, WeightFunctions
-from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import numbered_positions, target_from_document
 
 # A noise scale with more degrees of freedom counts as known.
 _MOST_FREEDOM = 1e6
+# Correlation of the arm's errors from which a stop repeats a calibrated one.
+_REPEATED = 0.5
 
 ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
 
@@ -35,6 +38,7 @@ class CalibrationPrior:
     """The fit of a calibration: its unknowns, their covariance, and the noise."""
 
     calibration: Calibration  # The calibration.
+    fit: JointFit  # Its section on the fit.
     # The printed targets by the session's names; that of an only one is empty.
     targets: Mapping[str, Target]
     boards: tuple[int, ...]  # (b,) indices, among the targets, of those with an edge.
@@ -42,7 +46,7 @@ class CalibrationPrior:
     # boards, then the arm.
     state: State
     covariance: FloatArray  # (6 + 6 b + k, 6 + 6 b + k) of edges and values.
-    looks: tuple[int, ...]  # (l,) indices of the free values of lens and boards.
+    written: FloatArray  # (6 + 6 b + k, w) Jacobian of these by the unknowns as they are written.
     arm: ArmKind  # Parametrisation of the arm's errors.
     model: ArmModel | None  # The calibrated arm, for errors of its model.
 
@@ -54,17 +58,17 @@ class CalibrationPrior:
             DataError: The calibration has none: it was made with an instrument, or by an older
                 version.
         """
+        label, fit = f"calibration {calibration.session_name!r}", calibration.joint_fit
         if calibration.mount == "instrument":
             raise DataError(
-                f"calibration {calibration.session_name!r} was made with a measuring instrument; "
-                "only one with a camera can be verified.",
+                f"{label} was made with a measuring instrument; only one with a camera can be "
+                "verified.",
                 next_step="Calibrate the new readings, and compare both with visioncal diff.",
             )
-        fit = calibration.joint_fit
         if fit is None:
             raise DataError(
-                f"calibration {calibration.session_name!r} does not hold the covariance of its "
-                "fit (joint_fit): an older version made it.",
+                f"{label} does not hold the covariance of its fit (joint_fit): an older version "
+                "made it.",
                 next_step="Calibrate its recording again: visioncal calibrate recording.rrd -o "
                 "FOLDER.",
             )
@@ -72,7 +76,7 @@ class CalibrationPrior:
             return _read(calibration, fit)
         except (LookupError, TypeError, ValueError) as error:
             raise DataError(
-                f"calibration {calibration.session_name!r}: joint_fit cannot be read: {error!r}.",
+                f"{label}: joint_fit cannot be read: {error!r}.",
                 culprits=["joint_fit"],
                 next_step="Calibrate its session again.",
             ) from error
@@ -83,12 +87,12 @@ class CalibrationPrior:
         camera = self.calibration.camera
         if camera is None or not self.targets:
             return None
-        targets, size = tuple(self.targets.values()), len(self.looks)
+        targets, size = tuple(self.targets.values()), len(self.fit.looks)
         return LensBoardParameters(
             Appearance(camera.camera, _shape(self.calibration, self.targets)),
             boards_basis(targets),
             numbered_positions(targets),
-            np.array(self.looks, dtype=np.int64),
+            np.array(self.fit.looks, dtype=np.int64),
             np.zeros(size, dtype=bool),
             np.zeros((size, size)),
             np.zeros(size),
@@ -123,18 +127,49 @@ class CalibrationPrior:
         """Degrees of freedom of the estimated noise; limited, as more make no difference."""
         return min(self.calibration.noise_dof, _MOST_FREEDOM)
 
-    def with_board_at(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
+    def with_board_at(self, z: FloatArray, sigma: float) -> "CalibrationPrior":
         """Replaces the pose of a single board.
 
         Args:
             z: (4, 4) rough edge of the board.
-            sigmas: (6,) its standard deviations [rad, m].
+            sigma: Its standard deviation about and along each axis [rad and m].
         """
         covariance = self.covariance.copy()
         covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
-        covariance[6:12, 6:12] = np.diag(sigmas**2)
+        covariance[6:12, 6:12] = sigma**2 * np.eye(6)
         state = replace(self.state, edges=np.stack([self.state.edges[0], z]))
         return replace(self, state=state, covariance=covariance)
+
+    def repeated(
+        self, poses: FloatArray, boards: IntArray, stops: IntArray
+    ) -> RepeatedStops | None:
+        """The calibrated observations that those of a check repeat; None for none.
+
+        Args:
+            poses: (n, 4, 4) flange at each observation of the check.
+            boards: (n,) index of the board that it shows.
+            stops: (n,) its stop.
+        """
+        calibrated, count = self.fit.stops, len(poses)
+        if calibrated is None or not len(calibrated.views):
+            return None
+        correlation = posture_correlation(np.concatenate([poses, exp(calibrated.poses)]))
+        alike = np.where(boards[:, None] == np.array(calibrated.boards), 1.0, 0.0)
+        near = alike * correlation[:count, count:]
+        nearest = near.argmax(axis=1)
+        repeating = np.flatnonzero(near.max(axis=1) > _REPEATED)
+        chosen, first = np.unique(nearest[repeating], return_index=True)
+        if not len(chosen):
+            return None
+        kept = np.append(np.arange(count), count + chosen)
+        own = np.unique(calibrated.poses, axis=0, return_inverse=True)[1].reshape(-1)
+        return RepeatedStops(
+            repeating[first],
+            calibrated.residuals[chosen],
+            correlation[np.ix_(kept, kept)],
+            np.append(stops, stops.max() + 1 + own[chosen]),
+            self.written @ calibrated.by_noise @ self.written.T,
+        )
 
 
 def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
@@ -148,8 +183,15 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     jacobian = _jacobian(np.array(boards), len(fit.looks), len(values))
     if fit.covariance.shape != (jacobian.shape[1],) * 2:
         raise ValueError(f"covariance has the shape {fit.covariance.shape}")
+    stops = fit.stops
+    if stops is not None and not (
+        stops.poses.shape == stops.residuals.shape == (len(stops.boards), 6)
+        and stops.by_noise.shape == fit.covariance.shape
+    ):
+        raise ValueError(f"stops have {len(stops.boards)} boards and other shapes")
     return CalibrationPrior(
         calibration,
+        fit,
         targets,
         tuple(list(targets).index(name) for name in names) if targets else (0,),
         State(
@@ -157,45 +199,23 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
             np.concatenate([np.zeros(len(fit.looks)), values]),
         ),
         jacobian @ fit.covariance @ jacobian.T,
-        _looks(calibration, fit, targets),
+        jacobian,
         "none" if fit.arm is None else fit.arm.of,
         fitted_model(calibration.calibrated_robot, fit.arm),
     )
-
-
-def _looks(
-    calibration: Calibration, fit: JointFit, targets: Mapping[str, Target]
-) -> tuple[int, ...]:
-    """Indices of the fit's free values among those of the lens, then of the targets."""
-    # Files of earlier versions lack a board's shear, the last of its values: indices behind it are
-    # shifted by one for each board.
-    only, camera = calibration.board, calibration.camera
-    boards = [*calibration.boards.values(), *([] if only is None else [only])]
-    if camera is None or all("shear" in board.shape for board in boards):
-        return fit.looks
-    is_shear = [False] * len(intrinsics(camera.camera))
-    for target in targets.values():
-        is_shear += [False] * (len(stated_board_sigma(target)) - 1) + [not target.is_rig]
-    return tuple(np.flatnonzero(~np.array(is_shear))[list(fit.looks)].tolist())
 
 
 def _jacobian(boards: FloatArray, looks: int, arm: int) -> FloatArray:
     """Jacobian of edges and values with respect to the unknowns as they are written.
 
     Written are the edges of the camera and of the first board, then lens and boards, then the
-    pose of each further board relative to the first, and the arm.
-
-    Args:
-        boards: (b, 4, 4) the boards' edges.
-        looks: Number of values of lens and boards.
-        arm: Number of values of the arm.
+    pose of each further of the (b, 4, 4) boards relative to the first, and the arm.
     """
     edges = 6 + 6 * len(boards)
-    size = edges + looks + arm
-    jacobian = np.zeros((size, size))
-    jacobian[:12, :12] = np.eye(12)
-    jacobian[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
-    jacobian[edges + looks :, edges + looks :] = np.eye(arm)
+    jacobian = np.eye(edges + looks + arm)
+    # Rows in the order of edges and values.
+    order = [*range(12), *range(12 + looks, edges + looks), *range(12, 12 + looks)]
+    jacobian[: edges + looks] = jacobian[order]
     for index, transform in enumerate(adjoint(invert(boards[1:]) @ boards[0])):
         # z_k exp(d_k) = z_1 exp(d_1) exp(-d) target_1_from_target_k
         row, column = 12 + 6 * index, 12 + looks + 6 * index

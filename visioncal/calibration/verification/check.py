@@ -9,12 +9,11 @@ from scipy.special import fdtrc
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.change_hypotheses import (
-    BOTH,
     CAMERA,
     NOISE,
-    REPLACED,
+    PAIRS,
+    Cause,
     causes_of,
-    kind_of,
 )
 from visioncal.calibration.verification.prediction import (
     PredictedStops,
@@ -30,31 +29,33 @@ from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
 from visioncal.estimation.model_evidence import (
     CalibrationPosterior,
-    ChangeHypothesis,
     HypothesisEvidence,
     evidence_of,
     undone,
     with_change,
 )
+from visioncal.estimation.problem_parts import ROBOT
 from visioncal.results import Calibration, select_matching
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
 
 _LIMITS = CheckLimits()
-_PAIRS = (BOTH, REPLACED)
-# Prior sigma of a board that was moved on purpose, around where it is seen [rad, m].
-_ANYWHERE = np.repeat([1.0, 1.0], 3)
+# Prior sigma of a board that was moved on purpose, around where it is seen [rad and m].
+_ANYWHERE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
     """A change that may have happened."""
 
-    # `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
-    # `board_size`, `board_replaced`, `robot_noise`, or `view 7`.
-    name: str
+    cause: Cause
     probability: float  # Posterior probability among all changes.
     explained: HypothesisEvidence  # Fit and evidence of the change.
+
+    @property
+    def name(self) -> str:
+        """Its kind and what it is of: `camera`, `board NAME`, `joint 3`, `view 7` ..."""
+        return self.cause.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,22 +69,31 @@ class Check:
     # [rad], translation [m]), in the board's frame.
     residuals: FloatArray
     remaining: FloatArray  # (m, 6) the same with the likeliest change undone, where one was found.
+    repeated: int  # Number of the calibration's stops that are repeated.
     log_evidence: float  # Logarithm of the likelihood ratio of any change to none.
-    misfit: float  # Squared Mahalanobis distance of the stops from the prediction.
-    freedom: int  # Its degrees of freedom.
+    unchanged: HypothesisEvidence  # Fit and evidence without a change.
     p_value: float  # Probability of a misfit at least as large if nothing has changed.
     suspects: tuple[Suspect, ...]  # All changes that were compared, the likeliest first.
     # Changes that cannot be distinguished from the likeliest, which is the first; empty where
     # nothing has changed.
     named: tuple[Suspect, ...]
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
-    # (6,) standard deviations of an estimated motion of the camera, about its axes [rad, m].
-    camera_sigma: FloatArray
 
     @property
     def passed(self) -> bool:
         """Whether the stops agree with the calibration."""
-        return bool(self.log_evidence < np.log(_LIMITS.likelihood_ratio))
+        return not self.named
+
+    @property
+    def misfit(self) -> float:
+        """Squared Mahalanobis distance of the stops from the prediction."""
+        return self.unchanged.misfit
+
+    @property
+    def camera_sigma(self) -> FloatArray:
+        """(6,) standard deviations of an estimated motion of the camera [rad, m]."""
+        camera = next(suspect for suspect in self.suspects if suspect.name == CAMERA)
+        return np.sqrt(np.diag(camera.explained.covariance))
 
 
 @typed
@@ -123,13 +133,25 @@ def verify(
     without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
     prior = CalibrationPrior.of(calibration)
     predicted = predict_stops(session, prior, progress, without)
-    return check(predicted, prior, board_placed_anew=board_placed_anew)
+    return check(predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_its_own)
 
 
 def check(
-    predicted: PredictedStops, prior: CalibrationPrior, *, board_placed_anew: bool = False
+    predicted: PredictedStops,
+    prior: CalibrationPrior,
+    *,
+    board_placed_anew: bool = False,
+    with_repeats: bool = True,
 ) -> Check:
-    """Compares possible changes by the evidence of predicted stops; see `verify`."""
+    """Compares possible changes by the evidence of predicted stops; see `verify`.
+
+    Args:
+        predicted: The stops.
+        prior: The calibration as a prior.
+        board_placed_anew: Whether the board was moved on purpose.
+        with_repeats: Whether stops near calibrated ones are compared with these: they are others.
+    """
+    problem, repeated = predicted.problem, None
     if board_placed_anew:
         if len(prior.boards) > 1:
             raise DataError(
@@ -140,54 +162,45 @@ def check(
             )
         change = mean_transform(predicted.away(prior))
         prior = prior.with_board_at(prior.state.edges[1] @ change, _ANYWHERE)
-    belief = CalibrationPosterior(
-        prior.state,
-        prior.covariance,
-        prior.noise(from_corners=predicted.from_corners),
-        prior.freedom,
-    )
+    elif with_repeats:
+        stops = problem.observations.stops
+        repeated = prior.repeated(problem.poses[ROBOT][stops], predicted.boards, stops)
+    noise = prior.noise(from_corners=predicted.from_corners)
+    belief = CalibrationPosterior(prior.state, prior.covariance, noise, prior.freedom, repeated)
     causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)
     with one_blas_thread():
-        unchanged = evidence_of(predicted.problem, belief)
-        explanations = [evidence_of(predicted.problem, belief, cause) for cause in causes]
-    likelihoods = np.array([explained.likelihood for explained in explanations])
-    scores = likelihoods + np.log(_prior_probabilities(causes))
+        unchanged = evidence_of(problem, belief)
+        explanations = [evidence_of(problem, belief, cause.columns) for cause in causes]
+    # Kinds of causes have equal prior probabilities, and causes of one kind.
+    kinds = [cause.kind for cause in causes]
+    priors = np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
+    scores = np.array([explained.likelihood for explained in explanations]) + np.log(priors)
     evidence = float(np.logaddexp.reduce(scores))
-    order = np.argsort(-scores, kind="stable")
-    probabilities = np.exp(scores - evidence)
     suspects = tuple(
-        Suspect(causes[index].name, float(probabilities[index]), explanations[index])
-        for index in order
+        Suspect(causes[index], float(np.exp(scores[index] - evidence)), explanations[index])
+        for index in np.argsort(-scores, kind="stable")
     )
     log_evidence = evidence - unchanged.likelihood
     named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_separated(suspects)
-    camera = next(suspect for suspect in suspects if suspect.name == CAMERA)
     changes = remaining = log(predicted.away(prior))
     if named:
-        cause = causes[order[0]]
-        corrected = undone(predicted.problem, cause, suspects[0].explained.values)
-        remaining = log(board_changes(corrected, with_change(belief.state, cause)))
+        columns = named[0].cause.columns
+        corrected = undone(problem, columns, named[0].explained.values)
+        remaining = log(board_changes(corrected, with_change(belief.state, columns)))
     return Check(
         prior.calibration,
         predicted,
         prior,
         changes,
         remaining,
+        0 if repeated is None else len(repeated.repeats),
         log_evidence,
-        unchanged.misfit,
-        unchanged.freedom,
+        unchanged,
         float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
         suspects,
         named,
         _is_explained(suspects[0], prior.freedom),
-        np.sqrt(np.diag(camera.explained.covariance)),
     )
-
-
-def _prior_probabilities(causes: Sequence[ChangeHypothesis]) -> FloatArray:
-    """Prior probabilities of the causes: equal for each kind, and within a kind."""
-    kinds = [kind_of(cause.name) for cause in causes]
-    return np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
 
 
 def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -196,21 +209,21 @@ def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
     # turned base looks like a slip of the first joint, however unlikely a turn about just that
     # axis.
     best, *others = suspects
-    if kind_of(best.name) in (NOISE, *_PAIRS):
+    if best.cause.kind in (NOISE, *PAIRS):
         return (best,)
-    margin = 2.0 * np.log(_LIMITS.ruled_out)
 
-    def penalised_misfit(suspect: Suspect) -> float:
-        return suspect.explained.misfit + len(suspect.explained.values)
+    def penalised(suspect: Suspect) -> float:
+        return suspect.explained.deviance + len(suspect.explained.values)
 
+    most = penalised(best) + 2.0 * np.log(_LIMITS.ruled_out)
     rivals = [
         rival
         for rival in others
         # Two simultaneous changes can always imitate one of them, and are no rivals.
-        if kind_of(rival.name) not in _PAIRS
+        if rival.cause.kind not in PAIRS
         and (
             rival.probability * _LIMITS.ruled_out > best.probability
-            or (rival.name != NOISE and penalised_misfit(rival) < penalised_misfit(best) + margin)
+            or (rival.cause.kind != NOISE and penalised(rival) < most)
         )
     ]
     return (best, *rivals)
@@ -219,7 +232,7 @@ def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
 def _is_explained(best: Suspect, freedom: float) -> bool:
     """Whether a change leaves residuals no larger than noise; true without degrees of freedom."""
     remaining = best.explained.freedom
-    if best.name == NOISE or remaining < 1:
+    if best.cause.kind == NOISE or remaining < 1:
         return True
     limit = f_limit(_LIMITS.unexplained, remaining, freedom)
     return bool(best.explained.misfit < remaining * limit)

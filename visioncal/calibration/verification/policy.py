@@ -18,17 +18,15 @@ State: TypeAlias = Literal["fired", "quiet", "unknown"]
 
 _FILE = Path(__file__).with_name("policy.toml")
 _DAY_S = 86400.0
-# Yes or no quantities; quantities with a limit, by unit.
-_FLAGS = ("failed_check", "collision")
-_UNITS = {"ambient_change_k": "K", "payload_change_kg": "kg", "age_days": "days"}
-_COLUMNS = {"ambient_change_k": "ambient_c", "payload_change_kg": "payload_kg"}
-_LABELS = {
-    "failed_check": "a failed check",
-    "collision": "a collision",
-    "ambient_change_k": "the ambient temperature's change",
-    "payload_change_kg": "the payload's change",
-    "age_days": "the calibration's age",
+# Names in words, with the units of quantities that have a limit; the others are yes or no.
+_QUANTITIES = {
+    "failed_check": ("a failed check", ""),
+    "collision": ("a collision", ""),
+    "ambient_change_k": ("the ambient temperature's change", "K"),
+    "payload_change_kg": ("the payload's change", "kg"),
+    "age_days": ("the calibration's age", "days"),
 }
+_COLUMNS = {"ambient_change_k": "ambient_c", "payload_change_kg": "payload_kg"}
 
 
 @dataclass(frozen=True)
@@ -49,14 +47,13 @@ class Outcome:
     value: float | None
     words: str  # Its name, with figure and limit, or why the figure is unknown.
 
-
-@dataclass(frozen=True)
-class TriggerFacts:
-    """Input of the triggers."""
-
-    values: Mapping[str, float]  # Figures by quantity.
-    flags: Mapping[str, bool]  # Yes or no, by quantity.
-    unknown: Mapping[str, str]  # Why a figure is unknown, by quantity.
+    @property
+    def document(self) -> dict[str, Any]:
+        """Its entry in verify.json; unknown values are absent."""
+        figures = {"limit": self.trigger.limit, "value": self.value}
+        known = {name: figure for name, figure in figures.items() if figure is not None}
+        stated = {"quantity": self.trigger.quantity, "state": self.state}
+        return {**stated, **known, "words": self.words}
 
 
 def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
@@ -81,71 +78,73 @@ def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
 
 def _trigger(row: Mapping[str, Any], label: str) -> Trigger:
     table = DocumentTable(row, label)
-    quantity, known = table.text("quantity"), (*_FLAGS, *_UNITS)
-    if quantity not in known:
+    quantity = table.text("quantity")
+    if quantity not in _QUANTITIES:
         raise DataError(
-            f"{label}: quantity is {quantity!r}; known are {', '.join(known)}.",
+            f"{label}: quantity is {quantity!r}; known are {', '.join(_QUANTITIES)}.",
             culprits=[label],
-            next_step=did_you_mean(quantity, known),
+            next_step=did_you_mean(quantity, _QUANTITIES),
         )
-    return Trigger(quantity, None if quantity in _FLAGS else table.number("limit", positive=True))
+    has_limit = bool(_QUANTITIES[quantity][1])
+    return Trigger(quantity, table.number("limit", positive=True) if has_limit else None)
 
 
-def facts_of(
+def outcomes(
+    policy: Sequence[Trigger],
     session: Session,
     calibration: Calibration,
     *,
     failed: bool,
     collision: bool,
     now: datetime | None = None,
-) -> TriggerFacts:
-    """Collects the input of the triggers.
+) -> tuple[Outcome, ...]:
+    """Evaluates each trigger.
 
     Args:
+        policy: The triggers.
         session: The check's session; its columns `ambient_c` and `payload_kg` are averaged.
         calibration: The checked calibration, with the mean conditions of its views.
         failed: Whether the check failed.
         collision: Whether a collision was reported.
         now: The time; that of the clock where None.
     """
-    values, unknown = {}, {}
-    before = calibration.means
-    for quantity, column in _COLUMNS.items():
-        readings = [view.numbers[column] for view in session.views if column in view.numbers]
-        if column not in before:
-            unknown[quantity] = f"the views that were calibrated with do not all have {column}"
-        elif not readings:
-            unknown[quantity] = f"the check's views have no {column}"
-        else:
-            values[quantity] = abs(float(np.mean(readings)) - before[column])
-    age_days = _age_days(calibration.created, now or datetime.now(UTC))
-    if age_days is None:
-        unknown["age_days"] = f"the calibration's time is {calibration.created!r}"
-    else:
-        values["age_days"] = age_days
-    return TriggerFacts(values, {"failed_check": failed, "collision": collision}, unknown)
+    flags = {"failed_check": failed, "collision": collision}
+    evaluated = []
+    for trigger in policy:
+        quantity, limit = trigger.quantity, trigger.limit
+        label, unit = _QUANTITIES[quantity]
+        if limit is None:
+            state: State = "fired" if flags[quantity] else "quiet"
+            evaluated.append(Outcome(trigger, state, None, label))
+            continue
+        found = (
+            _age_days(calibration.created, now or datetime.now(UTC))
+            if quantity == "age_days"
+            else _change(session, calibration, _COLUMNS[quantity])
+        )
+        if isinstance(found, str):
+            evaluated.append(Outcome(trigger, "unknown", None, f"{label} ({found})"))
+            continue
+        words = f"{label}, {found:.4g} {unit} (limit {limit:g})"
+        evaluated.append(Outcome(trigger, "fired" if found > limit else "quiet", found, words))
+    return tuple(evaluated)
 
 
-def _age_days(created: str, now: datetime) -> float | None:
+def _change(session: Session, calibration: Calibration, column: str) -> float | str:
+    """Change of a column's mean since the calibration; in words why it is unknown."""
+    readings = [view.numbers[column] for view in session.views if column in view.numbers]
+    if column not in calibration.means:
+        return f"the views that were calibrated with do not all have {column}"
+    if not readings:
+        return f"the check's views have no {column}"
+    return abs(float(np.mean(readings)) - calibration.means[column])
+
+
+def _age_days(created: str, now: datetime) -> float | str:
+    """Age of a calibration [days]; in words why it is unknown."""
     try:
         then = datetime.fromisoformat(created)
     except ValueError:
-        return None
+        return f"the calibration's time is {created!r}"
     then = then if then.tzinfo else then.replace(tzinfo=UTC)
     return round((now - then).total_seconds() / _DAY_S, 1)
-
-
-def outcomes(policy: Sequence[Trigger], facts: TriggerFacts) -> tuple[Outcome, ...]:
-    """Evaluates each trigger."""
-    return tuple(_outcome(trigger, facts) for trigger in policy)
-
-
-def _outcome(trigger: Trigger, facts: TriggerFacts) -> Outcome:
-    quantity, limit, label = trigger.quantity, trigger.limit, _LABELS[trigger.quantity]
-    if limit is None:
-        return Outcome(trigger, "fired" if facts.flags[quantity] else "quiet", None, label)
-    if quantity in facts.unknown:
-        return Outcome(trigger, "unknown", None, f"{label} ({facts.unknown[quantity]})")
-    value = facts.values[quantity]
-    words = f"{label}, {value:.4g} {_UNITS[quantity]} (limit {limit:g})"
-    return Outcome(trigger, "fired" if value > limit else "quiet", value, words)

@@ -13,9 +13,9 @@ from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import counted, figure
+from visioncal.core.number_format import counted, figure, listed, mm_and_deg
 from visioncal.core.transforms import invert, pose_difference
-from visioncal.core.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
+from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.corners import CornerStack, reproject
@@ -121,20 +121,31 @@ def checked_state(
 def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     """Does what `predict_stops` does, once targets have been detected."""
     calibration, detected = prior.calibration, run.cameras
-    for frame, look in run.cameras.items():
+    lens = calibration.camera
+    for frame, look in detected.items():
         if look.resolution is None:
             continue
-        if calibration.camera is None:
-            raise DataError(
-                f"calibration {calibration.session_name!r} holds no camera, and session "
-                f"{run.session.name!r} has images.",
-                next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
+        if lens is None:
+            raise _other_target(
+                f"session {run.session.name!r} has images; calibration "
+                f"{calibration.session_name!r} holds no camera.",
+                "Give the target's poses (cft_x_m ...) as when it was calibrated.",
             )
         check_resolution(run.session, calibration, look.resolution)
-        lens = CameraResult(calibration.camera.camera, estimated=False)
-        corrected = _in_lens_model(look.corners, calibration.camera, {})
-        run = run.with_camera(frame, replace(look, lens=lens, corners=corrected))
-    run = _without_breathing(run, detected, calibration.camera)
+        plain = CameraResult(lens.camera, estimated=False)
+        run = run.with_camera(frame, replace(_in_lens_model(look, lens, {}), lens=plain))
+    if lens is not None and lens.field is not None and lens.field.breathing != 0.0:
+        # Breathing is corrected to the calibration's mean distance, by rough poses.
+        positions = numbered_positions(tuple(run.session.boards.values()))
+        rough_poses = _STAGES["pnp"](run).poses
+        for frame, look in detected.items():
+            shown = {view: each for view, each in look.corners.items() if view in rough_poses}
+            if shown:
+                stack = CornerStack.of(shown, positions)
+                poses = np.array([rough_poses[view].cam_from_target[0] for view in stack.views])
+                depths = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
+                corrected = _in_lens_model(look, lens, depths).corners
+                run = run.with_camera(frame, replace(run.cameras[frame], corners=corrected))
     # Of a sweep the slower views are used, where the error of the clock offset is below the
     # robot's.
     run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
@@ -149,34 +160,15 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     )
 
 
-def _without_breathing(
-    run: RunState, detected: Mapping[str, CameraObservations], lens: CameraResult | None
-) -> RunState:
-    """Corrects corners for focus breathing, to the calibration's mean distance."""
-    if lens is None or lens.field is None or lens.field.breathing == 0.0:
-        return run
-    targets = tuple(run.session.boards.values())
-    rough_poses = _STAGES["pnp"](run).poses
-    for frame, look in detected.items():
-        shown = {view: corners for view, corners in look.corners.items() if view in rough_poses}
-        if not shown:
-            continue
-        stack = CornerStack.of(shown, numbered_positions(targets))
-        poses = np.array([rough_poses[view].cam_from_target[0] for view in stack.views])
-        depths = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
-        corrected = _in_lens_model(look.corners, lens, depths)
-        run = run.with_camera(frame, replace(run.cameras[frame], corners=corrected))
-    return run
-
-
 def _in_lens_model(
-    corners: Mapping[int, Corners], lens: CameraResult, depths: Mapping[int, float]
-) -> dict[int, Corners]:
-    """Corrects corners, by view, for the lens's errors beyond its model."""
-    return {
+    look: CameraObservations, lens: CameraResult, depths: Mapping[int, float]
+) -> CameraObservations:
+    """Corrects the corners of views for the lens's errors beyond its model."""
+    corners = {
         view: replace(detected, px=lens.in_model(detected.px, depths.get(view)))
-        for view, detected in corners.items()
+        for view, detected in look.corners.items()
     }
+    return replace(look, corners=corners)
 
 
 def board_changes(problem: Problem, state: State) -> FloatArray:
@@ -239,8 +231,7 @@ def _with_errors(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPo
     if prior.arm == "none":
         return observed
     arm = observed.robot_arm
-    if prior.arm == "poses":
-        arm = replace(arm, joints_rad=None)
+    arm = replace(arm, joints_rad=None) if prior.arm == "poses" else arm
     errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
     return replace(observed, calibrated=replace(arm, errors=errors))
 
@@ -259,29 +250,48 @@ def _noise_px(observed: ObservedPoses) -> float:
 
 
 def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Session:
-    """Replaces the session's targets by the calibration's, by their names."""
+    """Replaces the session's targets by the calibration's, by their names.
+
+    Raises:
+        DataError: They are others, or it is not known which of several is shown.
+    """
+    calibrated, shown = prior.targets, session.boards
+    if not calibrated and any(view.image or view.has_corners for view in session.views):
+        raise _other_target(
+            f"session {session.name!r} has images; calibration "
+            f"{prior.calibration.session_name!r} was made from measured poses, and does not say of "
+            "which target.",
+            "Give the target's poses (cft_x_m ...) as when it was calibrated.",
+        )
     # A session's only target has no name: of several calibrated ones, it is that with an equal
     # print.
-    calibrated, shown = prior.targets, session.boards
+    alike = [
+        name for name in calibrated if "" in shown and not _differences(prior, name, shown[""])
+    ]
+    name = alike[0] if len(alike) == 1 else ""
+    for shown_name, target in shown.items() if calibrated and not name else ():
+        label = f"session {session.name!r}: target {shown_name or target.name!r}"
+        if shown_name not in calibrated:
+            names = ", ".join(other or "one without a name" for other in calibrated)
+            raise _other_target(
+                f"{label} is none of those that were calibrated with ({names}).",
+                "Verify with views of that target alone."
+                if "" in calibrated
+                else "Name the targets as in the calibration's session.",
+            )
+        if differences := _differences(prior, shown_name, target):
+            raise _other_target(
+                f"{label} was calibrated with other values: it has {listed(differences)}.",
+                "Verify with the target that was calibrated with, as it was described then.",
+            )
     if len(calibrated) < 2 and len(shown) < 2:
-        if any(view.image or view.has_corners for view in session.views):
-            _check_targets(session, prior)
         return session
-    name = ""
-    if "" in shown:
-        alike = [
-            name for name, target in calibrated.items() if not _print_differences(target, shown[""])
-        ]
-        name = alike[0] if len(alike) == 1 else ""
-    if not name:
-        _check_targets(session, prior)
     if not shown:
-        raise DataError(
+        raise _other_target(
             f"session {session.name!r} does not say which of the targets that were calibrated with "
             f"({', '.join(calibrated)}) its rows show.",
-            culprits=["session.toml: targets"],
-            next_step="Declare them as in the calibration's session, and name one in each row's "
-            "column target.",
+            "Declare them as in the calibration's session, and name one in each row's column "
+            "target.",
         )
     views = session.views
     if name:
@@ -289,47 +299,18 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
     return replace(session, target=None, targets=calibrated, views=views)
 
 
-def _print_differences(ours: Target, theirs: Target) -> list[str]:
-    """The fields in which two targets are printed differently."""
-    first, second = target_document(ours), target_document(theirs)
+def _other_target(message: str, next_step: str) -> DataError:
+    return DataError(message, culprits=["session.toml: target"], next_step=next_step)
+
+
+def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str]:
+    """In what a target is printed differently than a calibrated one; its size's sigma may be."""
+    ours, theirs = target_document(prior.targets[name]), target_document(target)
     return [
-        name
-        for name in {**first, **second}
-        if first.get(name) != second.get(name) and name != "square_sigma_m"
+        f"{field} = {shorten(theirs.get(field))}, not {shorten(ours.get(field))}"
+        for field in {**ours, **theirs}
+        if ours.get(field) != theirs.get(field) and field != "square_sigma_m"
     ]
-
-
-def _check_targets(session: Session, prior: CalibrationPrior) -> None:
-    """Refuses targets other than the calibrated ones; the stated sigma of a size may differ."""
-    if not prior.targets:
-        raise DataError(
-            f"calibration {prior.calibration.session_name!r} was made from measured "
-            f"poses, and does not say of which target; session {session.name!r} has images.",
-            culprits=["session.toml: target"],
-            next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
-        )
-    for name, target in session.boards.items():
-        calibrated = prior.targets.get(name)
-        if calibrated is None:
-            names = [target or "one without a name" for target in prior.targets]
-            raise DataError(
-                f"session {session.name!r}: target {name or target.name!r} is none of those that "
-                f"were calibrated with ({', '.join(names)}).",
-                culprits=["session.toml: target"],
-                next_step="Verify with views of that target alone."
-                if "" in prior.targets
-                else "Name the targets as in the calibration's session.",
-            )
-        ours, theirs = target_document(calibrated), target_document(target)
-        for field in _print_differences(calibrated, target):
-            raise DataError(
-                f"session {session.name!r}: target {name or target.name!r} has {field} = "
-                f"{shorten(theirs.get(field))}, and the calibration was made with "
-                f"{shorten(ours.get(field))}: it is another target.",
-                culprits=[f"target: {field}"],
-                next_step="Verify with the target that was calibrated with, as it was described "
-                "then.",
-            )
 
 
 def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
@@ -338,27 +319,22 @@ def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
     Raises:
         DataError: They differ.
     """
-    culprit = ["session.toml: robot.model"]
-    if stated.joint_count != calibrated.joint_count:
-        raise DataError(
-            f"session {session.name!r} names robot {stated.name} with {stated.joint_count} joints, "
-            f"and the calibration is of {calibrated.name} with {calibrated.joint_count}.",
-            culprits=culprit,
-            next_step="Name the calibration of this robot.",
-        )
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, calibrated.joint_count))
-    # Motions are compared: the calibrated base may have been moved to the frame of the poses.
-    ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
-    between = [invert(array[0]) @ array for array in (ours, theirs)]
-    off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
-    if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
-        raise DataError(
-            f"session {session.name!r} names robot {stated.name}, whose flange is up to "
-            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated "
-            f"{calibrated.name}'s: it is another robot, or another tip.",
-            culprits=culprit,
-            next_step="Name the robot and tip as in the calibration's session.",
-        )
+    apart = f"{stated.joint_count} joints, not {calibrated.joint_count}"
+    if stated.joint_count == calibrated.joint_count:
+        q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, calibrated.joint_count))
+        # Motions are compared: the calibrated base may have been moved to the frame of the poses.
+        ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
+        between = [invert(array[0]) @ array for array in (ours, theirs)]
+        off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
+        if off[0] <= _ONE_ROBOT_MM and off[1] <= _ONE_ROBOT_DEG:
+            return
+        apart = f"its flange up to {mm_and_deg(*off.tolist())} off"
+    raise DataError(
+        f"session {session.name!r} names robot {stated.name}, which has {apart}: it is another "
+        f"robot, or another tip, than the calibrated {calibrated.name}.",
+        culprits=["session.toml: robot.model"],
+        next_step="Name the robot and tip as in the calibration's session.",
+    )
 
 
 def _warnings(observed: ObservedPoses, prior: CalibrationPrior) -> Iterator[str]:
@@ -375,6 +351,6 @@ def _warnings(observed: ObservedPoses, prior: CalibrationPrior) -> Iterator[str]
     if before is not None and now is not None and now > _MENTIONED * max(before, 1e-3):
         yield (
             f"The corners scatter by {figure(now)} px around the target's poses, and by "
-            f"{figure(before)} "
-            "px when it was calibrated: look whether the lens is clean, sharp and as it was."
+            f"{figure(before)} px when it was calibrated: look whether the lens is clean, sharp "
+            "and as it was."
         )

@@ -35,7 +35,7 @@ def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) ->
     """Renders the page of a check as HTML text."""
     change = check.named[0] if check.named else None
     # The change that can be undone, unlike mere noise.
-    undone = "" if change is None or change.name == NOISE else change_words(check, change)
+    undone = "" if change is None or change.cause.kind == NOISE else change_words(check, change)
     stops = [", ".join(map(str, views)) for views in check.predicted.views]
     before, after = _lengths(check.residuals), _lengths(check.remaining)
     return template("check.html.j2").render(
