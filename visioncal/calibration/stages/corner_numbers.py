@@ -10,12 +10,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from visioncal.calibration.stages.image_size import Size
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.poses import determines_pose
 from visioncal.session import Session, View
-from visioncal.vision.boards.imaging import claimed_size
 from visioncal.vision.targets import corner_positions, point_numbers
 
 # Largest homography residual as a share of the corners' spread. Wrong numbers leave 0.7 to 1.1;
@@ -38,7 +38,7 @@ OTHER_NUMBERS = "its corners in corners.csv do not lie as the target's drawing n
 
 
 def usable_corners(
-    session: Session, views: Sequence[View], resolution: tuple[int, int]
+    session: Session, views: Sequence[View], resolution: Size
 ) -> dict[int, Corners | Rejection]:
     """The corners of corners.csv by view, or why they are not usable.
 
@@ -52,8 +52,8 @@ def usable_corners(
             is smaller than that of the corners; or most views of a target contradict its numbering.
     """
     seen = {view.number: (session.corners[view.number], session.board_of(view)) for view in views}
-    _check_axes([(px, session.boards[name]) for px, name in seen.values()], resolution)
-    _check_extent(session, views, resolution)
+    sizes = [camera.size for camera in session.cameras.values() if camera.size is not None]
+    _check_image([(px, session.boards[name]) for px, name in seen.values()], resolution, sizes)
     usable = {
         view: _usable(corners, session.boards[name], np.array(resolution))
         for view, (corners, name) in seen.items()
@@ -89,61 +89,52 @@ def _usable(corners: Corners, target: Target, size: FloatArray) -> Corners | Rej
     return Rejection(corners.view, reason)
 
 
-def _check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, int]) -> None:
-    size = np.array(resolution, dtype=float)
-    outside = [f"view {corners.view}" for corners, _ in views if _is_beyond(corners.px, size)]
-    if not outside or any(_is_beyond(corners.px, size[::-1]) for corners, _ in views):
+def _check_image(
+    views: Sequence[tuple[Corners, Target]], resolution: Size, cameras: Sequence[Size]
+) -> None:
+    """Refuses axes of corners or sides of images that are exchanged, and smaller images."""
+    (width, height), size = resolution, np.array(resolution, dtype=float)
+    all_px = [corners.px for corners, _ in views]
+    outside = [corners.view for corners, _ in views if _is_beyond(corners.px, size)]
+    if not outside:
         return
-    width, height = resolution
-    # Exchanged columns turn a board over; the z axis of a rig may point either way.
-    boards = [pair for pair in views if not pair[1].is_rig]
-    is_behind = bool(boards) and share_from_behind(boards) > MOST_FROM_BEHIND
-    ways = {
-        "the columns u_px and v_px of corners.csv": "exchange the headings u_px and v_px in the "
-        "first line of corners.csv",
-        "width and height in resolution of session.toml": "write resolution = "
-        f"[{height}, {width}] in [camera] of session.toml",
-    }
-    if boards:
-        ways.pop([*ways][0 if not is_behind else 1])
-    step = ", or ".join(ways.values())
-    raise DataError(
-        f"{' or '.join(ways)} are exchanged: corners of {len(outside)} of {len(views)} views lie "
-        f"outside the image of {width} x {height} px, and none outside one of {height} x {width} "
-        "px.",
-        culprits=["corners.csv: u_px, v_px", "session.toml: resolution", *outside],
-        next_step=f"{step[0].upper()}{step[1:]}.",
-    )
-
-
-def _check_extent(session: Session, views: Sequence[View], resolution: tuple[int, int]) -> None:
-    corners = [session.corners[view.number].px for view in views]
-    last = np.array(resolution) - 1.0 + _BORDER_PX
-    outside = [
-        f"view {view.number}" for view, px in zip(views, corners, strict=True) if (px > last).any()
-    ]
-    if 2 * len(outside) <= len(views):
-        return
-    extent = np.max([px.max(axis=0) for px in corners], axis=0)
-    sizes = (camera.size for camera in session.cameras.values())
-    # Another camera's, with which this one may be exchanged.
-    if any((extent <= np.array(size) - 1.0 + _BORDER_PX).all() for size in sizes if size):
-        return
-    (width, height), (u_px, v_px) = resolution, extent.tolist()
-    files = (view.image for view in views if view.image and session.images.exists(view.image))
-    image = next((claimed_size(session.images.read(file)) for file in files), None)
-    least = [math.ceil(u_px + 0.5), math.ceil(v_px + 0.5)]
-    size = f"{least} or more, the size of the images in which the corners were found"
-    raise DataError(
-        f"session.toml: resolution = [{width}, {height}] is smaller than the images in which the "
-        f"corners of corners.csv were found: they reach u = {u_px:.1f} and v = {v_px:.1f} px, and "
-        f"those of {len(outside)} of {len(views)} views lie outside the stated image.",
-        culprits=["session.toml: resolution", *outside],
-        next_step="The images have the stated size: find the corners anew, in these images."
-        if image == resolution
-        else f"In [camera] of session.toml, write resolution = {[*image] if image else size}; "
-        "matrix and distortion, where stated, must be of that size.",
-    )
+    culprits = [f"view {view}" for view in outside]
+    if not any(_is_beyond(px, size[::-1]) for px in all_px):
+        # Exchanged columns turn a board over; the z axis of a rig may point either way.
+        boards = [pair for pair in views if not pair[1].is_rig]
+        is_behind = bool(boards) and share_from_behind(boards) > MOST_FROM_BEHIND
+        ways = {
+            "columns u_px and v_px of corners.csv": "exchange the headings u_px and v_px in the "
+            "first line of corners.csv",
+            "width and height in resolution of session.toml": "write resolution = "
+            f"[{height}, {width}] in [camera] of session.toml",
+        }
+        if boards:
+            ways.pop([*ways][1 if is_behind else 0])
+        step = ", or ".join(ways.values())
+        raise DataError(
+            f"{' or '.join(ways)} are exchanged: corners of {len(outside)} of {len(views)} views "
+            f"lie outside the image of {width} x {height} px, and none outside one of {height} x "
+            f"{width} px.",
+            culprits=["corners.csv: u_px, v_px", "session.toml: resolution", *culprits],
+            next_step=f"{step[0].upper()}{step[1:]}.",
+        )
+    extent = np.max([px.max(axis=0) for px in all_px], axis=0)
+    # Another camera's images, with which this one's may be exchanged.
+    fits_other = any((extent <= np.array(other) - 1.0 + _BORDER_PX).all() for other in cameras)
+    larger = [px for px in all_px if (px > size - 1.0 + _BORDER_PX).any()]
+    if 2 * len(larger) > len(views) and not fits_other:
+        u_px, v_px = extent.tolist()
+        raise DataError(
+            f"session.toml: resolution = [{width}, {height}] is smaller than the images in which "
+            f"the corners of corners.csv were found: they reach u = {u_px:.1f} and v = {v_px:.1f} "
+            f"px, and those of {len(larger)} of {len(views)} views lie outside the stated image.",
+            culprits=["session.toml: resolution", *culprits],
+            next_step="In [camera] of session.toml, write resolution = "
+            f"[{math.ceil(u_px + 0.5)}, {math.ceil(v_px + 0.5)}] or more, the size of the images "
+            "in which the corners were found; matrix and distortion, where stated, must be of "
+            "that size.",
+        )
 
 
 def _is_beyond(px: FloatArray, size: FloatArray) -> bool:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.stages.observed import Observed
@@ -161,19 +162,13 @@ def _repeats(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int
     repeated, copies = dict[int, int](), 0
     for rows in groups.values():
         numbers = np.array([np.append(row.state, row.reading) for row in rows])
-        # Rows that may be near are those near in the number that differs most.
-        widest = numbers[:, np.ptp(numbers, axis=0).argmax()] if numbers.size else np.zeros(1)
-        order = np.argsort(widest, kind="stable")
-        for at, row in enumerate(rows):
-            if row.view in repeated:
-                continue
-            first, end = np.searchsorted(widest[order], [widest[at] - 1.0, widest[at] + 1.0])
-            near = order[first : end + 1]
-            near = near[np.abs(numbers[near] - numbers[at]).max(axis=1, initial=0.0) <= 1.0]
-            for other in (rows[index] for index in near.tolist() if index > at):
-                if other.view not in repeated and row.is_repeated_by(other):
-                    repeated[other.view] = row.view
-                    copies += np.array_equal(row.reading, other.reading)
+        # Their pairs that are near in all numbers, by the earlier row.
+        for first, later in sorted(cKDTree(numbers).query_pairs(1.0, p=np.inf)):
+            row, other = rows[first], rows[later]
+            is_new = not {row.view, other.view} & repeated.keys()
+            if is_new and row.is_repeated_by(other):
+                repeated[other.view] = row.view
+                copies += np.array_equal(row.reading, other.reading)
     return {view: repeated[view] for view in sorted(repeated)}, copies
 
 
