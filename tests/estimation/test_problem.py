@@ -11,12 +11,10 @@ from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.moves import Move
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.outliers import inliers_and_moves, refine_inliers
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.slight_steps import evidence_gain, find_slight_move
 from visioncal.estimation.solve import (
     RepeatErrors,
     Solution,
@@ -26,6 +24,7 @@ from visioncal.estimation.solve import (
     posterior,
     solve_problem,
 )
+from visioncal.estimation.steps import Step, evidence, find_steps, frames_of
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
@@ -185,7 +184,9 @@ def test_repeats_share_errors_that_a_step_does_not_pass_for():
     known = np.linalg.inv(errors.covariance) - information
     np.testing.assert_allclose(known[:size], 0.0, atol=1e-6 * np.abs(information).max())
     frames = tuple(problem.unknown)
-    assert all(find_slight_move(*still_cell(seed), frames) is None for seed in range(6))
+    for seed in range(6):
+        problem, fit = still_cell(seed)
+        assert not find_steps(problem, fit, frames_of(problem, frames))
 
 
 def test_steps_are_as_likely_as_their_evidence_says():
@@ -199,7 +200,9 @@ def test_steps_are_as_likely_as_their_evidence_says():
         changed = {(frame, stop): moved(cell.truth[frame], twist) for stop in range(6, 14)}
         problem = observed(cell, rng, changed)
         fit = fit_problem(problem, true_state(cell, problem.tree))
-        gain, wider, _ = evidence_gain(problem, fit, Move(frame, f"{frame}@2", 6, np.eye(4)))
+        (candidate,) = frames_of(problem, [frame])
+        unmoved = Step(candidate, 6, np.zeros(6), np.eye(6), 0.0, np.zeros((0, 0)))
+        gain, wider, _ = evidence(problem, fit, unmoved)
         assert f"{frame}@2" in wider.unknown
         found.append((steps, 1.0 / (1.0 + np.exp(-0.5 * gain))))
     stepped, likely = np.array(found).T

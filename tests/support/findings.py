@@ -28,7 +28,6 @@ def healthy() -> dict[str, dict[str, Any]]:
                 "robot_rotation_deg": [0.0033, 0.0052],
             },
             "spectrum": [0.001 * index for index in range(1, 13)],
-            "inflation": 1.0,
         },
     }
 

@@ -112,7 +112,6 @@ _KINDS = (
         inflates=_INFLATED,
         is_step=True,
     ),
-    Kind("correlated_errors", 1e-4, CHAIN),
     Kind("prior", 2.7e-3),
     Kind("untied", FACT),
     Kind("unseen_target"),

@@ -1,8 +1,8 @@
-"""Moves during the session: a bumped camera, a displaced board.
+"""Frames that moved during the session by more than noise: a bumped camera, a displaced board.
 
 From some stop on, all observations of a frame agree on one other pose of it. Such a move is found
-by the number of observations that only it explains. `slight_steps` finds those within the noise of
-single observations.
+by the number of observations that only it explains. `steps` finds those within the noise of single
+observations.
 """
 
 from collections.abc import Sequence
@@ -12,14 +12,10 @@ import numpy as np
 
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import (
-    Solution,
-    by_noise_alone,
-    fitted_covariance,
-)
+from visioncal.estimation.solve import Solution, by_noise_alone, fitted_covariance
 
 # Least number of further observations, and of stops, that a move must explain.
 FEWEST = 3
@@ -32,9 +28,6 @@ _FALSE_ALARM, FALSE_MOVE = 1e-3, 1e-4
 _MARGIN = 2.0
 # Share of the gain at which another frame may be the one that moved.
 _RIVAL_SHARE = 0.9
-# Candidates with this share of the greatest gain are followed up by one more, up to a number;
-# different steps of each frame.
-_RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +39,6 @@ class Move:
     stop: int  # The first stop after the move.
     change: FloatArray  # (4, 4) its new pose in its own old frame: as first estimated.
     rivals: tuple[str, ...] = ()  # Frames whose move would explain as much.
-    mahalanobis_sq: float = 0.0  # The evidence for it, where it is slight.
 
 
 def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:
@@ -79,65 +71,34 @@ def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(weights.sum(axis=0), weighted_sum))
 
 
-def better_stop(problem: Problem, fit: Solution, move: Move) -> int:
-    """The stop of a move that explains most, now that both poses are fitted."""
-    involved = problem.observations.involves(move.frame) | problem.observations.involves(move.twin)
-    part = problem.subset(involved)
-    all_rows = np.ones(len(part), dtype=bool)
-    explained = []
-    for old, new in ((move.twin, move.frame), (move.frame, move.twin)):
-        renamed = replace(part, observations=part.observations.renamed(old, new, all_rows))
-        explained.append(explained_by_noise(renamed, fit, len(problem)))
-    stops = part.observations.stops
-    choices = np.unique(stops)
-    counts = [np.sum(np.where(stops < choice, *explained)) for choice in choices]
-    best = max(counts)
-    if counts[int(np.searchsorted(choices, move.stop))] == best:
-        return move.stop
-    return int(choices[int(np.argmax(counts))])
-
-
-def moved_earlier_or_later(
-    problem: Problem, moves: Sequence[Move], move: Move, stop: int
-) -> tuple[Problem, list[Move]]:
-    """The problem with a move at another stop."""
-    observations = problem.observations
-    after = observations.stops >= stop
-    renamed = observations.renamed(move.frame, move.twin, after).renamed(
-        move.twin, move.frame, ~after
-    )
-    return (
-        replace(problem, observations=renamed),
-        [replace(item, stop=stop) if item is move else item for item in moves],
-    )
-
-
 def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Move | None:
     """The least significant move if its two poses are equal up to noise; else None."""
     if not moves:
         return None
     covariance = fitted_covariance(problem, fit.state, fit.noise)
-    candidates = []
+    squares = []
     for move in moves:
-        change, change_covariance = fitted_change(problem, fit, covariance, move)
-        candidates.append((float(change @ np.linalg.solve(change_covariance, change)), move))
-    distance_sq, move = min(candidates, key=lambda pair: pair[0])
-    stops = len(np.unique(problem.observations.stops))
-    return move if distance_sq < move_limit(problem, len(problem.unknown) * stops) else None
+        change, known = fitted_change(problem, fit, covariance, move.frame, move.twin)
+        squares.append(float(change @ np.linalg.solve(known, change)))
+    least = int(np.argmin(squares))
+    tried = len(problem.unknown) * len(np.unique(problem.observations.stops))
+    freedom = max(0.5 * (6.0 * len(problem) - problem.size), 6.0)
+    limit = 6.0 * float(f_limit(FALSE_MOVE / tried, 6, freedom))
+    return moves[least] if squares[least] < limit else None
 
 
 def fitted_change(
-    problem: Problem, fit: Solution, known: FloatArray, move: Move
+    problem: Problem, fit: Solution, known: FloatArray, frame: str, twin: str
 ) -> tuple[FloatArray, FloatArray]:
-    """A fitted change (6,) in the frame's own old pose, and its covariance (6, 6).
+    """A fitted change (6,) from a frame to its twin, in its own old pose, and its covariance.
 
     The problem has both frames, and `known` (p, p) is the covariance of its unknowns.
     """
-    first, second = (problem.unknown[name] for name in (move.frame, move.twin))
-    between = invert(fit.state.edges[first]) @ fit.state.edges[second]
+    first, second = (problem.edge_columns(name) for name in (frame, twin))
+    before, after = (fit.state.edges[problem.unknown[name]] for name in (frame, twin))
+    between = invert(before) @ after
     jacobian = np.zeros((6, len(known)))
-    jacobian[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
-    jacobian[:, 6 * second : 6 * second + 6] = np.eye(6)
+    jacobian[:, first], jacobian[:, second] = -adjoint(invert(between)), np.eye(6)
     return log(between), jacobian @ known @ jacobian.T
 
 
@@ -170,87 +131,35 @@ def twin_name(problem: Problem, frame: str) -> str:
     return f"{first}@{count}"
 
 
-def find_gross_move(
-    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
-) -> Move | None:
+def find_move(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]) -> Move | None:
     """The move that explains most outliers; None where none explains enough.
 
-    Two simultaneous moves look like one where both frames are seen: of moves that explain about as
-    much, the one counts after which the next explains most. A pushed robot base is no move: its
-    observations stay outliers. `agrees` is the (n,) inlier mask.
+    A pushed robot base is no move: its observations stay outliers. `agrees` is the (n,) inlier
+    mask.
     """
-    steps = _steps(problem, fit, agrees, movable)
-    if not steps or _pushed_gain(problem, fit, agrees) > steps[0].gain:
+    bases = {base for base in problem.tree.bases.values() if base in problem.unknown}
+    found = []
+    for frame in (*movable, *bases):
+        rows = problem.observations.involves(frame)
+        if frame in bases:
+            rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
+        if np.sum(~agrees[rows]) >= FEWEST:
+            found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
+    found.sort(key=lambda step: -step[0])
+    if not found or found[0][3] in bases:
         return None
-    rivals = [step for step in steps if step.gain >= _RIVAL_GAIN * steps[0].gain][:_MOST_TRIED]
-    moves = [
-        Move(step.frame, twin_name(problem, step.frame), step.stop, step.change) for step in rivals
-    ]
-    if len(rivals) == 1:
-        return moves[0]
-    followed = [_followed(problem, fit, agrees, movable, move) for move in moves]
-    totals = [rival.gain + gain for rival, (gain, _) in zip(rivals, followed, strict=True)]
-    best = int(np.argmax(totals))
-    # The next move is no rival: that frame moved as well.
-    moved_frames = {moves[best].frame, followed[best][1]}
-    others = [
-        rival.frame
-        for rival, total in zip(rivals, totals, strict=True)
-        if total >= _RIVAL_SHARE * totals[best] and rival.frame not in moved_frames
-    ]
-    return replace(moves[best], rivals=tuple(dict.fromkeys(others)))
+    gain, stop, change, frame = found[0]
+    rivals = dict.fromkeys(
+        rival for also, at, _, rival in found if also >= _RIVAL_SHARE * gain and rival != frame
+    )
+    return Move(frame, twin_name(problem, frame), stop, change, tuple(rivals))
 
 
-@dataclass(frozen=True, eq=False)
-class _MoveCandidate:
-    """A step of a frame from a stop on, and the number of further observations it explains."""
-
-    gain: int
-    frame: str
-    stop: int
-    change: FloatArray
-
-
-def _steps(
-    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
-) -> list[_MoveCandidate]:
-    """The steps that explain enough, by descending gain."""
-    steps: list[_MoveCandidate] = []
-    for frame in movable:
-        rows = np.flatnonzero(problem.observations.involves(frame))
-        if np.sum(~agrees[rows]) >= FEWEST:
-            steps += _best_steps(problem, fit, agrees, frame, rows)
-    return sorted(steps, key=lambda value: -value.gain)
-
-
-def _pushed_gain(problem: Problem, fit: Solution, agrees: Mask) -> int:
-    """Greatest gain of a step of a robot's base."""
-    gains = [0]
-    for base in set(problem.tree.bases.values()):
-        if base not in problem.unknown:
-            continue
-        rows = np.flatnonzero(np.isfinite(problem.change_of(base, fit.state)[:, 0, 0]))
-        if np.sum(~agrees[rows]) >= FEWEST:
-            gains += [step.gain for step in _best_steps(problem, fit, agrees, base, rows)]
-    return max(gains)
-
-
-def _followed(
-    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str], move: Move
-) -> tuple[int, str]:
-    """Gain of the best next move, and its frame."""
-    split, split_fit = moved(problem, fit, move)
-    involved = split.observations.involves(move.twin)
-    agrees = np.where(involved, explained_by_noise(split, split_fit, len(problem)), agrees)
-    steps = _steps(split, split_fit, agrees, (*movable, move.twin))
-    return (steps[0].gain, steps[0].frame) if steps else (0, "")
-
-
-def _best_steps(
-    problem: Problem, fit: Solution, agrees: Mask, frame: str, rows: IntArray
-) -> list[_MoveCandidate]:
-    """The step of a frame that explains most, and the best one that differs from it."""
-    part = problem.subset(np.isin(np.arange(len(problem)), rows))
+def _best_move(
+    problem: Problem, fit: Solution, agrees: Mask, frame: str, rows: Mask
+) -> list[tuple[int, int, FloatArray]]:
+    """The move of a frame that explains most: further observations, first stop, (4, 4) change."""
+    part = problem.subset(rows)
     order = np.argsort(part.observations.stops, kind="stable")
     changes = part.change_of(frame, fit.state)[order]
     covariance = _change_covariance(part, fit, frame)[order]
@@ -266,33 +175,21 @@ def _best_steps(
     gains = np.cumsum((agreeing.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
     # Of equally good stops the last: between them the data favour neither pose.
     first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
-    steps, available = [], np.ones(len(tried), dtype=bool)
-    for _ in range(_STEPS_EACH):
-        candidate, stop_index = np.unravel_index(
-            np.where(available[:, None], gains[:, first], -1).argmax(),
-            (len(tried), len(first)),
-        )
-        begin = int(first[stop_index])
-        after = agreeing[candidate] & (stops >= stops[begin])
-        gain = int(gains[candidate, begin]) if available[candidate] else 0
-        if gain >= FEWEST and _is_enough(after, explained, stops, begin):
-            # The mean over all observations that agree with this step.
-            weights = np.asarray(np.linalg.inv(covariance[after]), dtype=float)
-            mean = _weighted_mean(differences[candidate, after], weights)
-            change = changes[tried[candidate]] @ exp(mean)
-            steps.append(_MoveCandidate(gain, frame, int(stops[begin]), change))
-        available &= ~agreeing[candidate][tried]
-        available[candidate] = False
-    return steps
-
-
-def _is_enough(after: Mask, explained: Mask, stops: IntArray, begin: int) -> bool:
-    """Whether a step from a row on is seen at enough stops, before it and after."""
-    return bool(
-        len(np.unique(stops[after])) >= FEWEST
-        and len(np.unique(stops[explained & (stops < stops[begin])])) >= FEWEST
-        and after.sum() > _LEAST_SHARE * (len(stops) - begin)
-    )
+    candidate, index = np.unravel_index(gains[:, first].argmax(), (len(tried), len(first)))
+    begin = int(first[index])
+    after = agreeing[candidate] & (stops >= stops[begin])
+    gain = int(gains[candidate, begin])
+    if (
+        gain < FEWEST
+        or len(np.unique(stops[after])) < FEWEST
+        or len(np.unique(stops[explained & (stops < stops[begin])])) < FEWEST
+        or after.sum() <= _LEAST_SHARE * (len(stops) - begin)
+    ):
+        return []
+    # The mean over all observations that agree with this step.
+    weights = np.asarray(np.linalg.inv(covariance[after]), dtype=float)
+    mean = _weighted_mean(differences[candidate, after], weights)
+    return [(gain, int(stops[begin]), changes[tried[candidate]] @ exp(mean))]
 
 
 def _change_covariance(problem: Problem, fit: Solution, frame: str) -> FloatArray:
@@ -303,7 +200,7 @@ def _change_covariance(problem: Problem, fit: Solution, frame: str) -> FloatArra
     return np.asarray(inverse @ covariance @ np.swapaxes(inverse, 1, 2))
 
 
-def common_change(
+def agreed_change(
     problem: Problem, fit: Solution, frame: str, some: Mask
 ) -> tuple[FloatArray, Mask] | None:
     """The new pose of a frame that (n,) some observations agree on, by a fit of others.
@@ -323,12 +220,3 @@ def common_change(
     residuals = differences - mean
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     return middle @ exp(mean), squares < _noise_limit(len(problem))
-
-
-def move_limit(problem: Problem, tried: int, kinds: int = 1) -> float:
-    """Limit of the squared length of a significant step, for a number tried (F distribution).
-
-    `kinds` is the number of kinds of residuals, if a step may be in one of them alone.
-    """
-    freedom = max(0.5 * (6.0 * len(problem) - problem.size) / kinds, 6.0)
-    return 6.0 * float(f_limit(FALSE_MOVE / tried, 6, freedom))

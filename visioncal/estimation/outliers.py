@@ -15,18 +15,17 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.quantiles import f_limit
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.transforms import exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.moves import (
     Move,
-    better_stop,
     explained_by_noise,
-    find_gross_move,
+    find_move,
     moved,
-    moved_earlier_or_later,
     needless_move,
+    twin_name,
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
@@ -39,7 +38,6 @@ from visioncal.estimation.robust import (
     trimmed_start,
     widened,
 )
-from visioncal.estimation.slight_steps import find_slight_move
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -47,6 +45,7 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
+from visioncal.estimation.steps import find_steps, frames_of
 
 # Share of sessions in which an inlier is rejected.
 _FALSE_ALARM = 1e-3
@@ -140,7 +139,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
-        move = find_gross_move(problem, fit, relative_squares < 1.0, movable)
+        move = find_move(problem, fit, relative_squares < 1.0, movable)
         if move is None:
             break
         problem, fit = moved(problem, fit, move)
@@ -150,19 +149,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
     used, fit = _widened(problem, used, fit)
-    return _without_needless(_timed(_inlier_fit(problem, used, fit, moves)))
-
-
-def _timed(agreed: InlierFit) -> InlierFit:
-    """Moves each move to the stop at which it explains most, after the joint fit."""
-    problem, fit, moves = agreed.problem, agreed.fit, list(agreed.moves)
-    for move in agreed.moves:
-        stop = better_stop(problem, fit, move)
-        if stop != move.stop:
-            problem, moves = moved_earlier_or_later(problem, moves, move, stop)
-    if problem is agreed.problem:
-        return agreed
-    return _inlier_fit(problem, *_widened(problem, agreed.used, fit), moves)
+    return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
 def _without_needless(agreed: InlierFit) -> InlierFit:
@@ -187,12 +174,14 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
-        slight = find_slight_move(problem.subset(used), fit, movable)
-        if slight is None:
+        part = problem.subset(used)
+        if not (slight := find_steps(part, fit, frames_of(part, movable))):
             break
-        problem, fit = moved(problem, fit, slight)
-        movable = (*movable, slight.twin)
-        moves.append(slight)
+        frame = slight[0].of
+        move = Move(frame, twin_name(problem, frame), slight[0].stop, exp(slight[0].value))
+        problem, fit = moved(problem, fit, move)
+        movable = (*movable, move.twin)
+        moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 

@@ -31,7 +31,6 @@ SOURCES = {
     "held_values": "values that are held",
     "noise_level": "how well the robot's noise is known",
     "lens_field": "the lens beyond its model",
-    "misfit": "neighbouring stops that err alike",
 }
 # As a share of the total sigma: a hundredth of the variance.
 _LEAST_SHARE = 0.1

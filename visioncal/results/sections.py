@@ -125,8 +125,6 @@ class UncertaintyResult(Section):
     # (12,) standard deviations along the principal directions of both transforms, ascending, in
     # units of the largest accepted ones.
     spectrum: Vector
-    # Factor on the covariance for the correlation of neighbouring stops' errors.
-    inflation: float = 1.0
     # (2,) least and greatest distance from the camera at which views looked [m]; absent where
     # unknown.
     distances_m: Annotated[FloatArray, Array((2,))] | None = None

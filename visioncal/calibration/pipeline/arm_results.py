@@ -1,17 +1,17 @@
 """The robots' arms of a cell: reading, calibration one by one, covariance, findings."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages import residual_findings, thermal
+from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import IdentifiedArm, RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
-from visioncal.calibration.stages.residual_findings import ResidualTest
+from visioncal.calibration.stages.residual_findings import arm_findings, step_finding
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.finding_kinds import NOTE
 from visioncal.core.types import FloatArray
@@ -22,14 +22,13 @@ from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
     held_shift,
 )
+from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"
@@ -62,8 +61,7 @@ def covariance_from_other_sources(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
-    tests: Mapping[str, ResidualTest],
-    offsets: Mapping[str, FloatArray],
+    steps: Sequence[Step],
     *,
     is_fit: bool = True,
 ) -> dict[str, FloatArray]:
@@ -74,8 +72,7 @@ def covariance_from_other_sources(
         fit: Their fit.
         arms: The arms. Errors that are not estimated count, and of others the uncertainty of their
             size.
-        tests: Tests of the residuals, by robot.
-        offsets: Jacobians of flanges with respect to joint offsets; see `joint_offsets`.
+        steps: Steps that the residuals show, likeliest first.
         is_fit: Whether it minimises the problem; a closed form is not biased by held values alone.
     """
     parts: dict[str, FloatArray] = {}
@@ -95,13 +92,8 @@ def covariance_from_other_sources(
             parts[f"size of arm errors{_source_suffix(arms, robot)}"] = covariance_of_size(
                 problem, covariance, robot, arm.errors
             )
-    # What the residuals show: correlated errors of stops, and a sudden step.
-    for robot, test in tests.items():
-        if test.neighbours is not None and test.neighbours.is_significant:
-            more = inflation(problem, fit.state, fit.noise, robot, test.neighbours.factor)
-            parts[f"misfit{_source_suffix(arms, robot)}"] = more
-        if test.step is not None:
-            parts[STEP] = step_covariance(problem, fit, test.step, offsets)
+    if steps and steps[0].kind != DRIFT:
+        parts[STEP] = steps[0].spread
     return parts
 
 
@@ -124,24 +116,28 @@ def _source_suffix(arms: Mapping[str, RobotArm], robot: str) -> str:
 
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
-    tests: Mapping[str, ResidualTest],
+    steps: tuple[Step, ...],
     results: Mapping[str, IdentifiedArm],
     level: str,
     cell: Cell,
 ) -> Iterator[Finding]:
-    """Findings against the robots' arms."""
+    """Findings against the robots' arms, and on what moved during the session."""
 
-    def joint(slip: Slip) -> str:
-        matched = arms[slip.robot].matched
-        words = (
-            f"joint {slip.joint + 1}" if matched is None else joint_words(slip.joint, matched.robot)
-        )
-        return words if len(arms) == 1 else f"{words} of robot {slip.robot}"
+    def joint(slip: Step) -> str:
+        matched, index = arms[slip.of].matched, slip.candidate.joint
+        words = f"joint {index + 1}" if matched is None else joint_words(index, matched.robot)
+        return words if len(arms) == 1 else f"{words} of robot {slip.of}"
 
     for robot, arm in arms.items():
-        findings_of_arm = _findings_on(arm, tests.get(robot), level, cell, joint)
-        for finding in (*findings_of_arm, *results[robot].doubts()):
-            yield finding if finding.of_kind.is_step else finding.of(_robot_name(arms, robot))
+        for finding in (*_findings_on(arm, level), *results[robot].doubts()):
+            yield finding.of(_robot_name(arms, robot))
+    for found in step_finding(steps, cell, joint):
+        aside = [arm.heat.set_aside for arm in arms.values() if arm.heat and arm.heat.set_aside]
+        if found.kind == "moved_slowly" and aside:
+            words = f"Whether the arm drifts with its temperature was not looked for: {aside[0]}."
+            yield replace(found, words=f"{found.words} {words}")
+        else:
+            yield found
 
 
 def notes_on_arms(
@@ -155,9 +151,7 @@ def notes_on_arms(
             yield remark.of(_robot_name(arms, robot)).words
 
 
-def _findings_on(
-    arm: RobotArm, test: ResidualTest | None, level: str, cell: Cell, joint: Callable[[Slip], str]
-) -> Iterator[Finding]:
+def _findings_on(arm: RobotArm, level: str) -> Iterator[Finding]:
     if arm.joints_rad is None and level not in ("auto", "hand-eye"):
         yield Finding(
             "level",
@@ -170,17 +164,8 @@ def _findings_on(
         yield Finding("level", words, step)
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
-    if test is not None:
-        calibrated = arm.model is not None
-        aside = "" if arm.heat is None else arm.heat.set_aside
-        for doubt in residual_findings.residual_findings(
-            test, arm.errors, cell, joint, calibrated=calibrated
-        ):
-            if doubt.kind == "moved_slowly" and aside:
-                words = f"Whether the arm drifts with its temperature was not looked for: {aside}."
-                yield replace(doubt, words=f"{doubt.words} {words}")
-            else:
-                yield doubt
+    if arm.errors is not None:
+        yield from arm_findings(arm.errors, calibrated=arm.model is not None)
 
 
 def _robot_name(arms: Mapping[str, RobotArm], robot: str) -> str:
@@ -270,10 +255,10 @@ def with_pose_errors(
 
 
 def with_errors_beside_step(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, tests: Mapping[str, ResidualTest]
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, steps: Sequence[Step]
 ) -> Mapping[str, RobotArm]:
     """Estimates pose-dependent errors again beside a sudden step, which they would also explain."""
-    step = next((test.step for test in tests.values() if test.step), None)
-    if step is None or isinstance(step, Slip) or all(arm.is_modelled for arm in arms.values()):
+    is_modelled = all(arm.is_modelled for arm in arms.values())
+    if not steps or steps[0].kind not in (FRAME, SIZE) or is_modelled:
         return arms
-    return with_pose_errors(arms, *with_step(problem, fit, step))
+    return with_pose_errors(arms, *with_step(problem, fit, steps[0]))

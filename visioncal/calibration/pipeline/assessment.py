@@ -31,7 +31,7 @@ from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import choose_nearest, with_candidate
-from visioncal.calibration.stages.residual_findings import ResidualTest, residual_tests
+from visioncal.calibration.stages.residual_findings import likely_steps
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
@@ -46,6 +46,7 @@ from visioncal.estimation.solve import (
     covariance_of,
     fit_problem,
 )
+from visioncal.estimation.steps import Step
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.arm import UnseenView
 from visioncal.results.sections import ClockResult
@@ -61,7 +62,7 @@ class FitAssessment:
     # (p, p) covariances from sources other than noise, by source.
     covariance_by_source: Mapping[str, FloatArray]
     lenses: Mapping[str, LensErrors]  # Lens errors beyond the camera models, by camera.
-    residual_tests: Mapping[str, ResidualTest]  # Tests of the residuals of each robot's stops.
+    steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
     arms: Mapping[str, IdentifiedArm]  # Results on the arms, by robot.
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
@@ -159,10 +160,9 @@ def assess_fit(
     errors = {
         name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
     }
-    offsets = joint_offsets(solved.arms)
-    tests = residual_tests(part, converged, errors, offsets)
-    solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, tests))
-    beside = covariance_from_other_sources(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
+    steps = likely_steps(part, converged, errors, joint_offsets(solved.arms))
+    solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, steps))
+    beside = covariance_from_other_sources(part, fit, solved.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     held_out = left_out(solved, is_misread=observed.is_misread)
     faults, middles = pose_faults(solved), middles_of(solved.cell)
@@ -172,7 +172,7 @@ def assess_fit(
         covariance,
         beside,
         lens_errors(solved),
-        tests,
+        steps,
         {
             name: arm.identified(part, fit, covariance, middles, convention)
             for name, arm in solved.arms.items()

@@ -1,9 +1,9 @@
 """Messages on outliers and moved frames: exchanged, wrong or turned observations, by cause."""
 
 import shlex
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, look_at, or_alone
-from visioncal.estimation.moves import common_change
-from visioncal.estimation.slight_steps import common_size
+from visioncal.estimation.moves import agreed_change
+from visioncal.estimation.steps import agreed_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
@@ -124,179 +124,140 @@ def moved_finding(moved: Moved) -> Finding:
 
 
 def pose_faults(solved: CellFit) -> tuple[PoseFault, ...]:
-    """Turned images, exchanged or wrong poses, and pushed robots that explain outliers."""
+    """Turned images, exchanged or wrong poses, and what moved, that explain outliers."""
     outliers = np.flatnonzero(~solved.inlier_fit.used)
     if not len(outliers):
         return ()
-    turned = _turned_images(solved)
-    explained = {row for fault in turned for row in fault.rows}
+    faults = [*_turned_images(solved)]
     mutual = exchanged(solved.inlier_fit.problem, _fitting_stations(solved, outliers))
     if solved.cell.mount is not None:
-        swapped = tuple(_exchanged_views(solved, mutual))
-        return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
-    faults = _pushed_bases(solved)
-    faults += _exchanged_poses(solved, mutual)
-    explained |= {row for fault in faults for row in fault.rows}
-    rest = {one: other for one, other in mutual.items() if not {one, other} & explained}
-    faults += _exchanged_views(solved, rest)
-    explained |= {row for fault in faults for row in fault.rows}
-    return (*turned, *faults, *_wrong_poses(solved, explained))
+        faults += _exchanged_views(solved, mutual, set())
+        return tuple(faults or _moved_run(solved))
+    faults += [*_pushed_bases(solved), *_exchanged_poses(solved, mutual)]
+    faults += _exchanged_views(solved, mutual, {row for fault in faults for row in fault.rows})
+    faults += _wrong_poses(solved, {row for fault in faults for row in fault.rows})
+    return tuple(faults)
 
 
-def _turned_images(solved: CellFit) -> list[PoseFault]:
+def _fault(
+    solved: CellFit, kind: str, rows: Sequence[int], words: str, do: Remedy, short: str = ""
+) -> PoseFault:
+    """A fault of some observations, in words in which {views} are theirs."""
+    views = tuple(solved.cell.rows[row].view for row in rows)
+    words = words.format(views=f"views {some_of([*map(str, views)], _LISTED)}")
+    found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
+    return PoseFault(found, tuple(rows), short)
+
+
+def _turned_images(solved: CellFit) -> Iterator[PoseFault]:
     """Turned or mirrored images, which agree with the others once they are turned back."""
-    rows, faults = solved.cell.rows, []
     rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
-    for at, row in enumerate(rows):
+    for at, row in enumerate(solved.cell.rows):
         if row.view in solved.turned and not solved.inlier_fit.used[at]:
             rows_by_turn[solved.turned[row.view]].append(at)
     images = {view.number: view.image for view in solved.cell.session.views}
-    for how, turned_rows in rows_by_turn.items():
-        views = _view_numbers(solved, turned_rows)
-        named = some_of([*map(str, views)], _LISTED)
-        subject = f"The image of view {named} is" if len(views) == 1 else f"Images {named} are"
-        them = "it agrees" if len(views) == 1 else "they agree"
-        left_out = "It was" if len(views) == 1 else "They were"
-        words = f"{subject} {how.words}: turned back, {them} with the others. {left_out} left out."
+    for how, rows in rows_by_turn.items():
+        files = [images[solved.cell.rows[row].view] for row in rows]
         step = Remedy("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
-        if all(images[view] for view in views):
-            files = " ".join(f"SESSION/{shlex.quote(images[view])}" for view in views)
-            turn = f"mogrify {how.option} {files}"
+        if all(files):
+            named = " ".join(f"SESSION/{shlex.quote(file)}" for file in files)
+            turn = f"mogrify {how.option} {named}"
             step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
-        fault = Finding("turned_images", words, step, views)
-        faults.append(PoseFault(fault, tuple(turned_rows), f"its image is {how.words}"))
-    return faults
+        words = f"images of {{views}} are {how.words}: turned back, they agree. They were left out."
+        yield _fault(solved, "turned_images", rows, words, step, f"its image is {how.words}")
 
 
-def _moved_runs(solved: CellFit) -> Iterator[PoseFault]:
-    """Outliers at one end of the session that one step of a frame explains."""
+def _moved_run(solved: CellFit) -> Iterator[PoseFault]:
+    """Outliers at one end of the session that one step of a frame, or of a board, explains."""
     # Another active tool frame in the controller looks like a step of what is on the flange, and
     # another base frame like one of what is fixed in the cell.
     inliers, rows = solved.inlier_fit, solved.cell.rows
-    problem = inliers.problem
+    problem, fit = inliers.problem, inliers.fit
     order = np.argsort(problem.observations.stops, kind="stable")
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
     if len(run) < _FEWEST_STOPS or not problem.observations.has_rotation[run].all():
         return
-    steps = _common_steps(solved, run)
-    if not steps:
-        yield from _other_boards(solved, run, is_behind=run is after)
+    some, steps = np.isin(np.arange(len(problem)), run), []
+    for frame in problem.unknown:
+        if (step := agreed_change(problem, fit, frame, some)) is None:
+            continue
+        change, explained = step
+        scatter_m = float(np.median(distances(problem.change_of(frame, fit.state)[run], change)[0]))
+        if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
+            steps.append((scatter_m, frame, change))
+    if steps:
+        what, advice = _moved_words(solved, sorted(steps, key=lambda step: step[0]))
+    elif (size := agreed_size(problem, fit, some)) is not None and size[1].all():
+        share = f"{figure(100.0 * abs(size[0]))} % {'larger' if size[0] > 0.0 else 'smaller'}"
+        what = f"the target is another one, {share} than that of the other views"
+        advice = "Measure both prints, take one of them for all views"
+    else:
         return
-    (frame, change), *rivals = steps
-    edge = inliers.fit.state.edges[problem.unknown[frame]]
-    when = _when(solved, run, is_behind=run is after)
-    moved = f"the {_body(frame)} stood {_displacement_words(change)}"
-    for rival, rival_change in rivals:
-        moved += f" (or the {_body(rival)} {_displacement_words(rival_change)})"
+    last = rows[int(run[-1])].station
+    when = f"from view {rows[int(run[0])].view} on"
+    if run is before:
+        following = min((row for row in rows if row.station > last), key=lambda row: row.station)
+        when = f"before view {following.view}"
     outliers = np.sort(run).tolist()
-    advice = "Fasten what moved, and calibrate the views before and after it apart."
-    on_flange = problem.tree.body(frame) != problem.tree.root
+    views = tuple(rows[row].view for row in outliers)
+    do = or_alone(f"{advice}; or calibrate the views before and after it apart.", views)
+    words = f"{{views}} were left out: {when}, as they agree, {what}."
+    fault = _fault(solved, "something_moved", outliers, words, do, f"{when}, something had moved")
+    evidence = run_evidence(len(run), len(rows))
+    yield replace(fault, found=replace(fault.found, mahalanobis_sq=evidence))
+
+
+def _moved_words(
+    solved: CellFit, steps: Sequence[tuple[float, str, FloatArray]]
+) -> tuple[str, str]:
+    """What stood elsewhere, by steps of frames, the likeliest first; and advice."""
+    inliers, (_, frame, change) = solved.inlier_fit, steps[0]
+    problem = inliers.problem
+    stood = [
+        f"the {name.partition('_')[0].replace('cam', 'camera')} stood "
+        f"{mm_and_deg(*pose_difference(np.eye(4), step))} elsewhere"
+        for _, name, step in steps
+    ]
+    advice, on_flange = "Fasten what moved", problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
         which = "tool" if on_flange else "base"
-        other_mm, other_deg = pose_difference(np.eye(4), edge @ change @ invert(edge))
-        moved += (
-            f", or the controller reported another {which} frame, "
-            f"{mm_and_deg(other_mm, other_deg)} from that of the other views"
+        edge = inliers.fit.state.edges[problem.unknown[frame]]
+        other = mm_and_deg(*pose_difference(np.eye(4), edge @ change @ invert(edge)))
+        stood.append(
+            f"the controller reported another {which} frame, {other} from that of the other views"
         )
         advice = (
             f"Look which {which} frame was active in the controller, and set the same one for all "
-            "views; or fasten what moved, and calibrate the views before and after it apart."
+            "views; or fasten what moved"
         )
-    words = f"{_named_views(solved, outliers)} were left out: {when}, as they agree, {moved}."
-    views, evidence = _view_numbers(solved, outliers), run_evidence(len(run), len(rows))
-    step = or_alone(advice, views)
-    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
-    yield PoseFault(finding, tuple(outliers), f"{when}, something had moved")
+    return ", or ".join(stood), advice
 
 
-def _other_boards(solved: CellFit, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
-    """Outliers at one end of the session that a board of another size explains."""
-    inliers, outliers = solved.inlier_fit, np.sort(run).tolist()
-    is_in_run = np.isin(np.arange(len(inliers.used)), run)
-    size = common_size(inliers.problem, inliers.fit, is_in_run)
-    if size is None or not size[1].all():
-        return
-    when = _when(solved, run, is_behind=is_behind)
-    words = (
-        f"{_named_views(solved, outliers)} were left out: {when}, as they agree, the target is "
-        f"another one, {figure(100.0 * abs(size[0]))} % "
-        f"{'larger' if size[0] > 0.0 else 'smaller'} than that of the other views."
-    )
-    step = Remedy("Measure both prints, take one of them for all views, and record again.")
-    evidence = run_evidence(len(run), len(inliers.used))
-    views = _view_numbers(solved, outliers)
-    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
-    yield PoseFault(finding, tuple(outliers), f"{when}, the target was another one")
-
-
-def _when(solved: CellFit, run: IntArray, *, is_behind: bool) -> str:
-    """When views at the end, or the beginning, of the session were taken, in words."""
-    rows = solved.cell.rows
-    if is_behind:
-        return f"from view {rows[int(run[0])].view} on"
-    last = rows[int(run[-1])].station
-    following = min((row for row in rows if row.station > last), key=lambda row: row.station)
-    return f"before view {following.view}"
-
-
-def _common_steps(solved: CellFit, run: IntArray) -> list[tuple[str, FloatArray]]:
-    """Frames with a common step that explains some views, and the step; least scatter first."""
-    inliers, steps = solved.inlier_fit, []
-    is_in_run = np.isin(np.arange(len(inliers.used)), run)
-    for frame in inliers.problem.unknown:
-        step = common_change(inliers.problem, inliers.fit, frame, is_in_run)
-        if step is None:
-            continue
-        change, explained = step
-        changes = inliers.problem.change_of(frame, inliers.fit.state)[run]
-        scatter_m = float(np.median(distances(changes, change)[0]))
-        if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
-            steps.append((scatter_m, frame, change))
-    return [(frame, change) for _, frame, change in sorted(steps, key=lambda item: item[0])]
-
-
-def _body(frame: str) -> str:
-    return frame.partition("_")[0].replace("cam", "camera")
-
-
-def _displacement_words(change: FloatArray) -> str:
-    shift_mm, turn_deg = pose_difference(np.eye(4), change)
-    return f"{mm_and_deg(shift_mm, turn_deg)} elsewhere"
-
-
-def _exchanged_views(solved: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+def _exchanged_views(
+    solved: CellFit, mutual: Mapping[int, int], explained: Collection[int]
+) -> Iterator[PoseFault]:
     """Pairs of views of one camera, each of which fits the other's pose."""
-    rows = solved.cell.rows
-    for first, second in sorted(mutual.items()):
-        if first < second:
+    for pair in sorted(mutual.items()):
+        if pair[0] < pair[1] and not {*pair} & {*explained}:
+            first, second = (solved.cell.rows[row].view for row in pair)
             words = (
-                f"Views {rows[first].view} and {rows[second].view} are exchanged: the image of "
-                "each fits the pose in the other's row. They were left out."
+                f"Views {first} and {second} are exchanged: the image of each fits the pose in "
+                "the other's row. They were left out."
             )
-            views = (rows[first].view, rows[second].view)
             do = (
                 "Write a copy of the session in which their images are exchanged, and calibrate it."
             )
-            finding = Finding(EXCHANGED, words, Remedy(do, exchanging(*views)), views)
-            yield PoseFault(finding, (first, second))
+            yield _fault(solved, EXCHANGED, pair, words, Remedy(do, exchanging(first, second)))
 
 
-def _view_numbers(solved: CellFit, rows: Sequence[int]) -> tuple[int, ...]:
-    return tuple(solved.cell.rows[row].view for row in rows)
-
-
-def _named_views(solved: CellFit, rows: Sequence[int]) -> str:
-    return f"views {some_of([*map(str, _view_numbers(solved, rows))], _LISTED)}"
-
-
-def _pushed_bases(solved: CellFit) -> list[PoseFault]:
+def _pushed_bases(solved: CellFit) -> Iterator[PoseFault]:
     """Robots whose observations are all outliers from some stop on, as if the base had moved."""
     # Such observations are left out, and the base stays where it was: unlike other frames, a base
     # is not split in two when it moves, as all that its robot carries hangs on it.
     problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
-    stops, faults = problem.observations.stops, []
+    stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
         flange = problem.tree.flanges[robot]
         by_robot = problem.observations_through(flange)
@@ -311,11 +272,9 @@ def _pushed_bases(solved: CellFit) -> list[PoseFault]:
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
             f"{base} is where it stood before."
         )
-        views = _view_numbers(solved, after.tolist())
-        step = Remedy("Fasten it, and calibrate the stops from there on alone.", look_at(views[0]))
-        pushed = Finding("something_moved", words, step, views)
-        faults.append(PoseFault(pushed, tuple(after.tolist())))
-    return faults
+        look = look_at(solved.cell.rows[after[0]].view)
+        step = Remedy("Fasten it, and calibrate the stops from there on alone.", look)
+        yield _fault(solved, "something_moved", after.tolist(), words, step)
 
 
 def _base_displacement(
@@ -331,29 +290,49 @@ def _base_displacement(
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
-def _wrong_poses(solved: CellFit, explained: set[int]) -> Iterator[PoseFault]:
+def _exchanged_poses(solved: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+    """Pairs of poses of one robot that are exchanged."""
+    rows, problem, used = solved.cell.rows, solved.inlier_fit.problem, solved.inlier_fit.used
+    for robot, flange in problem.tree.flanges.items():
+        by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
+        pairs = Counter(
+            tuple(sorted((rows[at].station, rows[mutual[at]].station)))
+            for at in by_robot
+            if at in mutual
+        )
+        for stations, count in pairs.items():
+            at_both = [at for at in by_robot if rows[at].station in stations]
+            if count < 2 * _FEWEST or used[at_both].any():
+                continue
+            first, second = (solved.cell.stops[station] for station in stations)
+            short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
+            words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
+            yield _fault(solved, EXCHANGED, at_both, words, _EXCHANGE, short)
+
+
+def _wrong_poses(solved: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:
     """Stops at which all observations through a robot agree that its pose is wrong."""
     problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
         by_robot = problem.observations_through(problem.tree.flanges[robot])
-        for stop in np.unique(stops[by_robot & ~used]).tolist():
-            rows = np.flatnonzero(by_robot & (stops == stop))
-            if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
+        for station in np.unique(stops[by_robot & ~used]).tolist():
+            rows = np.flatnonzero(by_robot & (stops == station))
+            if len(rows) < _FEWEST or used[rows].any() or {*explained} & {*rows.tolist()}:
                 continue
-            moved = _base_displacement(solved, base, rows, problem.poses[robot][stop])
-            if moved:
+            if moved := _base_displacement(solved, base, rows, problem.poses[robot][station]):
+                stop = solved.cell.stops[station]
                 words = (
-                    f"Robot {robot} did not stand at stop {solved.cell.stops[stop]} where "
-                    f"its pose says: all {len(rows)} views by way of it disagree with the others, "
-                    f"as if the flange had been moved by {moved}, and were left out "
-                    f"({_named_views(solved, rows.tolist())})."
+                    f"Robot {robot} did not stand at stop {stop} where its pose says: all "
+                    f"{len(rows)} views by way of it disagree with the others, as if the flange "
+                    f"had been moved by {moved}, and were left out ({{views}})."
                 )
-                views = _view_numbers(solved, rows.tolist())
-                fix = "Correct its pose there in views.csv, or leave the stop out."
-                finding = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
-                short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
-                yield PoseFault(finding, tuple(rows.tolist()), short)
+                do = Remedy(
+                    "Correct its pose there in views.csv, or leave the stop out.",
+                    look_at(solved.cell.rows[rows[0]].view),
+                )
+                short = f"the pose of robot {robot} at stop {stop} is wrong"
+                yield _fault(solved, "wrong_pose", rows.tolist(), words, do, short)
 
 
 def reasons(solved: CellFit, faults: Sequence[PoseFault]) -> dict[int, str]:
@@ -445,30 +424,3 @@ def _fitting_stations(solved: CellFit, outliers: IntArray) -> dict[int, list[int
         for name, target in solved.cell.session.boards.items()
     }
     return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
-
-
-def _exchanged_poses(solved: CellFit, mutual: Mapping[int, int]) -> list[PoseFault]:
-    """Pairs of poses of one robot that are exchanged."""
-    rows, problem, used = solved.cell.rows, solved.inlier_fit.problem, solved.inlier_fit.used
-    faults = []
-    for robot in problem.robots:
-        by_robot = np.flatnonzero(
-            problem.observations_through(problem.tree.flanges[robot])
-        ).tolist()
-        pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
-        for at in by_robot:
-            if at in mutual:
-                both = sorted((rows[at].station, rows[mutual[at]].station))
-                pairs[both[0], both[1]].append(at)
-        for stations, members in pairs.items():
-            at_both = [at for at in by_robot if rows[at].station in stations]
-            if len(members) >= 2 * _FEWEST and not used[at_both].any():
-                first, second = (solved.cell.stops[station] for station in stations)
-                short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
-                words = (
-                    f"{short[0].upper()}{short[1:]}: {_named_views(solved, at_both)} were left "
-                    "out. Each pose is right at the other's stop."
-                )
-                finding = Finding(EXCHANGED, words, _EXCHANGE, _view_numbers(solved, at_both))
-                faults.append(PoseFault(finding, tuple(at_both), short))
-    return faults

@@ -43,7 +43,6 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
-from visioncal.estimation.moves import Move
 from visioncal.estimation.observability import (
     CellWords,
     Direction,
@@ -65,9 +64,7 @@ def findings_of(run: RunState) -> Findings:
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, of_cell = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
-    of_arms = doubts_of_arms(
-        solved.arms, answer.residual_tests, answer.arms, solved.level, solved.cell
-    )
+    of_arms = doubts_of_arms(solved.arms, answer.steps, answer.arms, solved.level, solved.cell)
     found = [*(_with_alternative(doubt, run) for doubt in of_arms), *lens_findings(answer.lenses)]
     of_rest = [
         *prior_findings(answer.problem, answer.state, answer.covariance, solved.cell.priors),
@@ -131,12 +128,11 @@ def _tie(cell: Cell, edges: Mapping[str, Edge]) -> Finding | None:
 
 def _with_alternative(finding: Finding, run: RunState) -> Finding:
     """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
-    steps = (test.step for test in run.assessment.residual_tests.values())
-    moves = [step for step in steps if isinstance(step, Move)]
-    if finding.kind != MOVED_FRAME or run.mount is None or not moves:
+    steps = run.assessment.steps
+    if finding.kind != MOVED_FRAME or run.mount is None or not steps:
         return finding
     tree = run.cell_fit.cell.tree
-    on_flange = tree.body(moves[0].frame) != tree.root
+    on_flange = tree.body(steps[0].of) != tree.root
     same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
     return replace(finding, words=f"{finding.words} {same} would look the same.")
 

@@ -11,11 +11,10 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements, distances
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.lens_step import lens_step
-from visioncal.estimation.residual_tests import common_errors, lens_field
 from visioncal.results.lens import LensField
 
 # Variance of displacements that is negligible beside that of corners; grid points per image axis.
@@ -28,8 +27,6 @@ class LensErrors:
 
     levels: LensLevels  # Their sizes, in units of `noise_px`.
     noise_px: float  # Standard deviation of a corner's coordinate [px].
-    # Whether errors depend on the position in the image, not on the board's corner.
-    is_of_lens: bool
     distance_m: float  # The mean distance of the views [m].
     focal_px: float  # The focal length [px].
 
@@ -49,25 +46,11 @@ def lens_errors(solved: CellFit) -> dict[str, LensErrors]:
         name: LensErrors(
             problem.levels or LensLevels(),
             seen.sigmas_px[which],
-            _is_of_lens(optics, name),
             _distance_m(seen, which),
             float(np.mean(optics.camera(name).matrix[:2])),
         )
         for which, (name, problem) in enumerate(optics.problems.items())
     }
-
-
-def _is_of_lens(optics: CameraParameters, camera: str) -> bool:
-    """Compares mean residuals by cells of the image with those by corners of the board."""
-    problem = optics.problems[camera]
-    if problem.levels is None or problem.levels.gains[0] < SIGNIFICANT:
-        return False
-    without = replace(optics, problems={**optics.problems, camera: problem.without_levels()})
-    residuals = without.compressed(camera).residuals
-    stack, shares = problem.stack, problem.shares[problem.stack.view_of]
-    by_cell = lens_field(stack.px, residuals, problem.scene.camera.resolution, shares)
-    by_corner = common_errors(stack.ids, residuals, shares)
-    return by_cell.is_significant and by_cell.mahalanobis_sq > by_corner.mahalanobis_sq
 
 
 def _distance_m(seen: LinearisedCorners, which: int) -> float:
@@ -183,7 +166,7 @@ def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
     """Findings on significant lens errors."""
     for name, lens in lenses.items():
         of, levels, (field, *changes) = _named(name, len(lenses)), lens.levels, lens.levels.gains
-        if lens.is_of_lens:
+        if field > SIGNIFICANT:
             yield Finding(
                 "lens_field",
                 f"{of} departs from its model: corners of one part of the image are off alike, by "

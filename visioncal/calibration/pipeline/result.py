@@ -229,9 +229,7 @@ def _points(run: RunState) -> Iterator[PointResult]:
 
 
 def _uncertainty(run: RunState) -> UncertaintyResult:
-    work, answer = run.accuracy_at_work, run.assessment
-    tests = (misfit.neighbours for misfit in answer.residual_tests.values())
-    alike = [test.factor for test in tests if test is not None and test.is_significant]
+    work = run.accuracy_at_work
     return UncertaintyResult(
         point_cam_m=work.point_cam,
         distances_m=work.distances_m,
@@ -239,7 +237,6 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
         radius95_mm=work.radius95_mm,
         noise_95=_of_robot(run, _noise_intervals(run)),
         spectrum=work.spectrum,
-        inflation=max(alike, default=1.0),
     )
 
 

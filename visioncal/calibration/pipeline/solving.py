@@ -47,7 +47,6 @@ from visioncal.estimation.outliers import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Observations, State
-from visioncal.estimation.slight_steps import log_gain, slipped_joint
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -55,6 +54,7 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
+from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.session.frames import frame_name
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
@@ -326,8 +326,8 @@ def _choose_levels(solved: CellFit, *, functions: bool = False) -> dict[str, Rob
         # They also explain much of a slipped joint: where the slip explains more, they are left
         # out.
         gain = found.function_gain
-        slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm})) if gain else None
-        slips = slip is not None and log_gain(part, fit, slip.mahalanobis_sq) > gain
+        joints = joints_of(part, joint_offsets({arm.robot: arm})) if gain else []
+        slips = any(step.gain > gain for step in find_steps(part, fit, joints))
         return found if gain and not slips else arm
 
     return change_each(solved.arms, part, fit, with_level)

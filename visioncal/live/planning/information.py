@@ -63,7 +63,6 @@ class RecordedStops:
     first_corner: int = 0  # Number of the first corner of the planned board.
     # Posture-dependent errors of the arm at the stops; None where the stops show none.
     arm: ArmErrors | None = None
-    inflation: float = 1.0  # Factor on the noise variance.
     # (12, c) root of the covariance of the edges' further errors, those of an arm without joint
     # angles. More stops do not reduce them.
     edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
@@ -247,21 +246,15 @@ def _world(
     factors = stop_factors(cell, purpose, q, recorded)
     shared_count, sigma = len(shared), _arm_sigma(purpose)
     arm = _arm_size(cell.robot, purpose, recorded)
-    inflation = 1.0
-    if recorded is not None and not purpose.blocks:
-        inflation = recorded.inflation
-        if recorded.arm is not None:
-            # Errors that a fit treats as noise are not unknowns.
-            arm *= recorded.arm.is_estimated
+    if recorded is not None and not purpose.blocks and recorded.arm is not None:
+        # Errors that a fit treats as noise are not unknowns.
+        arm *= recorded.arm.is_estimated
     weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
-    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm)) / inflation
+    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm))
     size, all_columns = len(prior), factors.shape[2]
     recorded_information = np.zeros((all_columns, all_columns))
     if recorded is not None:
         recorded_information = _recorded_information(cell, purpose, recorded)
-    scale = np.ones(all_columns)
-    scale[:size] = inflation**-0.5
-    factors, recorded_information = scale * factors, np.outer(scale, scale) * recorded_information
     if purpose.judged == "sight":
         weights = _sight_weights(cell, arm, q)
     else:
@@ -271,7 +264,7 @@ def _world(
     if recorded is not None and not purpose.blocks:
         error_root, held = recorded.edge_error_root, recorded.held.shape[1]
         held_gradient = np.zeros((size, held))
-        held_gradient[12 : 12 + len(recorded.held)] = -recorded.held / inflation
+        held_gradient[12 : 12 + len(recorded.held)] = -recorded.held
         edge_gradient = (prior + recorded_information[:size, :size])[:, :12] @ error_root
         gradient = np.hstack([gradient, edge_gradient, held_gradient])
         zeros = np.zeros((*factors.shape[:2], held))

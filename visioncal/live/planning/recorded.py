@@ -189,15 +189,13 @@ def _recorded_stops(
     assessment = run.assessment_or_none
     if assessment is None:
         return recorded
-    alike = [misfit.neighbours for misfit in assessment.residual_tests.values()]
-    factors = (value.factor for value in alike if value is not None and value.is_significant)
     # Gradient at held parameters of lens and boards.
     problem = assessment.problem
     gradient = normal_equations(problem, assessment.state, assessment.noise)[1]
     gradient = gradient * (problem.counted & ~problem.moving)
     columns = [problem.effect_columns[effect.name] for effect in start.problem.effects]
     held = np.concatenate([np.zeros(0), *(gradient[part.start : part.stop] for part in columns)])
-    recorded = replace(recorded, inflation=max(factors, default=1.0), held=held[:, None])
+    recorded = replace(recorded, held=held[:, None])
     by_arm = assessment.covariance_by_source.get("arm")
     if arm.is_modelled or by_arm is None:
         return recorded

@@ -1,0 +1,322 @@
+"""Changes from some stop on: of a frame, a joint's offset or a board's size; and a base's drift.
+
+Each is a few columns of the residuals, and all stops are tried at once by running sums (Rao's score
+test of a change point, Page 1955). The evidence of a fit with the change decides; `moves` finds
+frames that moved by more than the noise of single observations.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.core.quantiles import f_limit
+from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.arm import rows_of, stops_of
+from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
+from visioncal.estimation.moves import (
+    FALSE_MOVE,
+    FEWEST,
+    Move,
+    explained_by_noise,
+    fitted_change,
+    moved,
+    twin_name,
+)
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
+from visioncal.estimation.solve import (
+    RepeatErrors,
+    Solution,
+    equations_from,
+    fit_problem,
+    fitted_covariance,
+)
+
+FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
+# Sizes of changes with equal prior probability, and the unit of each value.
+_MOTION = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
+_PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
+    FRAME: _MOTION,
+    DRIFT: _MOTION,
+    JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
+    SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
+}
+# Least information of a change beside the other unknowns, as a share of that without them.
+_LEAST_INFORMATION = 1e-6
+# Largest share of the residuals that a change explains.
+_MOST_EXPLAINED = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """What may have changed during the session."""
+
+    kind: str  # `FRAME`, `JOINT`, `SIZE` or `DRIFT`.
+    of: str  # The frame; of a joint or a drift the robot, as the problem names it.
+    stops: IntArray  # The stops from which on it may have changed.
+    effect: Effect | None = None  # The change as an effect on all stops; None for a frame's pose.
+    joint: int = -1  # Index of the joint.
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A change from some stop on."""
+
+    candidate: Candidate  # What changed.
+    stop: int  # The first stop after it.
+    # (c,) change: twist of a frame in its own old pose, or of a base over the session [rad, m];
+    # actual minus reported angle [rad]; relative size.
+    value: FloatArray
+    covariance: FloatArray  # (c, c) of the change.
+    gain: float  # Twice the gain in log-likelihood, or the log Bayes factor of `evidence`.
+    # (p, p) covariance added for it where a fit does not model it: the solution lies between the
+    # states before and after, which are equally likely to be needed.
+    spread: FloatArray
+
+    @property
+    def kind(self) -> str:
+        """What changed: `FRAME`, `JOINT`, `SIZE` or `DRIFT`."""
+        return self.candidate.kind
+
+    @property
+    def of(self) -> str:
+        """The frame or robot that changed."""
+        return self.candidate.of
+
+
+def frames_of(problem: Problem, frames: Sequence[str]) -> list[Candidate]:
+    """Poses of frames that may have changed."""
+    return [
+        Candidate(FRAME, frame, _between(problem, problem.observations.involves(frame)))
+        for frame in frames
+    ]
+
+
+def joints_of(problem: Problem, offsets: Mapping[str, FloatArray]) -> list[Candidate]:
+    """Joints whose offsets may have changed.
+
+    `offsets` are (s, 6, n) by robot: Jacobians of its flange at each stop by its n joint offsets.
+    """
+    return [
+        Candidate(
+            JOINT,
+            robot,
+            _between(problem, rows_of(problem, robot)),
+            Effect.free(
+                f"offset {joint} of {robot}",
+                PriorInformation.flat(1),
+                flange_jacobian={robot: offset[:, :, [joint]]},
+            ),
+            joint,
+        )
+        for robot, offset in offsets.items()
+        for joint in range(offset.shape[2])
+    ]
+
+
+def sizes_of(problem: Problem, fit: Solution) -> list[Candidate]:
+    """Boards that may have been exchanged for one of another size."""
+    return [
+        Candidate(
+            SIZE,
+            frame,
+            _between(problem, problem.observations.involves(frame)),
+            _size_effect(problem, fit, frame),
+        )
+        for frame in problem.unknown
+        if frame.startswith("target")
+    ]
+
+
+def drift_of(problem: Problem, robot: str) -> Candidate:
+    """Motion of a robot's base in proportion to the number of the stop."""
+    stops, poses = stops_of(problem, robot), problem.poses[robot]
+    jacobian = np.zeros((len(poses), 6, 6))
+    time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
+    jacobian[stops] = adjoint(invert(poses[stops])) * time
+    effect = Effect.free(
+        f"drift of {robot}", PriorInformation.flat(6), flange_jacobian={robot: jacobian}
+    )
+    first = int(problem.observations.stops.min())
+    return Candidate(DRIFT, robot, np.array([first]), effect)
+
+
+def _between(problem: Problem, rows: Mask) -> IntArray:
+    """Stops with enough stops of (n,) some observations before and after."""
+    return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST : 1 - FEWEST])
+
+
+def _size_effect(problem: Problem, fit: Solution, board: str) -> Effect:
+    """A board's size as an effect: in proportion to its distance."""
+    rows = np.array([frame == board for frame in problem.observations.observed])
+    measured = problem.measured(fit.state)
+    jacobian = np.zeros((len(problem), 6, 1))
+    positions = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
+    jacobian[:, 3:] = np.where(rows[:, None, None], positions, 0.0)
+    return Effect.free(f"size of {board}", PriorInformation.flat(1), jacobian)
+
+
+def find_steps(
+    problem: Problem, fit: Solution, candidates: Sequence[Candidate], kinds: int = 1
+) -> list[Step]:
+    """The step of each candidate that noise does not explain, greatest gain first.
+
+    Args:
+        problem: The inlier observations.
+        fit: Their converged fit.
+        candidates: What may have changed.
+        kinds: Number of kinds of residuals, rotations and positions, if a change may be in one
+            alone: it then has to explain a half as much, and noise explains it more often.
+    """
+    errors, size = RepeatErrors.of(problem, fit), problem.size
+    effects = [candidate.effect for candidate in candidates if candidate.effect is not None]
+    widened = problem.with_effects([*problem.effects, *effects])
+    values = np.append(fit.state.values, np.zeros(widened.size - size))
+    start = replace(fit, state=State(fit.state.edges, values))
+    columns = [
+        np.r_[
+            widened.edge_columns(candidate.of)
+            if candidate.effect is None
+            else widened.effect_columns[candidate.effect.name]
+        ]
+        for candidate in candidates
+    ]
+    ends = np.cumsum([0, *map(len, columns)])
+    best: dict[int, Step] = {}
+    freedom = _residual_freedom(problem, fit)
+    tried = Counter[str]()
+    for candidate in candidates:
+        tried[candidate.kind] += len(candidate.stops)
+    for stop, information, gradient in equations_from(
+        widened, start, errors, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+    ):
+        across = np.delete(information, np.s_[size : widened.size], axis=1)
+        following = -errors.covariance @ across.T
+        for at, candidate in enumerate(candidates):
+            if stop not in candidate.stops:
+                continue
+            mine = slice(ends[at], ends[at + 1])
+            alone = information[mine, columns[at]]
+            marginal = alone + across[mine] @ following[:, mine]
+            scale = np.sqrt(np.maximum(np.diag(alone), np.finfo(float).tiny))
+            scaled = np.linalg.eigvalsh(np.stack([alone, marginal]) / np.outer(scale, scale))
+            if scaled.min() < _LEAST_INFORMATION:
+                continue
+            covariance = covariance_from(marginal)
+            value = -covariance @ gradient[mine]
+            square, count = float(-gradient[mine] @ value), len(value)
+            many = freedom / (kinds if count > 1 else 1)
+            limit = count * float(
+                f_limit(FALSE_MOVE / tried[candidate.kind], count, max(0.5 * many, 6.0))
+            )
+            if _as_f_test(square, many, count) < limit:
+                continue
+            gain = -freedom * float(np.log1p(-min(square / freedom, _MOST_EXPLAINED)))
+            if at in best and best[at].gain >= gain:
+                continue
+            before = following[:size, mine] @ value
+            after = before.copy()
+            if candidate.effect is None:
+                after[columns[at]] += value
+            spread = (np.outer(before, before) + np.outer(after, after)) / 2.0
+            best[at] = Step(candidate, stop, value, covariance, gain, spread)
+    return sorted(best.values(), key=lambda step: -step.gain)
+
+
+def _as_f_test(square: float, freedom: float, count: int) -> float:
+    """Score statistic of `count` values as that of an F test, times their number.
+
+    The noise of the score includes the tested change, which bounds the score.
+    """
+    remaining = max(freedom - square, (1.0 - _MOST_EXPLAINED) * freedom)
+    return square * max(freedom - count, 1.0) / remaining
+
+
+def _residual_freedom(problem: Problem, fit: Solution) -> float:
+    """Degrees of freedom of the residuals; unknowns with a prior take less than one each."""
+    prior = problem.prior_information(fit.state).information
+    prior_share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * prior))
+    determined = float(np.sum(problem.moving)) - prior_share
+    return max(float(problem.observations.directions.sum()) - determined, 6.0)
+
+
+def with_step(problem: Problem, fit: Solution, step: Step) -> tuple[Problem, Solution]:
+    """The problem with a step from its stop on, and its fit."""
+    effect = step.candidate.effect
+    if effect is None:
+        move = Move(step.of, twin_name(problem, step.of), step.stop, exp(step.value))
+        widened, start = moved(problem, fit, move)
+    else:
+        by_sensor, after = effect.by_sensor, problem.observations.stops >= step.stop
+        flanges = {name: array.copy() for name, array in effect.flange_jacobian.items()}
+        for array in flanges.values():
+            array[: step.stop] = 0.0
+        effect = replace(
+            effect,
+            by_sensor=None if by_sensor is None else by_sensor * after[:, None, None],
+            flange_jacobian=flanges,
+        )
+        widened = problem.with_effects([*problem.effects, effect])
+        values = np.append(fit.state.values, step.value)
+        start = replace(fit, state=State(fit.state.edges, values))
+    return widened, fit_problem(widened, start.state, start.noise)
+
+
+def evidence(problem: Problem, fit: Solution, step: Step) -> tuple[float, Problem, Solution]:
+    """Twice the log Bayes factor of a step, by a fit with it and with its own noise.
+
+    The score has one noise level for rotations and positions. A pushed camera shows in positions
+    alone, which are only half of the score.
+
+    Returns:
+        The factor, and the problem with the step and its fit.
+    """
+    widened, step_fit = with_step(problem, fit, step)
+    # The sensors' levels are held, the same for both.
+    before, after = (
+        robot_likelihood(part, state, step_fit.noise).negative_log_likelihood
+        for part, state in ((problem, fit.state), (widened, step_fit.state))
+    )
+    known = fitted_covariance(widened, step_fit.state, step_fit.noise)
+    # Restricted likelihood has a flat prior on the change; actual changes come in all orders of
+    # magnitude.
+    if step.candidate.effect is None:
+        twin = [*widened.unknown][-1]
+        change, covariance = fitted_change(widened, step_fit, known, step.of, twin)
+    else:
+        count = len(step.value)
+        change, covariance = step_fit.state.values[-count:], known[-count:, -count:]
+    sizes, units = _PRIOR[step.kind]
+    logs = []
+    for size in sizes:
+        total = covariance + np.diag((size * units) ** 2)
+        square = float(change @ np.linalg.solve(total, change))
+        logs.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
+    prior = float(np.logaddexp.reduce(logs) - np.log(len(logs)))
+    return 2.0 * (before - after + prior), widened, step_fit
+
+
+def agreed_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
+    """The new size of a board that (n,) some observations agree on, by a fit of others.
+
+    Returns:
+        The relative increase, and for each of them whether noise explains the rest; None where they
+        are not of one board.
+    """
+    pairs = zip(problem.observations.observed, some.tolist(), strict=True)
+    board, *others = {frame for frame, chosen in pairs if chosen}
+    if others or not board.startswith("target"):
+        return None
+    measured = problem.measured(fit.state)[some, :3, 3]
+    predicted = problem.predicted(fit.state)[some, :3, 3]
+    ratios = np.sum(predicted * measured, axis=1) / np.sum(measured**2, axis=1)
+    share = float(np.median(ratios)) - 1.0
+    widened = problem.with_effects([*problem.effects, _size_effect(problem, fit, board)])
+    resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
+    return share, explained_by_noise(widened, resized, len(problem))[some]
