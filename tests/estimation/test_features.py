@@ -135,8 +135,8 @@ def test_a_touch_that_tells_no_direction_does_no_harm():
     assert np.abs(away(frame, found.base_from_fixture)).max() < 3e-3
     points[3] = points[0]
     guesses = list(fixture_problem(replace(touches, measured=points)).guesses())
-    # Of 2 x 2 x 2 sets of three touches two are on one line, and the means make one more start.
-    assert len(guesses) == 7
+    # 2 x 2 x 2 sets of three touches, of which two are on one line, and the means.
+    assert len(guesses) == 9
     turns = [guess.frame[:3, :3] for guess in guesses]
     assert all(np.allclose(turn @ turn.T, np.eye(3)) for turn in turns)
 

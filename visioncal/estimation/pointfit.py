@@ -20,7 +20,7 @@ from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import f_limit, t_chance
-from visioncal.core.transforms import compose
+from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
@@ -57,8 +57,6 @@ _STATED = {
 }
 # Most starts from one touch of each kind.
 _SETS = 60
-# Least determinant of axes: it is one, or zero for collinear touches.
-_IS_FRAME = 0.5
 # Touches nearer to the start than this share of the farthest one's distance may be on either side,
 # by noise; they do no harm.
 _BEHIND = 0.1
@@ -324,19 +322,19 @@ def _feature_frames(touches: PointPairs) -> Iterator[FloatArray]:
     sets = np.array(list(product(*kinds)))
     if len(sets) > _SETS:
         sets = np.random.default_rng(0).choice(sets, _SETS, replace=False)
-    frames = (_frame_from(*points[rows]) for rows in sets)
-    # Collinear touches determine no frame, and no other touch would contradict it.
-    yield from (frame for frame in frames if np.linalg.det(frame[:3, :3]) > _IS_FRAME)
+    yield from (_frame_from(*points[rows]) for rows in sets)
 
 
 def _frame_from(origin: FloatArray, on_x: FloatArray, in_xy: FloatArray) -> FloatArray:
-    """The (4, 4) frame of three points: on the origin, the x axis and the xy plane."""
-    # For collinear points axes are zero, and so is the determinant.
+    """The (4, 4) frame of three points: on the origin, the x axis and the xy plane.
+
+    Of collinear points it is one of the many.
+    """
     x = on_x - origin
-    x = x / max(float(np.linalg.norm(x)), np.finfo(float).tiny)
     z = np.cross(x, in_xy - origin)
-    z = z / max(float(np.linalg.norm(z)), np.finfo(float).tiny)
-    return compose(np.stack([x, np.cross(z, x), z], axis=1), origin)
+    axes = np.stack([x, np.cross(z, x), z], axis=1)
+    lengths = np.linalg.norm(axes, axis=0)
+    return compose(nearest_rotation(axes / np.maximum(lengths, np.finfo(float).tiny)), origin)
 
 
 def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> PointFit:
@@ -357,7 +355,6 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
         DegenerateError: The x axis was touched at the origin, or the plane on the x axis.
     """
     _check_kinds(touches)
-    _check_sides(touches)
     if expected_noise_m is None and len(touches) == len(FEATURE_KINDS):
         expected_noise_m = TOUCH_NOISE_M
     agreement = find_inlier_groups(fixture_problem(touches), expected_noise_m)
@@ -385,6 +382,7 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
 
 
 def _check_kinds(touches: PointPairs) -> None:
+    """Refuses touches of missing kinds, and those on both sides of the origin or the x axis."""
     missing = [kind for kind in FEATURE_KINDS if kind not in touches.kinds]
     if missing:
         raise DataError(
@@ -395,46 +393,23 @@ def _check_kinds(touches: PointPairs) -> None:
             "plane on the side of positive y.",
         )
     _check_finite(touches, "touch")
-
-
-def _check_sides(touches: PointPairs) -> None:
-    """Refuses touches that do not determine the axes: too near, or on both sides."""
     origin = touches.measured[touches.rows("origin")].mean(axis=0)
-    along = touches.measured[touches.rows("x")] - origin
-    _check_one_side(touches, "x", along, "origin", LEAST_NOISE_M)
-    x = along.mean(axis=0) / np.linalg.norm(along.mean(axis=0))
-    aside = touches.measured[touches.rows("xy")] - origin
-    reach = max(float(np.linalg.norm(aside, axis=1).max()), float(np.linalg.norm(along[0])))
+    along, aside = (touches.measured[touches.rows(kind)] - origin for kind in ("x", "xy"))
+    x = along.mean(axis=0) / max(float(np.linalg.norm(along.mean(axis=0))), LEAST_NOISE_M)
     aside = aside - np.outer(aside @ x, x)
-    least = max(LEAST_NOISE_M, float(np.sqrt(_LEAST_RATIO)) * reach)
-    _check_one_side(touches, "xy", aside, "x axis", least)
-
-
-def _check_one_side(
-    touches: PointPairs, kind: FeatureKind, vectors: FloatArray, start: str, least_m: float
-) -> None:
-    """Checks (k, 3) vectors from the origin, or from the x axis, to the touches of a kind."""
-    names = [touches.labels[at] for at in touches.rows(kind)]
-    distances = np.linalg.norm(vectors, axis=1)
-    farthest = int(np.argmax(distances))
-    if distances[farthest] <= least_m:
-        axes = "y and z axes" if kind == "x" else "x axis"
-        raise DegenerateError(
-            f"fixture: the fixture's rotation about its {axes} is not determined at all: touch "
-            f"{some_of(names)} of kind {kind} is {figure(1e3 * distances[farthest])} mm from the "
-            f"{start}.",
-            culprits=names,
-            next_step=f"Touch a point far from the {start}.",
-        )
-    shares = vectors @ vectors[farthest] / distances[farthest] ** 2
-    behind = [name for name, share in zip(names, shares, strict=True) if share < -_BEHIND]
-    if behind:
-        raise DataError(
-            f"fixture: the touches of kind {kind} lie on both sides of the {start}: "
-            f"{some_of(behind)} on the other side than {names[farthest]}.",
-            culprits=[*behind, names[farthest]],
-            next_step=f"Touch only points of positive {kind[-1]}.",
-        )
+    for kind, vectors, start in (("x", along, "origin"), ("xy", aside, "x axis")):
+        names = [name for name, of in zip(touches.labels, touches.kinds, strict=True) if of == kind]
+        distances = np.linalg.norm(vectors, axis=1)
+        farthest = int(np.argmax(distances))
+        shares = vectors @ vectors[farthest] / max(float(distances[farthest]), LEAST_NOISE_M) ** 2
+        behind = [name for name, share in zip(names, shares, strict=True) if share < -_BEHIND]
+        if behind:
+            raise DataError(
+                f"fixture: the touches of kind {kind} lie on both sides of the {start}: "
+                f"{some_of(behind)} on the other side than {names[farthest]}.",
+                culprits=[*behind, names[farthest]],
+                next_step=f"Touch only points of positive {kind[-1]}.",
+            )
 
 
 def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> DrawingFit:

@@ -22,9 +22,6 @@ _POINTS, _SIZE = 4096, 6
 _MOST_FREEDOM = 1e6
 # Search range of radii about a first guess, as a factor, and relative tolerance.
 _FAR, _TOLERANCE = 1e3, 1e-9
-# So many times fewer points give them to this share.
-_FEW, _NEAR = 16, 0.03
-_ROUNDS = 40
 _EXACT, _FAR_WITHIN = 1e-30, 1e15
 
 
@@ -72,18 +69,11 @@ def radius_within(
     if not guess > 0.0:
         return 0.0
 
-    def missing(logarithm: float, every: int) -> float:
+    def missing(logarithm: float) -> float:
         limit = guess * float(np.exp(logarithm))
-        return _mean_chance([_crossings(errors[::every], known[::every], limit)], freedom) - share
+        return _mean_chance([_crossings(errors, known, limit)], freedom) - share
 
-    low, high = -np.log(_FAR), np.log(_FAR)
-    # A few of the points bracket the root, all of them give it exactly.
-    about = brentq(missing, low, high, (_FEW,), xtol=_NEAR)
-    low, high = (
-        limit if missing(near, 1) * side < 0.0 else near
-        for near, limit, side in ((about - _NEAR, low, -1.0), (about + _NEAR, high, 1.0))
-    )
-    root = brentq(missing, low, high, (1,), xtol=_TOLERANCE)
+    root = brentq(missing, -np.log(_FAR), np.log(_FAR), xtol=_TOLERANCE)
     # Rounded up, so that the share is reached at the radius.
     return guess * float(np.exp(root + 2.0 * _TOLERANCE))
 
@@ -126,9 +116,7 @@ def _directions() -> FloatArray:
     Its steps are powers of the root of x^7 = x + 1, which generalises the golden ratio to six
     dimensions.
     """
-    ratio = 1.0
-    for _ in range(_ROUNDS):
-        ratio = (1.0 + ratio) ** (1.0 / (_SIZE + 1))
+    ratio = float(np.max(np.real(np.roots([1.0, *np.zeros(_SIZE - 1), -1.0, -1.0]))))
     steps = ratio ** -np.arange(1.0, _SIZE + 1.0)
     even = (0.5 + np.arange(1, _POINTS + 1)[:, None] * steps) % 1.0
     normal = ndtri(even)
