@@ -72,7 +72,7 @@ def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
         off = 0.5 * rng.standard_normal(4)
         told = with_camera(cell, off, matrix_sigma_px=0.5, intrinsics=mode)
         known = calibrated(cell, session=told)
-        assert known.accuracy_at_work.budget_mm["intrinsics"] > 0.0
+        assert known.uncertainty.budget_mm["intrinsics"] > 0.0
         surprises.append(mahalanobis_sq(cell, known))
     # Mean of 4 chi-square of 12 over 12: sigma 0.2; four sigma, and held values err a bit more.
     assert 0.2 < np.mean(surprises) < 2.0
@@ -145,7 +145,7 @@ def test_a_fisheye_camera_goes_the_whole_way(given):
 
 def test_a_closed_form_is_diagnosed_too():
     cell = simulate(replace(FINE, seed=2))
-    joint, park = (calibrated(cell, solver=name).accuracy_at_work for name in ("joint", "park"))
+    joint, park = (calibrated(cell, solver=name).uncertainty for name in ("joint", "park"))
     assert {"pixels", "robot", "total"} < set(park.budget_mm)
     # The levels of noise belong to the session, whichever solver gave the estimate: both maximise
     # the same restricted likelihood, to the tolerance of its search. What is held pulls at a fit

@@ -1,8 +1,10 @@
 """Examination of a fit: covariance, diagnosis, left-out residuals, held-back views."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -49,7 +51,9 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.steps import Step
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.arm import UnseenView
-from visioncal.results.sections import ClockResult
+from visioncal.results.sections import ClockResult, Intervals
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +144,23 @@ class FitAssessment:
     def intervals(self) -> FloatArray:
         """(r, 2, 2) 95 % intervals of the robots' noise; see `estimation.intervals`."""
         return noise_intervals(self.problem, self.state, self.noise)
+
+    @property
+    def noise_95(self) -> dict[str, Intervals]:
+        """95 % intervals of the robots' noise levels, by robot and by name."""
+        pairs = zip(self.problem.robots, self.intervals.tolist(), strict=True)
+        return {
+            robot: {
+                "translation_mm": (1e3 * metres[0], 1e3 * metres[1]),
+                "rotation_deg": (math.degrees(rad[0]), math.degrees(rad[1])),
+            }
+            for robot, (rad, metres) in pairs
+        }
+
+    def of_robot(self, levels: Mapping[str, Mapping[str, _T]]) -> dict[str, _T]:
+        """Figures on the noise of the only robot, or of robot and camera combined, by name."""
+        of = "combined" if self.problem.is_combined else "robot"
+        return {f"{of}_{name}": level for name, level in levels[self.problem.robots[0]].items()}
 
 
 def assess_fit(

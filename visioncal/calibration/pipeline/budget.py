@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import solve_without
+from visioncal.results.sections import UncertaintyResult
 from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
 
@@ -77,30 +77,18 @@ def budget_mm(solved: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, di
     }
 
 
-@dataclass(frozen=True, eq=False)
-class WorkAccuracy:
-    """Accuracy of a point that one camera and one robot locate where their views look."""
-
-    # (3,) the target's middle in the camera's frame, mean over the views [m].
-    point_cam: FloatArray
-    distances_m: FloatArray  # (2,) least and greatest distance of the middle from the camera [m].
-    # Standard deviation of that point's position, by source and as a `total` [mm].
-    budget_mm: Mapping[str, float]
-    radius95_mm: float  # 95 % error radius of its position [mm].
-    # (12,) standard deviations along the principal directions of both edges, ascending, in units of
-    # the largest accepted ones (5 mm, 0.5 deg).
-    spectrum: FloatArray
-
-
-def work_accuracy(
+def uncertainty_of(
     solved: CellFit, beside: Mapping[str, FloatArray], covariance: FloatArray
-) -> WorkAccuracy:
-    """Computes the accuracy of one camera and one robot where their views look.
+) -> UncertaintyResult:
+    """Uncertainty of a target's middle that one camera and one robot locate, by all views' mean.
 
     Args:
         solved: The fit.
         beside: (p, p) covariances from sources other than noise, by source.
         covariance: (p, p) of its unknowns, from all sources.
+
+    Returns:
+        The section of the result, without intervals of the noise.
     """
     part, state = solved.inlier_problem, solved.inlier_fit.fit.state
     middles = middles_of(solved.cell)
@@ -113,12 +101,13 @@ def work_accuracy(
     }
     limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limits, limits))
-    return WorkAccuracy(
-        point_cam,
-        np.array([distances_m.min(), distances_m.max()]),
-        {name: _sigma_mm(covariance) for name, covariance in covariances.items()},
-        1e3 * radius95(covariances["total"]),
-        np.sqrt(np.maximum(values, 0.0)),
+    return UncertaintyResult(
+        point_cam_m=point_cam,
+        distances_m=np.array([distances_m.min(), distances_m.max()]),
+        budget_mm={name: _sigma_mm(at) for name, at in covariances.items()},
+        radius95_mm=1e3 * radius95(covariances["total"]),
+        noise_95={},
+        spectrum=np.sqrt(np.maximum(values, 0.0)),
     )
 
 

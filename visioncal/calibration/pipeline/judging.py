@@ -172,7 +172,7 @@ _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence
 
 def _pair_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
-    answer, work, mount = run.assessment, run.accuracy_at_work, run.session.mount
+    answer, work, mount = run.assessment, run.uncertainty, run.session.mount
     place = _place("Where the views look, a point", work.budget_mm, work.radius95_mm)
     names = chain_words(answer.problem, mount).names
     found = directions(answer.problem, answer.state, answer.covariance, names)

@@ -6,7 +6,7 @@ It includes the joint fit, as a later verification of the same cell needs it.
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -52,11 +52,9 @@ from visioncal.results.sections import (
     FittedStops,
     ImageBlur,
     InstrumentResult,
-    Intervals,
     JointFit,
     PointResult,
     RigResult,
-    UncertaintyResult,
 )
 from visioncal.results.views import rms_of
 from visioncal.robot import Robot
@@ -64,7 +62,6 @@ from visioncal.session import frame_name
 from visioncal.session.frames import object_name
 from visioncal.vision.targets import first_corners, target_document
 
-_T = TypeVar("_T")
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
     "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
@@ -179,7 +176,7 @@ def _sections_of_pair(
         "boards": {} if is_unnamed else boards,
         "rig": next(iter(rigs.values()), None) if is_unnamed else None,
         "rigs": {} if is_unnamed else rigs,
-        "uncertainty": _uncertainty(run),
+        "uncertainty": run.uncertainty,
         # Of those that all used views state.
         "means": {
             name: float(np.mean([numbers[name] for numbers in used]))
@@ -228,18 +225,6 @@ def _points(run: RunState) -> Iterator[PointResult]:
                 yield PointResult(point=name, x_m=x_m, y_m=y_m, z_m=z_m, sigma_mm=edge.sigma_mm)
 
 
-def _uncertainty(run: RunState) -> UncertaintyResult:
-    work = run.accuracy_at_work
-    return UncertaintyResult(
-        point_cam_m=work.point_cam,
-        distances_m=work.distances_m,
-        budget_mm=work.budget_mm,
-        radius95_mm=work.radius95_mm,
-        noise_95=_of_robot(run, _noise_intervals(run)),
-        spectrum=work.spectrum,
-    )
-
-
 def _noise(run: RunState) -> dict[str, float]:
     """Standard deviations per axis, of corners and flange, or of both together without corners."""
     px = [sigmas["pixel_px"] for sigmas in run.assessment.sigmas.values() if "pixel_px" in sigmas]
@@ -249,33 +234,7 @@ def _noise(run: RunState) -> dict[str, float]:
         noise["instrument_mm"] = 1e3 * run.readings.sigma_m
         if run.readings.are_poses:
             noise["instrument_deg"] = float(np.rad2deg(run.readings.instrument.sigma_rad or 0.0))
-    return noise | _of_robot(run, run.assessment.sigmas)
-
-
-def _of_robot(run: RunState, levels: Mapping[str, Mapping[str, _T]]) -> dict[str, _T]:
-    """Figures on the noise of the only robot, or on that of robot and camera combined, by name."""
-    problem = run.assessment.problem
-    of = "combined" if problem.is_combined else "robot"
-    return {f"{of}_{name}": level for name, level in levels[problem.robots[0]].items()}
-
-
-def _noise_intervals(run: RunState) -> dict[str, Intervals]:
-    """95 % intervals of the robots' noise levels, by robot and by name."""
-
-    def bounds(interval: FloatArray) -> tuple[float, float]:
-        low, high = interval.tolist()
-        return low, high
-
-    answer = run.assessment
-    return {
-        robot: {
-            "translation_mm": bounds(1e3 * interval_m),
-            "rotation_deg": bounds(np.rad2deg(interval_rad)),
-        }
-        for robot, (interval_rad, interval_m) in zip(
-            answer.problem.robots, answer.intervals, strict=True
-        )
-    }
+    return noise | run.assessment.of_robot(run.assessment.sigmas)
 
 
 def _joint_fit(run: RunState) -> JointFit | None:
@@ -416,7 +375,7 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
         joint_fit=_joint_fit_of_cell(run),
         uncertainty=CellUncertainty(
             budget_mm={edges[frame]: mm for frame, mm in answer.budget_mm.items()},
-            noise_95=_noise_intervals(run),
+            noise_95=answer.noise_95,
         ),
     )
 

@@ -1,13 +1,13 @@
 """State of a pipeline run, to which each stage adds its results."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypedDict, TypeVar, Unpack
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
-from visioncal.calibration.pipeline.budget import WorkAccuracy, work_accuracy
+from visioncal.calibration.pipeline.budget import uncertainty_of
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
@@ -19,6 +19,7 @@ from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, Mount, Progress
 from visioncal.results import Verdict
+from visioncal.results.sections import UncertaintyResult
 from visioncal.robot import Loads
 from visioncal.session import Session
 from visioncal.session.selecting import is_whole_cell
@@ -92,11 +93,11 @@ class RunState(Observed):
         return _there(self.assessment_or_none, "the answer")
 
     @cached_property
-    def accuracy_at_work(self) -> WorkAccuracy:
-        """Accuracy of one camera and one robot where their views look."""
-        return work_accuracy(
-            self.cell_fit, self.assessment.covariance_by_source, self.assessment.covariance
-        )
+    def uncertainty(self) -> UncertaintyResult:
+        """Uncertainty of one camera and one robot where their views look."""
+        answer = self.assessment
+        work = uncertainty_of(self.cell_fit, answer.covariance_by_source, answer.covariance)
+        return replace(work, noise_95=answer.of_robot(answer.noise_95))
 
     @property
     def robot_arm(self) -> RobotArm:

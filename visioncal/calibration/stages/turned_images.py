@@ -4,7 +4,6 @@ Such an image shows another lens than the others, from a pose that the robot did
 corners, turned back, are where the robot and the board predict them.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ _LEAST_PX = 0.05
 _OF_SPACING = 0.15
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class ImageTurn:
     """A rotation or reflection of an image, in words, and ImageMagick's option that undoes it."""
 
@@ -27,22 +26,14 @@ class ImageTurn:
     option: str
 
 
-_PixelMap = Callable[[FloatArray, int, int], FloatArray]
-_HALF = ImageTurn("turned by 180 deg", "-rotate 180")
-_LEFT = ImageTurn("turned by 90 deg counterclockwise", "-rotate 90")
-_RIGHT = ImageTurn("turned by 90 deg clockwise", "-rotate 270")
-_FLOPPED = ImageTurn("mirrored left to right", "-flop")
-_FLIPPED = ImageTurn("mirrored upside down", "-flip")
-# Coordinates of corners (n, 2) once it is undone, in images of a width and a height [px].
-_UNDONE: Mapping[ImageTurn, _PixelMap] = {
-    _HALF: lambda px, width, height: np.array([width - 1, height - 1]) - px,
-    _FLOPPED: lambda px, width, _: np.array([width - 1, 0]) + np.array([-1, 1]) * px,
-    _FLIPPED: lambda px, _, height: np.array([0, height - 1]) + np.array([1, -1]) * px,
-}
-# Only square images keep their size.
-_QUARTERS: Mapping[ImageTurn, _PixelMap] = {
-    _LEFT: lambda px, _, height: np.stack([height - 1 - px[:, 1], px[:, 0]], axis=1),
-    _RIGHT: lambda px, width, _: np.stack([px[:, 1], width - 1 - px[:, 0]], axis=1),
+# What each did to a corner's place relative to the middle of the image, which its inverse undoes;
+# quarter turns only of square images, which keep their size.
+_TURNS = {
+    ImageTurn("turned by 180 deg", "-rotate 180"): [[-1, 0], [0, -1]],
+    ImageTurn("mirrored left to right", "-flop"): [[-1, 0], [0, 1]],
+    ImageTurn("mirrored upside down", "-flip"): [[1, 0], [0, -1]],
+    ImageTurn("turned by 90 deg counterclockwise", "-rotate 90"): [[0, 1], [-1, 0]],
+    ImageTurn("turned by 90 deg clockwise", "-rotate 270"): [[0, -1], [1, 0]],
 }
 
 
@@ -67,9 +58,12 @@ def find_image_turn(
     limit_px = min(_AGREEMENT * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(predicted))
     if not len(predicted) or _rms_px(px, predicted) < limit_px:
         return None
-    candidates = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
-    undone = ((_rms_px(undo(px, *size), predicted), turn) for turn, undo in candidates.items())
-    rms_px, turn = min(undone, key=lambda pair: pair[0])
+    middle = (np.array(size) - 1.0) / 2.0
+    rms_px, turn = min(
+        (_rms_px(middle + (px - middle) @ np.array(turned), predicted), turn)
+        for turn, turned in _TURNS.items()
+        if turned[0][0] or size[0] == size[1]
+    )
     return turn if rms_px < limit_px else None
 
 
