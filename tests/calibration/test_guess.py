@@ -107,20 +107,6 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
-@pytest.mark.parametrize(("size", "is_measured"), [(0.3, True), (0.55, False), (3.0, True)])
-def test_a_target_of_another_size_is_named_by_its_size(size, is_measured):
-    # Not by units that would almost do: inches for centimetres are 2.54.
-    poses = cell_poses("eye-to-hand")
-    stated = replace(poses.camera, positions=poses.camera.positions / size)
-    guess = guess_reading(poses.robot, stated, "eye-to-hand", is_measured=is_measured)
-    (word,) = guess.best.differences
-    assert word.startswith("the target ")
-    # A tenth of what the least of these sizes is off by; the noise is a thousandth.
-    assert guess.best.hypothesis.camera.scale == pytest.approx(size, rel=0.02)
-    found = guess.best.hypothesis.camera_numbers(stated).poses()
-    np.testing.assert_allclose(found, poses.camera.poses(), atol=0.02)
-
-
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_wrong_mount_is_named_though_poses_are_poor(mount):
     # As of a hobby arm: 5 degrees and 10 mm.
@@ -214,7 +200,7 @@ def test_rotations_that_are_none_are_called_so(side, rows):
     wrong = replace(wrong, rotations=3.0 * wrong.rotations)
     guess = guessed(replace(few, **{side: wrong}, is_measured=False))
     assert not guess.stands_out
-    assert not guess.declared.is_readable
+    assert not guess.declared.fit.is_readable
     assert "are none" in guess.sentence
 
 

@@ -273,26 +273,6 @@ def test_poses_that_close_under_no_reading_are_not_written(cell, tmp_path):
     assert not (tmp_path / "fixed").exists()
 
 
-@pytest.mark.slow
-def test_poses_that_no_reading_explains_are_wrong_where_the_joints_agree(cell):
-    def exchanged(rows):
-        for row in rows:
-            row["x_m"], row["y_m"] = row["y_m"], row["x_m"]
-
-    def without(rows):
-        for row in rows:
-            row.update(dict.fromkeys(POSE, ""))
-
-    rewritten(cell, exchanged)
-    first = visioncal.calibrate(cell).verdict.findings[0]
-    assert first.kind == "misread_poses"
-    assert first.words.startswith("The reported poses are wrong: with them the chain closes to ")
-    assert visioncal.doctor(cell).findings[0].kind == "misread_poses"
-    # As the step says: the joint angles alone.
-    rewritten(cell, without)
-    assert visioncal.calibrate(cell).verdict.status == "good"
-
-
 def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
     document = cell / "session.toml"
     document.write_text(document.read_text("utf-8").replace('"ur10e"', '"ur10ee"'), "utf-8")

@@ -75,7 +75,11 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     print_table(
         ("reading", "chain closes to", "views that agree"),
         [
-            (candidate.words, candidate.figures, f"{candidate.agreeing} of {candidate.rows}")
+            (
+                candidate.words,
+                candidate.fit.figures,
+                f"{candidate.fit.agreeing} of {candidate.rows}",
+            )
             for candidate in guess.candidates
         ],
         bold=guess.candidates.index(guess.best),
@@ -83,7 +87,7 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     )
     say("\n".join([guess.sentence, *(f"note: {note}" for note in guess.notes)]))
     if not guess.stands_out:
-        if guess.declared.closes:
+        if guess.declared.fit.closes:
             return guess.declared
         raise DataError(
             "Nothing was written: the chain does not close as declared, and no other reading "

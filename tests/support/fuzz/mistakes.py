@@ -92,7 +92,7 @@ def is_named(guess: Guess, poses: Poses) -> bool:
         return False
     found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
     there = np.isfinite(true).all(axis=(1, 2))
-    turns = HALF_TURNS if best.hypothesis.robot.signs == "mirror" else HALF_TURNS[:1]
+    turns = HALF_TURNS if best.hypothesis.robot.mirrored else HALF_TURNS[:1]
     # Numbers are rewritten without loss, but for the rounding of a few conversions.
     return any(
         np.allclose(a @ found[there] @ b, true[there], atol=1e-7) for a in turns for b in turns

@@ -12,15 +12,16 @@ from itertools import combinations
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fit
-from visioncal.calibration.guess.readings import (
-    HALF_TURN,
-    HALF_TURNED,
-    Hypothesis,
-    of_exchanged_rows,
-)
-from visioncal.calibration.guess.search import (
+from visioncal.calibration.guess.fit import (
     CLOSING_SCORE,
+    STARTS,
+    Fit,
+    distances,
+    is_about_one_axis,
+    robust_fit,
+)
+from visioncal.calibration.guess.readings import HALF_TURN, HALF_TURNED, of_exchanged_rows
+from visioncal.calibration.guess.search import (
     EVIDENCE,
     FEWEST_ROWS,
     IMPOSSIBLE,
@@ -149,7 +150,7 @@ def _decided(recording: Recording) -> tuple[list[Candidate], Candidate]:
     if swapped is not None:
         tried.append(best := swapped)
     fit = _by_joints(best)
-    if fit is not None and fit.score <= CLOSING_SCORE:
+    if fit is not None and fit.closes:
         away_mm, away_deg = pose_difference(HALF_TURN, fit.x)
         if away_mm < _NEAR_MM and away_deg < _NEAR_DEG:
             best = replace(best, hypothesis=HALF_TURNED.of(best.hypothesis), labels=())
@@ -179,18 +180,12 @@ def _with_likeliest_label(best: Candidate) -> Candidate:
         return best
     tried = fitted(best.recording, labels, thinned(best.recording.common_rows), STARTS)
     likely = [_plausibility(item) for item in tried]
-    chosen = tried[int(np.argmax(likely))]
-    as_likely = (
-        item.differences
-        for item, odds in zip(tried, likely, strict=True)
-        if item.hypothesis.mount != chosen.hypothesis.mount and odds > max(likely) - _CLEAR
-    )
-    return replace(chosen, labels=labels, other_mount=next(as_likely, ()))
+    return replace(tried[int(np.argmax(likely))], labels=labels)
 
 
 def _plausibility(candidate: Candidate) -> float:
     """Log odds of the cell that a reading gives, beside readings that close the chain alike."""
-    if not candidate.is_readable:
+    if not candidate.fit.is_readable:
         return -np.inf
     camera = candidate.hypothesis.camera.poses(candidate.recording.camera.rows(candidate.of_rows))
     in_front = IMPOSSIBLE * bool(np.median(camera[:, 2, 3]) > 0.0)
@@ -225,7 +220,7 @@ def _by_joints(candidate: Candidate) -> Fit | None:
 def _exchanged(best: Candidate) -> Candidate | None:
     """The reading with two rows exchanged that explains two outlier views; None if unclear."""
     recording, rows = best.recording, best.recording.common_rows
-    if not best.is_readable or (len(rows) <= _MOST_OUTLIERS and _is_poor(best)):
+    if not best.fit.is_readable or (len(rows) <= _MOST_OUTLIERS and _is_poor(best)):
         return None
     robot, camera = (side[0] for side in chains(recording, [best.hypothesis], rows))
     residuals = distances(robot, camera, best.fit.lever, (best.fit.x, best.fit.z)).residuals
@@ -239,7 +234,7 @@ def _exchanged(best: Candidate) -> Candidate | None:
     looked = np.union1d(thinned(rows), rows[farthest])
     readings = [best.hypothesis, *(swap.of(best.hypothesis) for swap in swaps)]
     before, *tried = fitted(recording, readings, looked, 0)
-    if len(tried) < 2 or before.agreeing == before.rows:
+    if len(tried) < 2 or before.fit.agreeing == before.rows:
         return None
     found, second = sorted(tried, key=lambda item: -item.log_posterior)[:2]
     if _is_poor(before):
@@ -269,7 +264,7 @@ def _are_same(best: Candidate, rival: Candidate) -> bool:
 
 def _is_poor(best: Candidate) -> bool:
     """Whether the camera turns about one axis at most."""
-    if not best.is_readable:
+    if not best.fit.is_readable:
         return False
     kept = best.recording.camera.rows(best.of_rows[best.fit.kept])
     return is_about_one_axis(best.hypothesis.camera.poses(kept)[:, :3, :3])
@@ -286,7 +281,7 @@ def _check_mount(likelier: Candidate, other: Candidate) -> None:
     """Refuses a choice between two mounts that fit alike."""
     first, second = likelier.hypothesis.mount, other.hypothesis.mount
     is_clear = _beside_other_mount(likelier) > _beside_other_mount(other) + _CLEAR
-    if first == second or not likelier.closes or (is_clear and not _is_poor(likelier)):
+    if first == second or not likelier.fit.closes or (is_clear and not _is_poor(likelier)):
         return
     pair = sorted((likelier, other), key=lambda item: MOUNTS.index(item.declared.mount))
     readings = " and ".join(f"{best.hypothesis.mount} ({best.words})" for best in pair)
@@ -301,8 +296,8 @@ def _guess(tried: list[Candidate], best: Candidate, *, is_mount_given: bool) -> 
     ranked = sorted(tried, key=lambda item: (item is not best, -item.log_posterior))[:_LISTED]
     if declared not in ranked:
         ranked[-1] = declared
-    notes = [*_notes(best, is_declared=best is declared)]
-    if not is_mount_given and best.closes:
+    notes = [*_notes(best)]
+    if not is_mount_given and best.fit.closes:
         on_flange_m, at_base_m = _flange_and_cell_m(best)
         notes.insert(
             0,
@@ -317,7 +312,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     """States the finding, with its figures."""
     if best is not declared:
         return _best_sentence(declared, best)
-    if not declared.is_readable:
+    if not declared.fit.is_readable:
         return (
             "As declared, the rotations of the robot or of the camera are none, and no other "
             "reading of the numbers stands out."
@@ -331,7 +326,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
             f"declared, {closes}{others and f'; {others}'}. Add views tilted about different axes."
         )
     is_beaten = any(rival.log_posterior > declared.log_posterior + _CLEAR for rival in rivals)
-    if not declared.closes or is_beaten:
+    if not declared.fit.closes or is_beaten:
         return (
             f"No reading that was tried stands out: as declared, {closes}"
             f"{others and f'; {others}'}."
@@ -341,47 +336,32 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
 
 def _best_sentence(declared: Candidate, best: Candidate) -> str:
     closes = f"With {best.words}, the chain closes to {_figures(best)}"
-    if not declared.is_readable:
-        return f"{closes}; as declared, the numbers are no rotations."
     if best.hypothesis.robot.half_turned:
         return (
             f"{closes}, and the poses are those of the joint angles; as declared, the chain closes "
             f"to {_figures(declared)}."
         )
     if best.hypothesis.swap and len(best.differences) == 1:
-        return f"{closes}; as declared, {declared.agreeing} of {declared.rows} views agree."
-    also = "; ".join(name for name in best.other_mount if name not in best.differences)
-    own = "; ".join(name for name in best.differences if name not in best.other_mount)
-    other = f"; {also} in place of {own} fits as well" if also else ""
-    return f"{closes} instead of {_figures(declared)}{other}."
+        return f"{closes}; as declared, {declared.fit.agreeing} of {declared.rows} views agree."
+    return f"{closes} instead of {_figures(declared)}."
 
 
 def _figures(candidate: Candidate) -> str:
-    agreeing, rows = candidate.agreeing, candidate.rows
-    return f"{candidate.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
+    agreeing, rows = candidate.fit.agreeing, candidate.rows
+    return f"{candidate.fit.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
 
 
-def _notes(best: Candidate, *, is_declared: bool) -> Iterator[str]:
+def _notes(best: Candidate) -> Iterator[str]:
     """States what residuals cannot show here."""
-    reading = best.hypothesis
-    others = _likelier_labels(best) if is_declared else best.labels
     # Other units for both sides only scale the cell.
-    also = " or with ".join(
-        "; ".join(other.changes)
-        for other in others
-        if other != reading and other.robot.unit == reading.robot.unit
-    )
-    if also and not is_declared:
+    reading, unit = best.hypothesis, best.hypothesis.robot.unit
+    labels = (label for label in best.labels if label != reading and label.robot.unit == unit)
+    if also := " or with ".join("; ".join(label.changes) for label in labels if reading.changes):
         yield (
             f"The views close the chain in the same way with {also}. It was chosen by what lies "
             "nearer to the flange, or by the joints."
         )
-    elif also and not _is_poor(best):
-        yield (
-            f"The views close the chain in the same way with {also}, which is likelier: as "
-            "declared, what sits on the flange is far from it, or the target behind the camera."
-        )
-    if reading.robot.signs == "mirror":
+    if reading.robot.mirrored:
         yield (
             "Mirrored images look the same, and are the usual cause: turn those back instead of "
             "changing poses that are right. Which axis is mirrored cannot be seen in the views: "
@@ -392,13 +372,3 @@ def _notes(best: Candidate, *, is_declared: bool) -> Iterator[str]:
             "A base turned about its z (base_link for base) does not show without joint angles "
             "and the robot's model."
         )
-
-
-def _likelier_labels(declared: Candidate) -> list[Hypothesis]:
-    """The simplest readings that close the chain as the declared one with a likelier cell."""
-    rows, limit = thinned(declared.recording.common_rows), _plausibility(declared) + _CLEAR
-    unit = declared.hypothesis.robot.unit
-    labels = [label for label in declared.labels if label.changes and label.robot.unit == unit]
-    tried = fitted(declared.recording, labels, rows, STARTS)
-    likelier = [item.hypothesis for item in tried if _plausibility(item) > limit]
-    return [label for label in likelier if label.cost == min(item.cost for item in likelier)]

@@ -13,7 +13,6 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fits
 from visioncal.calibration.guess.search import thinned
-from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
@@ -37,15 +36,11 @@ _EQUIVALENT, _RIVALS = 2.0, 1.5
 _SCREENED, _REFINED, _REFINED_SHARE = 16, 6, 0.6
 # The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its minimum.
 # Where most of it is gone as recorded, the zero is nearer than that. A shift of 180 degrees is left
-# out: it looks like an opposite sign of the joint before or behind it. The last: the finest step.
-_STEP_RAD, _NEAR_RAD, _FARTHEST_RAD, _FINEST_RAD = 0.25, 0.5, 2.75, 1e-6
+# out: it looks like an opposite sign of the joint before or behind it. From the fourth step on, a
+# zero that is right is seen; the last is the finest.
+_STEP_RAD, _NEAR_RAD, _FARTHEST_RAD, _CLEAR_RAD, _FINEST_RAD = 0.25, 0.5, 2.75, 0.02, 1e-6
 # Outliers have residuals beyond this many scores.
 _OUTLIER = 5.0
-# Joint 3 counted from the link before it, or from the horizontal: joint 2's share in it.
-_COUPLINGS = (
-    (1.0, "from the link before it", "Add q2_rad to"),
-    (-1.0, "from the horizontal", "Subtract q2_rad from"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,30 +71,18 @@ def declared_reading(robot: Robot) -> JointReading:
     return JointReading(robot, np.eye(robot.joint_count), np.zeros(robot.joint_count), cost=0.0)
 
 
-def unit_readings(robot: Robot) -> Iterator[JointReading]:
-    """The readings with angles in degrees, or in radians that were taken for degrees."""
-    revolute, declared = ~robot.chain.prismatic, declared_reading(robot)
+def joint_readings(robot: Robot) -> Iterator[JointReading]:
+    """All other readings but lost zeros."""
+    revolute = ~robot.chain.prismatic
     for factor, words, change in (
         (np.pi / 180.0, "in degrees", "pi / 180"),
         (180.0 / np.pi, "in radians that were taken for degrees", "180 / pi"),
     ):
-        yield replace(
-            declared,
-            mixing=np.diag(np.where(revolute, factor, 1.0)),
-            words=f"the angles {words}",
-            fix="Where the angles are recorded, multiply q1_rad to "
-            f"q{len(revolute)}_rad by {change}.",
-            cost=1.0,
-        )
-
-
-def joint_readings(robot: Robot) -> Iterator[JointReading]:
-    """All other readings but lost zeros: one mistake, then two."""
-    units, signs = [*unit_readings(robot)], [*_signs(robot)]
-    columns = [*_orders(robot), *signs]
-    yield from (*units, *columns, *_couplings(robot), *_models(robot))
-    yield from (_combined(unit, column) for unit in units for column in columns)
-    yield from (_combined(*pair) for pair in combinations(signs, 2))
+        columns = f"q1_rad to q{len(revolute)}_rad"
+        fix = f"Where the angles are recorded, multiply {columns} by {change}."
+        mixing = np.diag(np.where(revolute, factor, 1.0))
+        yield _entry(robot, mixing, f"the angles {words}", fix)
+    yield from (*_exchanges(robot), *_signs(robot), *_models(robot))
 
 
 def _entry(
@@ -108,29 +91,14 @@ def _entry(
     return JointReading(robot, mixing, np.zeros(len(mixing)), words, fix, tuple(columns))
 
 
-def _orders(robot: Robot) -> Iterator[JointReading]:
-    names = robot.joint_names
-    count = len(names)
-    # ROS's joint_states are sorted by the joints' names.
-    alphabetical = [sorted(names).index(name) for name in names]
-    for order, words in (
-        (alphabetical, "the order of the names' alphabet"),
-        ([*range(count)][::-1], "reverse order"),
-    ):
-        changed = [at for at in range(count) if order[at] != at]
-        if len(changed) > 2:
-            fix = "Put the columns into the order from the base to the flange."
-            mixing, what = np.eye(count)[order], f"the columns of the joints in {words}"
-            yield _entry(robot, mixing, what, fix, changed)
+def _exchanges(robot: Robot) -> Iterator[JointReading]:
+    count = robot.joint_count
     for pair in combinations(range(count), 2):
         order = [*range(count)]
         order[pair[0]], order[pair[1]] = pair[1], pair[0]
         both = " and ".join(f"q{at + 1}_rad" for at in pair)
-        words = f"the columns {both} exchanged"
-        if order == alphabetical:
-            words += ", as in ROS's joint_states, which sorts joints by their names"
-        fix = f"Exchange the headings {both} in views.csv."
-        yield _entry(robot, np.eye(count)[order], words, fix, pair)
+        fix = f"Exchange the headings {both} in views.csv (ROS's joint_states sort by name)."
+        yield _entry(robot, np.eye(count)[order], f"the columns {both} exchanged", fix, pair)
 
 
 def _signs(robot: Robot) -> Iterator[JointReading]:
@@ -138,16 +106,6 @@ def _signs(robot: Robot) -> Iterator[JointReading]:
         signs = np.where(np.arange(robot.joint_count) == at, -1.0, 1.0)
         fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
         yield _entry(robot, np.diag(signs), f"q{at + 1}_rad of the opposite sign", fix, [at])
-
-
-def _couplings(robot: Robot) -> Iterator[JointReading]:
-    """Joint 3 counted from the horizontal: palletisers and arms with a parallelogram do so."""
-    if robot.joint_count > 2:
-        for share, words, fix in _COUPLINGS:
-            mixing = np.eye(robot.joint_count)
-            mixing[2, 1] = share
-            what = f"q3_rad counted {words}, unlike the model"
-            yield _entry(robot, mixing, what, f"{fix} q3_rad.", [2])
 
 
 def _models(robot: Robot) -> Iterator[JointReading]:
@@ -161,17 +119,6 @@ def _models(robot: Robot) -> Iterator[JointReading]:
         if name != robot.name and model.joint_count == robot.joint_count:
             fix = f'In session.toml, write [robot] model = "{name}".'
             yield _entry(model, same, f"the arm a {name} and not a {robot.name}", fix)
-
-
-def _combined(first: JointReading, second: JointReading) -> JointReading:
-    return replace(
-        first,
-        mixing=first.mixing @ second.mixing,
-        words=f"{first.words} and {second.words}",
-        fix=f"{first.fix} {second.fix}",
-        columns=() if not first.columns else (*first.columns, *second.columns),
-        cost=first.cost + second.cost,
-    )
 
 
 def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
@@ -200,12 +147,6 @@ class FittedJoints:
     def score(self) -> float:
         """The fit's score, not below a least one."""
         return max(self.fit.score, _FLOOR)
-
-    @property
-    def figures(self) -> str:
-        """RMS residual of the kept rows, in words."""
-        shift, angle = self.fit.rms
-        return mm_and_deg(1e3 * shift, np.rad2deg(angle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +183,8 @@ class JointGuess:
         agree = int(np.sum(residuals <= _OUTLIER * self.best.score))
         rows = f" in {agree} of {len(residuals)} views" if agree < len(residuals) else ""
         return (
-            f"With {words}, they fit {what} to {self.best.figures}{rows}; as recorded, to "
-            f"{self.declared.figures}."
+            f"With {words}, they fit {what} to {self.best.fit.figures}{rows}; as recorded, to "
+            f"{self.declared.fit.figures}."
         )
 
     @property
@@ -273,8 +214,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
         few = thinned(rows, _SCREENED)
         start, *tried = _fitted([recorded, *joint_readings(robot)], q, poses, few)
         tried.sort(key=lambda item: item.score * (1.0 + item.reading.cost))
-        farthest = _NEAR_RAD if declared.score < _MODEL_DEVIATION else _FARTHEST_RAD
-        tried = [*tried[:_REFINED], *_with_zeros(robot, q, poses, few, farthest)]
+        tried = [*tried[:_REFINED], *_with_zeros(start, q, poses, few)]
         near = [item.reading for item in tried if item.score < _REFINED_SHARE * start.score]
         tried = _fitted(near, q, poses, rows, STARTS)
     least = min((item.score for item in tried), default=np.inf)
@@ -289,22 +229,22 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
 
 
 def _with_zeros(
-    robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray, farthest_rad: float
+    start: FittedJoints, q: FloatArray, poses: FloatArray, rows: IntArray
 ) -> list[FittedJoints]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
-    joints = np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1
-    grid = np.arange(-farthest_rad, farthest_rad + _STEP_RAD, _STEP_RAD)
-    zeros, step, best = np.zeros(len(joints)), _STEP_RAD, []
-    while len(joints) and step > _FINEST_RAD:
-        tried = [
-            _with_zero(robot, joint, zero + more)
-            for joint, zero in zip(joints.tolist(), zeros.tolist(), strict=True)
-            for more in grid.tolist()
-        ]
+    robot, step = start.reading.robot, _STEP_RAD
+    farthest = _NEAR_RAD if start.score < _MODEL_DEVIATION else _FARTHEST_RAD
+    grid = np.arange(-farthest, farthest + step, step)
+    zeros = dict.fromkeys((np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist(), 0.0)
+    best: list[FittedJoints] = []
+    while zeros and step > _FINEST_RAD:
+        tried = [_with_zero(robot, joint, zeros[joint] + more) for joint in zeros for more in grid]
         fits = _fitted(tried, q, poses, rows)
-        of_joints = [fits[at : at + len(grid)] for at in range(0, len(fits), len(grid))]
-        best = [min(fits, key=lambda item: item.fit.score) for fits in of_joints]
-        zeros = np.array([fit.reading.zeros.sum() for fit in best])
+        of_joints = (fits[at : at + len(grid)] for at in range(0, len(fits), len(grid)))
+        best = [min(of_joint, key=lambda item: item.fit.score) for of_joint in of_joints]
+        if step < _CLEAR_RAD:
+            best = [item for item in best if item.score < _REFINED_SHARE * start.score]
+        zeros = {item.reading.columns[0]: float(item.reading.zeros.sum()) for item in best}
         step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0
     return best
 

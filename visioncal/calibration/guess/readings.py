@@ -2,26 +2,20 @@
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
-from visioncal.core.number_format import figure
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mask, Mount
 
-# `mirror`: the whole frame is left-handed. A letter: that coordinate alone has the wrong sign.
-Signs: TypeAlias = Literal["", "mirror", "x", "y", "z"]
 MIRROR_WORDS = (
     "the images mirrored, or the robot's poses in a left-handed frame (one axis mirrored)"
 )
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Mirroring another axis is equivalent, up to half turns of both frames.
 _MIRROR = np.array([1.0, -1.0, 1.0])
-# The second triple of angles about three axes of the same rotation [deg]: the outer ones half a
-# turn farther on, the supplement of the middle one.
-_HALF_TURNED, _BEYOND = 180.0, np.array([-1.0, 1.0, -1.0])
 # Units of poses; micrometres are for instruments.
 _UNITS = ("m", "mm", "cm", "inch")
 # Euler angle orders that robot makers and libraries use, about moving and about fixed axes.
@@ -45,10 +39,6 @@ class Turns:
     # Where the recorded numbers came from misreading others: the form in which those were misread.
     # Writing the rotations in it gets them back, and they are read as `form`.
     written: str = ""
-    # Whether the middle angles so got back are replaced by those beyond 90 degrees: angles about
-    # three axes are written up to 90, those about two axes, as of a tool that points down, reach
-    # 180.
-    is_beyond: bool = False
 
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations; NaN where the numbers give none."""
@@ -59,7 +49,7 @@ class Turns:
         valid: Mask = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
         misread = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
         misread[valid] = ROTATION_FORMS[self.written].write(rotations[valid])
-        return read(_HALF_TURNED - misread * _BEYOND if self.is_beyond else misread)
+        return read(misread)
 
 
 @dataclass(frozen=True)
@@ -71,14 +61,8 @@ class SideReading:
     inverse: bool = False  # Whether the numbers give the inverse of the wanted pose.
     # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
-    signs: Signs = ""  # Which axis has the wrong sign.
+    mirrored: bool = False  # Whether the frame is left-handed.
     half_turned: bool = False  # Whether the base has to be turned by 180 degrees about its z.
-    scale: float = 1.0  # Further factor of distances, for a target of another size than stated.
-
-    @classmethod
-    def as_declared(cls, reading: Reading) -> "SideReading":
-        """The side as a declared reading has it."""
-        return cls(Turns(reading.rotation), reading.unit, reading.inverse)
 
     @property
     def reading(self) -> Reading | None:
@@ -88,18 +72,16 @@ class SideReading:
             form = "matrix" if form == "matrix-transposed" else "matrix-transposed"
         elif self.transposed:
             return None
-        if self.turns.written or self.signs or self.half_turned or self.scale != 1.0:
+        if self.turns.written or self.mirrored or self.half_turned:
             return None
         return Reading(form, self.unit, self.inverse)
 
     def poses(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
         rotations = self.turns.rotations(numbers)
-        positions = UNITS_M[self.unit] * self.scale * numbers.positions
-        if self.signs == "mirror":
+        positions = UNITS_M[self.unit] * numbers.positions
+        if self.mirrored:
             rotations, positions = rotations * np.outer(_MIRROR, _MIRROR), positions * _MIRROR
-        elif self.signs:
-            positions = positions * np.where(np.arange(3) == "xyz".index(self.signs), -1.0, 1.0)
         if self.transposed:
             rotations = np.swapaxes(rotations, 1, 2)
         poses = compose(rotations, positions)
@@ -190,10 +172,6 @@ class Hypothesis:
             rotations=np.where(has_row, ordered.rotations, np.nan),
         )
 
-    def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:
-        """The camera's numbers, corrected."""
-        return self.camera.corrected(camera)
-
 
 @dataclass(frozen=True)
 class Change:
@@ -227,7 +205,7 @@ class Change:
         """Whether both may be mistaken together."""
         if self.is_rewritten or other.is_rewritten:
             # Nobody rewrites angles and takes their frame for left-handed, too.
-            return {self.name, other.name}.isdisjoint(("transposed", "signs"))
+            return {self.name, other.name}.isdisjoint(("transposed", "mirrored"))
         return (self.part, self.name) != (other.part, other.name)
 
 
@@ -243,9 +221,7 @@ def changes(
     """
     robot, camera = declared.robot, declared.camera
     yield from _changes_of_side("robot", robot, () if rewritten is None else _misread(rewritten))
-    yield Change(MIRROR_WORDS, "robot", "signs", "mirror")
-    for axis in "xyz":
-        yield Change(f"the robot's positions with {axis} negated", "robot", "signs", axis)
+    yield Change(MIRROR_WORDS, "robot", "mirrored", True)
     if is_measured:
         for unit in _UNITS:
             if unit != camera.unit:
@@ -277,12 +253,6 @@ def _changes_of_side(
     yield Change(f"{whose} rotations transposed", part, "transposed", True)
 
 
-def of_another_size(scale: float) -> Change:
-    """A target of another size than stated."""
-    words = f"the target {figure(scale)} times as large as stated"
-    return Change(words, "camera", "scale", scale)
-
-
 def of_exchanged_rows(rows: tuple[int, int], places: Sequence[str]) -> Change:
     """Two rows of the robot that are exchanged."""
     first, second = (places[row] for row in rows)
@@ -310,8 +280,6 @@ def _misread(numbers: PoseNumbers) -> Iterator[Turns]:
     intrinsic = [name for name in angles if name.split("-")[1].isupper()]
     for written in intrinsic:
         yield from (Turns(name, written) for name in angles if name != written)
-        if not _is_about_two_axes(written):
-            yield from (Turns(name, written, True) for name in angles if _is_about_two_axes(name))
     rotations = form.read(numbers.rotations)
     turned = rotation_angle(rotations[np.isfinite(rotations).all(axis=(1, 2))])
     if turned.max(initial=0.0) > _RADIANS_AS_DEGREES_RAD:
@@ -320,11 +288,6 @@ def _misread(numbers: PoseNumbers) -> Iterator[Turns]:
     for written in intrinsic:
         yield from (Turns(name, written) for name in (*in_radians, "rotation-vector"))
     yield from (Turns(name, "rotation-vector-deg") for name in ("rotation-vector", *in_radians))
-
-
-def _is_about_two_axes(form: str) -> bool:
-    order = form.split("-")[1]
-    return order[0] == order[2]
 
 
 def _strangeness(turns: Turns) -> float:

@@ -7,24 +7,24 @@ angle is also the same for a pose and its inverse: inverses, and all that concer
 distinguished by the fits.
 """
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations
 
 import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, no_fit, robust_fits
 from visioncal.calibration.guess.readings import (
+    ROW_ORDERS,
     Change,
     Hypothesis,
     SideReading,
+    Turns,
     changes,
-    of_another_size,
 )
 from visioncal.core.conventions import UNITS_M, PoseNumbers
-from visioncal.core.number_format import figure
-from visioncal.core.transforms import compose, invert
+from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mount
 
 # With fewer views too many readings agree; more than the second add time and no certainty.
@@ -34,9 +34,6 @@ FEWEST_ROWS, _FITTED_ROWS = 4, 30
 EVIDENCE = 0.5
 # Log prior odds against a change of the declared reading, and against a cell that cannot be.
 _CHANGE, IMPOSSIBLE = 4.0, 20.0
-# A right reading closes the chain to this share of the distance, or angle [rad]: poses with 10 mm
-# and 1 degree of noise leave less, wrong readings ten times more.
-CLOSING_SCORE = 0.05
 # Plausible distances between camera and board [m].
 _BOARD_DISTANCE_M = (0.02, 30.0)
 # A stage hands on what is within this ratio of its best score, plus half a degree, which noisy
@@ -46,10 +43,6 @@ _RATIO, _SLACK_RAD, _TURNED, _WITH_OTHERS, _REFINED = 3.0, 5e-3, 100, 16, 12
 _PENALTY, _FLOOR, _SURE = 0.3, 1e-4, 0.01
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
 _PAIRS_SHARE = 0.35
-# Limits of a target's size relative to the stated one, as logarithms: up to a half more or less is
-# fitted elsewhere. Fewer views than the last number fit any size.
-_SMALLEST, _LARGEST, _FEWEST_SIZED = np.log(1.5), np.log(20.0), 5
-_LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +58,10 @@ class Recording:
     @cached_property
     def declared(self) -> Hypothesis:
         """The declared reading."""
-        readings = self.robot.reading, self.camera.reading
-        robot, camera = (SideReading.as_declared(reading) for reading in readings)
+        robot, camera = (
+            SideReading(Turns(side.reading.rotation), side.reading.unit, side.reading.inverse)
+            for side in (self.robot, self.camera)
+        )
         return Hypothesis(robot, camera, self.mount)
 
     @cached_property
@@ -94,8 +89,6 @@ class Candidate:
     of_rows: IntArray  # The camera's rows in the fit.
     # All readings that close the chain in the same way.
     labels: tuple[Hypothesis, ...] = field(default=(), repr=False)
-    # Differences of an equally good and likely reading with the other mount; empty without one.
-    other_mount: tuple[str, ...] = ()
 
     @property
     def declared(self) -> Hypothesis:
@@ -118,11 +111,6 @@ class Candidate:
         return len(self.of_rows)
 
     @property
-    def agreeing(self) -> int:
-        """Number of views that agree with each other."""
-        return self.fit.agreeing
-
-    @property
     def log_prior(self) -> float:
         """Log prior odds, by the changes that it implies."""
         impossible = IMPOSSIBLE * (not self.recording.is_likely(self.hypothesis))
@@ -139,45 +127,11 @@ class Candidate:
         return self.log_posterior - EVIDENCE * self.fit.unexplained
 
     @property
-    def score(self) -> float:
-        """Closing error without unit."""
-        return self.fit.score
-
-    @property
-    def closes(self) -> bool:
-        """Whether the chain closes as well as under a right reading."""
-        return self.score <= CLOSING_SCORE
-
-    @property
-    def is_readable(self) -> bool:
-        """Whether the numbers can be read as rotations at all."""
-        return bool(np.isfinite(self.score))
-
-    @property
-    def figures(self) -> str:
-        """The closing error, in words."""
-        if not self.is_readable:
-            return "no rotations"
-        shift_m, angle = self.fit.rms
-        is_long = 1e3 * shift_m > _LONG_MM
-        length = f"{_short(shift_m)} m" if is_long else f"{_short(1e3 * shift_m)} mm"
-        return f"{length} and {_short(float(np.rad2deg(angle)))} deg"
-
-    @property
     def board_scale(self) -> float:
         """Factor for the board's sizes, where images were measured; else 1."""
-        camera, unit = self.hypothesis.camera, self.declared.camera.unit
-        return camera.scale * UNITS_M[camera.unit] / UNITS_M[unit] if self.is_measured else 1.0
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether the camera's poses were measured from images."""
-        return self.recording.is_measured
-
-
-def _short(value: float) -> str:
-    """Formats two digits; whole numbers from a hundred on."""
-    return f"{value:.0f}" if value > _WHOLE_FROM else figure(value)
+        units = (side.camera.unit for side in (self.hypothesis, self.declared))
+        unit_m, declared_m = (UNITS_M[unit] for unit in units)
+        return unit_m / declared_m if self.recording.is_measured else 1.0
 
 
 def chains(
@@ -226,7 +180,7 @@ def fitted(
 def closes(recording: Recording) -> bool:
     """Whether the chain closes as declared; true with too few rows to show it."""
     rows = recording.common_rows
-    return len(rows) < FEWEST_ROWS or fitted(recording, [recording.declared], rows, 0)[0].closes
+    return len(rows) < FEWEST_ROWS or fitted(recording, [recording.declared], rows, 0)[0].fit.closes
 
 
 def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
@@ -244,22 +198,20 @@ def search(recording: Recording) -> list[Candidate]:
     """
     rows, declared = thinned(recording.common_rows), recording.declared
     for rewritten in (None, recording.robot.rows(rows)):
-        readings = sorted(_readings(recording, rows, rewritten), key=lambda reading: reading.cost)
         classes: dict[Hashable, tuple[Hypothesis, ...]] = {}
-        for reading in readings:
+        readings = _readings(recording, rows, rewritten)
+        for reading in sorted(readings, key=lambda reading: reading.cost):
             key = reading.chain_class, recording.is_likely(reading)
             classes[key] = (*classes.get(key, ()), reading)
         labels = {of_class[0]: of_class for of_class in classes.values()}
         screened = fitted(recording, labels, rows, 0)
-        least = min(item.score for item in screened)
+        least = min(item.fit.score for item in screened)
         if least < _SURE:
             break
     limit = _RATIO * least + _SLACK_RAD
-    near = [item for item in screened if item.score <= limit and item.hypothesis != declared]
-    near.sort(key=lambda item: (item.score + _FLOOR) * (1.0 + _PENALTY * item.hypothesis.cost))
-    singles = [reading for reading in readings if len(reading.changes) < 2]
+    near = [item for item in screened if item.fit.score <= limit and item.hypothesis != declared]
+    near.sort(key=lambda item: (item.fit.score + _FLOOR) * (1.0 + _PENALTY * item.hypothesis.cost))
     refined = [declared, *(item.hypothesis for item in near[:_REFINED])]
-    refined += _of_other_sizes(recording, singles, rows)
     return [
         replace(item, labels=labels.get(item.hypothesis, ()))
         for item in fitted(recording, refined, rows, STARTS)
@@ -271,7 +223,7 @@ def _readings(
 ) -> Iterator[Hypothesis]:
     """The declared reading, and those with one or two mistakes that turn as the camera does."""
     declared, is_measured = recording.declared, recording.is_measured
-    mismatch = _Mismatch(recording, rows)
+    mismatch = _mismatch(recording, rows)
     table = [*changes(declared, is_measured=is_measured, rewritten=rewritten)]
     of_rotations = [change for change in table if change.is_of_rotations]
     others = [change for change in table if not change.is_of_rotations]
@@ -280,7 +232,7 @@ def _readings(
     turned: dict[tuple[Change, ...], Hypothesis] = {(): declared}
     turned |= {(change,): change.of(declared) for change in of_rotations}
     turned.update(_pairs(declared, plain))
-    away = {made: mismatch.of(reading) for made, reading in turned.items()}
+    away = {made: mismatch(reading) for made, reading in turned.items()}
     limit = _RATIO * min(away.values()) + _SLACK_RAD
     near = [made for made in turned if made and away[made] <= limit]
     near.sort(key=lambda made: (away[made] + _FLOOR) * (1.0 + _PENALTY * turned[made].cost))
@@ -301,31 +253,28 @@ def _pairs(
             yield (first, second), second.of(first.of(declared))
 
 
-class _Mismatch:
-    """Differences between the angles by which robot and camera turn between two views."""
+def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], float]:
+    """Low quantile of the differences [rad] by which robot and camera turn under a reading."""
+    of_camera = recording.camera.rows(rows)
 
-    def __init__(self, recording: Recording, rows: IntArray) -> None:
-        self._recording, self._rows = recording, rows
-        self._camera_numbers = recording.camera.rows(rows)
-        self._angles: dict[Hashable, FloatArray] = {}
+    @cache
+    def by_robot(turns: Turns, order: str) -> FloatArray:
+        at = ROW_ORDERS[order](len(recording.robot))[rows]
+        rotations = turns.rotations(recording.robot.rows(np.maximum(at, 0)))
+        rotations[at < 0] = np.nan
+        return _relative_angles(rotations)
 
-    def of(self, reading: Hypothesis) -> float:
-        """Low quantile of the differences [rad]; infinite with too few to compare."""
-        robot = self._angles.get((reading.robot.turns, reading.order))
-        if robot is None:
-            rows = reading.rows(len(self._recording.robot))[self._rows]
-            numbers = self._recording.robot.rows(np.maximum(rows, 0))
-            rotations = reading.robot.turns.rotations(numbers)
-            rotations[rows < 0] = np.nan
-            robot = _relative_angles(rotations)
-            self._angles[reading.robot.turns, reading.order] = robot
-        camera = self._angles.get(reading.camera.turns)
-        if camera is None:
-            camera = _relative_angles(reading.camera.turns.rotations(self._camera_numbers))
-            self._angles[reading.camera.turns] = camera
-        difference = np.nan_to_num(np.abs(robot - camera), nan=np.inf)
+    @cache
+    def by_camera(turns: Turns) -> FloatArray:
+        return _relative_angles(turns.rotations(of_camera))
+
+    def mismatch(reading: Hypothesis) -> float:
+        robot = by_robot(reading.robot.turns, reading.order)
+        difference = np.nan_to_num(np.abs(robot - by_camera(reading.camera.turns)), nan=np.inf)
         rank = int(_PAIRS_SHARE * len(difference))
         return float(np.partition(difference, rank)[rank])
+
+    return mismatch
 
 
 def _relative_angles(rotations: FloatArray) -> FloatArray:
@@ -333,34 +282,3 @@ def _relative_angles(rotations: FloatArray) -> FloatArray:
     flat = rotations.reshape(-1, 9)
     traces = (flat @ flat.T)[np.triu_indices(len(flat), 1)]
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
-
-
-def _of_other_sizes(
-    recording: Recording, singles: Sequence[Hypothesis], rows: IntArray
-) -> Iterator[Hypothesis]:
-    """Readings with a target of the size that closes the chain, beside one other mistake."""
-    # `R_i t_X + s R_i R_X c_i - t_Z = -p_i`. Sizes near the stated one are fitted elsewhere; here,
-    # units would be mistaken for them.
-    declared = recording.declared
-    bases = [
-        base
-        for base in singles
-        if (base.robot.unit, base.camera.unit) == (declared.robot.unit, declared.camera.unit)
-        and not base.robot.signs
-    ]
-    robot, camera = chains(recording, bases, rows)
-    whole = np.isfinite(robot).all(axis=(1, 2, 3)) & np.isfinite(camera).all(axis=(1, 2, 3))
-    robot, camera, zero = robot[whole], camera[whole], np.zeros(3)
-    fits = robust_fits(compose(robot[..., :3, :3], zero), compose(camera[..., :3, :3], zero))
-    limit = _RATIO * min((fit.score for fit in fits), default=0.0) + _SLACK_RAD
-    for at, (base, fit) in enumerate(zip(np.flatnonzero(whole), fits, strict=True)):
-        kept, lever = fit.kept, float(np.median(np.linalg.norm(camera[at, :, :3, 3], axis=1)))
-        if fit.score > limit or len(kept) < _FEWEST_SIZED or not lever > 0.0:
-            continue
-        turn = robot[at, kept, :3, :3]
-        seen = turn @ fit.x[:3, :3] @ camera[at, kept, :3, 3, None] / lever
-        columns = np.concatenate([turn, seen, robot[at, kept, :3, 3:]], axis=2)
-        columns = (columns - columns.mean(axis=0)).reshape(-1, 5)
-        size = np.linalg.lstsq(columns[:, :4], -columns[:, 4], rcond=1e-3)[0][3] / lever
-        if size > 0.0 and _SMALLEST < abs(np.log(size)) < _LARGEST:
-            yield of_another_size(float(size)).of(bases[base])

@@ -182,7 +182,8 @@ def assess_fit(
         name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
     }
     steps = likely_steps(part, converged, errors, joint_offsets(solved.arms))
-    solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, steps))
+    if not observed.is_misread:
+        solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, steps))
     beside = covariance_from_other_sources(part, fit, solved.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     held_out = left_out(solved, is_misread=observed.is_misread)

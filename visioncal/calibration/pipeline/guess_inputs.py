@@ -51,12 +51,14 @@ def guess_from_camera_poses(
         joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
     if robot is None:
         poses = numbers_in(run.session, POSE)
-        robot = reported_or_joint_poses(robot_numbers(run) if run.clocks else poses, joint_poses)
+        robot = robot_numbers(run) if run.clocks else poses
+        if joint_poses is not None and not robot.present.any():
+            robot = PoseNumbers.of_poses(joint_poses, robot.places)
     is_measured, mount = bool(run.corners), run.session.mount if knows_mount else None
     choices = camera_pose_choices(run, robot) if camera is None else (camera,)
     for poses in choices:
         guess = guess_reading(robot, poses, mount, chain=joint_poses, is_measured=is_measured)
-        if not guess.stands_out and guess.declared.closes:
+        if not guess.stands_out and guess.declared.fit.closes:
             break
     return guess
 
@@ -82,15 +84,6 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
         if joints is not None and len(joints) == robot.joint_count:
             poses[at] = robot.base_from_flange(joints[None])[0]
     return poses if np.isfinite(poses).any() else None
-
-
-def reported_or_joint_poses(read: PoseNumbers, joint_poses: FloatArray | None) -> PoseNumbers:
-    """The robot's reported poses; those of its joints where none were reported."""
-    return (
-        read
-        if joint_poses is None or read.present.any()
-        else PoseNumbers.of_poses(joint_poses, read.places)
-    )
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.guess import Candidate
-from visioncal.calibration.guess.fit import distances, robust_fit
+from visioncal.calibration.guess.fit import CLOSING_SCORE, distances, robust_fit
 from visioncal.calibration.guess.readings import SHIFTS, Hypothesis, changes
 from visioncal.calibration.guess.search import (
-    CLOSING_SCORE,
     FEWEST_ROWS,
     Recording,
     chains,
@@ -18,11 +16,7 @@ from visioncal.calibration.guess.search import (
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_numbers,
-    camera_pose_choices,
-    chain_poses,
     guess_from_camera_poses,
-    numbers_in,
-    places_of,
     robot_numbers,
 )
 from visioncal.calibration.pipeline.run_state import RunState
@@ -33,7 +27,6 @@ from visioncal.calibration.stages.corner_numbers import (
     numbering_finding,
     share_from_behind,
 )
-from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.checks import is_scattered
 from visioncal.core.conventions import PoseNumbers
@@ -43,9 +36,7 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
-from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.columns import POSE
 
 _MISREAD = "misread_poses"
 # A robot that turns and moves by less did not move; a target that turns by at least the last did,
@@ -83,11 +74,6 @@ _UNPAIRED = Remedy(
     "views.csv of another run; and, where joint angles become poses, whether [robot] model in "
     "session.toml is this arm. Write into column image which file belongs to each row."
 )
-_BESIDE_JOINTS = Remedy(
-    "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete these "
-    "columns, and the poses are those of the joint angles.",
-    CALIBRATE,
-)
 
 
 def misread_pose_finding(run: RunState) -> Finding | None:
@@ -101,14 +87,13 @@ def misread_pose_finding(run: RunState) -> Finding | None:
         # Too little to guess from; the calibration's own error says so.
         return None
     if not guess.stands_out:
-        if guess.declared.closes:
+        if guess.declared.fit.closes:
             return None
-        contradicted = _poses_contradicting_joints(run, guess.declared)
-        return contradicted or _unrecorded(run, "positions") or _unpaired(run)
+        return _unrecorded(run, "positions") or _unpaired(run)
     best, step = guess.best, READ_AGAIN
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(run.session.views[row].number for row in swap)
-    if best.hypothesis.robot.signs == "mirror":
+    if best.hypothesis.robot.mirrored:
         step = _MIRRORED_CORNERS if session_is_mirrored(run.session) else _MIRRORED
     return Finding(_MISREAD, guess.sentence, step, exchanged)
 
@@ -156,19 +141,13 @@ def _changed_midway(run: RunState) -> Finding | None:
     # or a pose that was recorded twice, shifts all rows behind it.
     recording = _recording(run)
     rows = recording.common_rows
-    changed = None
-    if len(rows) >= _REFERENCE + _FEWEST:
-        changed = _changed_rows(recording, rows) or _changed_rows(recording, rows[::-1])
-    if changed is None:
+    if len(rows) < _REFERENCE + _FEWEST or (changed := _changed_rows(recording, rows)) is None:
         return None
     at, reading = changed
-    views = tuple(run.session.views[row].number for row in np.sort(at))
-    when, others = f"From view {views[0]} on", "before them"
-    if at[-1] < at[0]:
-        when, others = f"Up to view {views[-1]}", "behind them"
+    views = tuple(run.session.views[row].number for row in at)
     words = (
-        f"{when}, the robot's poses are not those of the others: with {reading.changes[0]}, these "
-        f"views fit the ones {others}, and as declared they do not."
+        f"From view {views[0]} on, the robot's poses are not those of the others: with "
+        f"{reading.changes[0]}, these views fit the ones before, and as declared they do not."
     )
     step = f"In rows {views[0]} to {views[-1]} of views.csv, "
     if shift := SHIFTS.get(reading.order, 0):
@@ -254,28 +233,6 @@ def _pairwise_angles(poses: FloatArray) -> FloatArray:
     return rotation_angle(invert(poses)[:, None] @ poses)
 
 
-def _poses_contradicting_joints(run: RunState, declared: Candidate) -> Finding | None:
-    """Finding that the reported poses are wrong where the joint angles fit the camera."""
-    session = run.session
-    if session.robot_document is None or not numbers_in(session, POSE).present.any():
-        return None
-    arm = Robot.from_document(session.robot_document)
-    chain, matched = chain_poses(session, arm), match_joints(session.views, arm)
-    # Where the reported poses are those of the joint angles, only rounding decides which chain
-    # closes, if the motion determines little.
-    if chain is None or (matched.joints_rad and not matched.contradicting):
-        return None
-    robot = PoseNumbers.of_poses(chain, places_of(session))
-    choices = camera_pose_choices(run, robot)
-    if not any(closes(_recording(run, robot, camera)) for camera in choices):
-        return None
-    words = (
-        f"The reported poses are wrong: with them the chain closes to {declared.figures} only, and "
-        "it closes with the joint angles and the robot's model."
-    )
-    return Finding(_MISREAD, words, _BESIDE_JOINTS)
-
-
 def misreadings(run: RunState) -> Iterator[Finding]:
     """Findings on misread poses, where chains do not close as declared; after the stage `pnp`."""
     if run.mount is None:
@@ -306,34 +263,30 @@ def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
 
     Each camera is tested with one target and one robot alone, those of most views first.
     """
-    mirrored: set[str] = set()
     is_first = True
     for robot in run.session.robots:
-        tried = set(mirrored)
         for pair in pairs_of(run, robot):
-            if pair.camera in tried or _closes_in_cell(run, robot, pair):
+            if _closes_in_cell(run, robot, pair):
                 continue
             # Exchanged names are tested first: that is cheaper, and unambiguous.
-            exchanged = exchanged_names(run) if is_first else None
-            if exchanged is not None:
+            if is_first and (exchanged := exchanged_names(run)) is not None:
                 yield exchanged
                 return
             is_first = False
-            tried.add(pair.camera)
             hint = _misread_in_pair(run, robot, pair)
             if hint is None:
                 continue
-            if hint.do in (_MIRRORED, _MIRRORED_CORNERS):
-                mirrored.add(pair.camera)
-                # The command that writes a copy takes one camera and one robot only.
-                words = COUNTED_BACKWARDS if hint.do == _MIRRORED_CORNERS else _MIRRORED.words
-                yield replace(hint, words=f"Camera {pair.camera}: {hint.words}", do=Remedy(words))
-                continue
-            step = (
-                f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
-                "quaternion x, y, z, w), and calibrate again."
-            )
-            yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Remedy(step))
+            # The command that writes a copy takes one camera and one robot only.
+            whose, step = f"Camera {pair.camera}", COUNTED_BACKWARDS
+            if hint.do == _MIRRORED:
+                step = _MIRRORED.words
+            elif hint.do != _MIRRORED_CORNERS:
+                whose = f"Robot {robot}"
+                step = (
+                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
+                    "quaternion x, y, z, w), and calibrate again."
+                )
+            yield replace(hint, words=f"{whose}: {hint.words}", do=Remedy(step))
             # All cameras would show the same.
             break
 
@@ -368,16 +321,10 @@ def _closes(run: RunState) -> bool:
     return closes(_recording(run))
 
 
-def _recording(
-    run: RunState, robot: PoseNumbers | None = None, camera: PoseNumbers | None = None
-) -> Recording:
-    """The poses of robot and camera, as declared where None, of the camera the best by image."""
-    return Recording(
-        robot or robot_numbers(run),
-        camera or camera_numbers(run),
-        run.session.mount,
-        is_measured=bool(run.corners),
-    )
+def _recording(run: RunState) -> Recording:
+    """The poses of robot and camera as declared, of the camera the best by each image."""
+    sides = robot_numbers(run), camera_numbers(run)
+    return Recording(*sides, run.session.mount, is_measured=bool(run.corners))
 
 
 def may_be_misread(run: RunState) -> bool:

@@ -127,7 +127,7 @@ def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
     except VisioncalError:
         # The candidate reading that is then tried reports the error.
         return np.inf
-    return declared.score if declared.closes else np.inf
+    return declared.fit.score if declared.fit.closes else np.inf
 
 
 def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
@@ -208,7 +208,7 @@ def reread(
     if robot.present.any():
         _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
     if camera.present.any():
-        corrected = pose_cells(reading.camera_numbers(camera), MEASURED_CAM_POSE)
+        corrected = pose_cells(reading.camera.corrected(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
     if candidate.differences:
         changes += (f"The poses are read otherwise than declared: {candidate.words}.",)
@@ -273,7 +273,7 @@ def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
 
 
 def _mirrors(candidate: Candidate) -> bool:
-    return candidate.hypothesis.robot.signs == "mirror"
+    return candidate.hypothesis.robot.mirrored
 
 
 def _not_mirrored(candidate: Candidate) -> DataError:
@@ -300,7 +300,7 @@ def _mirrored_back(
     )
     reading = candidate.hypothesis
     changes = tuple(change for change in reading.changes if change != MIRROR_WORDS)
-    reading = replace(reading, robot=replace(reading.robot, signs=""), changes=changes)
+    reading = replace(reading, robot=replace(reading.robot, mirrored=False), changes=changes)
     return replace(corners, px=px), (words,), replace(candidate, hypothesis=reading)
 
 
