@@ -7,10 +7,11 @@ several orders: then geometry does not determine the order.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import permutations
 from math import perm
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import apply
@@ -117,68 +118,43 @@ def find_numbering(
 
 def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
     """Candidate orders (k, n)."""
+    from scipy.optimize import linear_sum_assignment
+
     count, drawn = len(measured), len(nominal)
     if perm(drawn, count) <= _EXHAUSTIVE:
         return np.array(list(permutations(range(drawn), count)))
-    orders = []
-    free = np.arange(count)
-    for _ in range(_TRIANGLES):
-        if len(free) < 3:
-            break
-        triangle = free[_large_triangle(measured[free])]
+    orders, free = [], np.arange(count)
+    for _ in range(min(_TRIANGLES, count // 3)):
+        # The two farthest points, and the one farthest from their line.
+        points = measured[free]
+        first, second = np.unravel_index(cdist(points, points).argmax(), (len(free),) * 2)
+        along = points[second] - points[first]
+        third = np.linalg.norm(np.cross(points - points[first], along), axis=1).argmax()
+        triangle = free[[first, second, third]]
         free = np.setdiff1d(free, triangle)
         triples = _similar_triples(measured[triangle], nominal)
         placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
         # Lower bound of any order: every point's nearest one.
-        lower = [float(_squares(measured, value).min(axis=1).sum()) for value in placed]
-        nearest = np.argsort(lower, kind="stable")[:_PLACES]
-        orders += [_nearest(measured, nominal, value) for value in placed[nearest]]
+        lower = [cdist(measured, value, "sqeuclidean").min(axis=1).sum() for value in placed]
+        for value in placed[np.argsort(lower, kind="stable")[:_PLACES]]:
+            order = linear_sum_assignment(cdist(measured, value, "sqeuclidean"))[1]
+            # Realigned by all points, which is more accurate than by a triangle.
+            again = apply(align(measured, nominal[order]), nominal)
+            orders.append(linear_sum_assignment(cdist(measured, again, "sqeuclidean"))[1])
     return np.array(orders)
-
-
-def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> IntArray:
-    """Assigns each measured point a distinct drawn one, near the aligned drawing."""
-    from scipy.optimize import linear_sum_assignment
-
-    for _ in range(2):
-        order = linear_sum_assignment(_squares(measured, placed))[1]
-        # Realigned by all points, which is more accurate than by a triangle.
-        placed = apply(align(measured, nominal[order]), nominal)
-    return np.asarray(order)
-
-
-def _squares(measured: FloatArray, placed: FloatArray) -> FloatArray:
-    """Squared distances (n, m) between measured points and drawn ones."""
-    return np.asarray(np.sum((measured[:, None] - placed[None]) ** 2, axis=2))
-
-
-def _large_triangle(points: FloatArray) -> IntArray:
-    """Indices (3,) of the two farthest points, and of the one farthest from their line."""
-    pairs = np.array(list(combinations(range(len(points)), 2)))
-    sides = points[pairs[:, 1]] - points[pairs[:, 0]]
-    longest = int(np.argmax(np.sum(sides**2, axis=1)))
-    first, second = pairs[longest]
-    aside = np.linalg.norm(np.cross(points - points[first], sides[longest]), axis=1)
-    aside[[first, second]] = -1.0
-    return np.array([first, second, int(np.argmax(aside))])
 
 
 def _similar_triples(triangle: FloatArray, nominal: FloatArray) -> IntArray:
     """Ordered triples (k, 3) of drawn points whose sides are most like a triangle's."""
-    drawn = len(nominal)
-    distances = np.linalg.norm(nominal[:, None] - nominal[None], axis=2)
-    sides = [float(np.linalg.norm(triangle[i] - triangle[j])) for i, j in ((0, 1), (0, 2), (1, 2))]
-    pairs = np.array(list(permutations(range(drawn), 2)))
-    off = (distances[pairs[:, 0], pairs[:, 1]] - sides[0]) ** 2
+    distances, sides = cdist(nominal, nominal), cdist(triangle, triangle)
+    pairs = np.array(list(permutations(range(len(nominal)), 2)))
+    off = (distances[pairs[:, 0], pairs[:, 1]] - sides[0, 1]) ** 2
     keep = np.argsort(off, kind="stable")[:_PAIRS]
     pairs, off = pairs[keep], off[keep]
-    total = (
-        off[:, None]
-        + (distances[pairs[:, 0]] - sides[1]) ** 2
-        + (distances[pairs[:, 1]] - sides[2]) ** 2
-    )
-    rows = np.arange(len(pairs))
-    total[rows, pairs[:, 0]] = total[rows, pairs[:, 1]] = np.inf
+    total = off[:, None]
+    for end in (0, 1):
+        total = total + (distances[pairs[:, end]] - sides[end, 2]) ** 2
+    np.put_along_axis(total, pairs, np.inf, axis=1)
     chosen = np.argsort(total, axis=None, kind="stable")[:_TRIPLES]
     row, third = np.unravel_index(chosen[np.isfinite(total.ravel()[chosen])], total.shape)
     return np.column_stack([pairs[row], third])
