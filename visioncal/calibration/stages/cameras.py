@@ -15,7 +15,6 @@ from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_pose
 from visioncal.calibration.stages.repeats import listed, with_stop_means, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.finding_kinds import EMPTY_IMAGE
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
@@ -170,17 +169,9 @@ def estimate_lenses(seen: T) -> T:
                     _refuse_mirrored(seen, frame, fitted, np.inf)
                     raise
             lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
-            seen = seen.noting(fit.rejections, (_about(warning, of) for warning in fit.warnings))
+            seen = seen.noting(fit.rejections, (warning.of(of) for warning in fit.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
-
-
-def _about(warning: Finding, frame: str) -> Finding:
-    """A finding about a lens, naming the camera's frame where it is not empty."""
-    if frame and warning.kind == EMPTY_IMAGE and warning.do is not None:
-        # Each of several cameras has its own empty parts of the image.
-        warning = replace(warning, do=Remedy(f"{frame}: {warning.do.words}"))
-    return warning.of(frame)
 
 
 def locate_targets(seen: T) -> T:
@@ -269,7 +260,7 @@ def _refuse_mirrored(
     """Refuses corners that fit a pose only with left and right exchanged."""
     # Mirrored corners of a flat target fit a pose behind it, which the robot's motion reveals.
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
-    if look.resolution is None:
+    if look.resolution is None or not any(target.is_rig for target in targets):
         return
     last = look.resolution[0] - 1.0
     mirrored = {
@@ -282,19 +273,10 @@ def _refuse_mirrored(
         return
     if fit.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
         return
-    has_images = any(view.image for view in seen.session.views if view.number in corners)
-    step = (
-        "Turn the images back (a flip in the camera's driver, or a mirror before the lens), and "
-        "calibrate anew."
-        if has_images
-        else COUNTED_BACKWARDS
-    )
-    if any(target.is_rig for target in targets):
-        step += " Or one axis of the rig's table has the wrong sign."
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "
         f"{figure(fit.sigma_px)} px with left and right exchanged.",
-        next_step=step,
+        next_step=f"{COUNTED_BACKWARDS} Or one axis of the rig's table has the wrong sign.",
     )
 
 
