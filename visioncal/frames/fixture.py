@@ -1,9 +1,9 @@
 """Fixture frame from touches of a drawing's points, or of its origin, x axis and xy plane."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Generic, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGAIN, Finding, Remedy, Verdict
 from visioncal.estimation.group_outliers import GroupInliers
-from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
 from visioncal.estimation.pointfit import (
@@ -28,6 +27,7 @@ from visioncal.estimation.pointfit import (
     fit_points,
 )
 from visioncal.estimation.points import Placement
+from visioncal.estimation.procrustes import spreads
 from visioncal.frames.touches import (
     MeasuredPoints,
     NominalPoints,
@@ -122,7 +122,7 @@ class FitSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class PointsFit(Generic[State]):
+class PointsFit:
     """Fit of a tool or a fixture to n touches or other points."""
 
     source: str  # What the points were read from, for the record.
@@ -132,7 +132,7 @@ class PointsFit(Generic[State]):
     kinds: Sequence[str]  # (n,) kinds of the touches, or empty texts.
     # The frame in its parent, with the points' common errors in the covariance.
     edge: Edge
-    agreement: GroupInliers[State]  # The inliers.
+    agreement: GroupInliers[Placement]  # The inliers.
     causes: Sequence[str]  # (n,) probable cause if the point is an outlier.
     noise_m: float  # Noise of a touch per axis [m].
     # Directions of the largest sigma: of the offset, and of the rotation if it was measured.
@@ -316,12 +316,20 @@ def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Fi
         measured.scattered,
     )
     fit = fit_features(touches, setting.touch_noise_m)
-    fitted = _fitted(fit, touches, measured, [_CAUSE] * len(measured), setting)
-    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
-    more = tuple(_redundancy_findings(fitted, setting))
-    centroid, matrix = measured.points[fitted.agrees].mean(axis=0), fit.base_from_fixture
+    matrix = fit.base_from_fixture
+    centroid = measured.points[fit.agreement.mask].mean(axis=0)
     centre = np.asarray((centroid - matrix[:3, 3]) @ matrix[:3, :3])
-    return _fixture_frame(fitted, centre, f"{counts} touches", more, {}, setting)
+    fitted = _fitted(fit, touches, measured, [_CAUSE] * len(measured), centre, setting)
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
+    used = [kind for kind, ok in zip(kinds, fitted.agrees.tolist(), strict=True) if ok]
+    once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
+    more: tuple[Finding, ...] = ()
+    if once:
+        words = f"{' and '.join(once).capitalize()} {'was' if len(once) == 1 else 'were'} touched"
+        assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
+        remedy = Remedy("Touch each once more, elsewhere.")
+        more = (Finding("unchecked", f"{words} once only, which nothing checks.{assumed}", remedy),)
+    return fitted.frame(f"{counts} touches", more, _worst_details(fitted), setting)
 
 
 def _fitted(
@@ -329,11 +337,16 @@ def _fitted(
     pairs: PointPairs,
     measured: MeasuredPoints,
     causes: Sequence[str],
+    centre: FloatArray,
     setting: FitSettings,
-) -> PointsFit[Placement]:
-    """The fit with the points' common errors in its covariance; `causes` are as in `PointsFit`."""
+) -> PointsFit:
+    """The fit with the points' common errors in its covariance.
+
+    `causes` are as in `PointsFit`; its worst directions are those at the points' `centre` in the
+    fixture [m].
+    """
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
-    noise = np.hypot(noise_m, pairs.nominal_sigma_m)
+    covariance = measured.carried(fit.by_points, np.hypot(noise_m, pairs.nominal_sigma_m))
     thing = "Touch" if pairs.kinds else "Point"
     return PointsFit(
         measured.source,
@@ -345,53 +358,24 @@ def _fitted(
         [f"{thing} {label}" for label in pairs.labels],
         measured.places,
         pairs.kinds or ("",) * len(measured),
-        Edge(fit.base_from_fixture, measured.carried(fit.by_points, noise)),
+        Edge(fit.base_from_fixture, covariance),
         fit.agreement,
         causes,
         noise_m,
-        (),
+        worst_of(fit.base_from_fixture, covariance, "fixture", "base", centre),
     )
 
 
-def _fixture_frame(
-    fitted: PointsFit[Placement],
-    centre: FloatArray,
-    method: str,
-    more: Sequence[Finding],
-    details: Mapping[str, Any],
-    setting: FitSettings,
-) -> Frame:
-    """Builds the frame, with its worst directions at the points' `centre` in the fixture [m]."""
-    edge = fitted.edge
-    offset, rotation = worst_of(edge.matrix, edge.covariance, "fixture", "base", centre)
-    worst = {
-        "offset": offset.words,
-        "offset_sigma_mm": 1e3 * offset.sigma,
-        "rotation": rotation.words,
-        "rotation_sigma_deg": float(np.rad2deg(rotation.sigma)),
+def _worst_details(fitted: PointsFit) -> dict[str, Any]:
+    offset, rotation = fitted.worst
+    return {
+        "worst": {
+            "offset": offset.words,
+            "offset_sigma_mm": 1e3 * offset.sigma,
+            "rotation": rotation.words,
+            "rotation_sigma_deg": float(np.rad2deg(rotation.sigma)),
+        }
     }
-    fitted = replace(fitted, worst=(offset, rotation))
-    return fitted.frame(method, more, {"worst": worst, **details}, setting)
-
-
-def _redundancy_findings(fitted: PointsFit[Placement], setting: FitSettings) -> Iterator[Finding]:
-    used = [kind for kind, ok in zip(fitted.kinds, fitted.agrees.tolist(), strict=True) if ok]
-    once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
-    assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
-    if len(once) == len(FEATURE_KINDS):
-        yield Finding(
-            "unchecked",
-            f"Three touches leave nothing to check the fixture with.{assumed}",
-            Remedy("Touch each feature once more, elsewhere."),
-        )
-    elif once:
-        verb = "was" if len(once) == 1 else "were"
-        yield Finding(
-            "unchecked",
-            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks."
-            f"{assumed}",
-            Remedy("Touch again, elsewhere."),
-        )
 
 
 def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: FitSettings) -> Frame:
@@ -410,21 +394,23 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
         for at in fit.numbering.moved.tolist():
             other = points.drawn_labels[fit.numbering.assignment[at]]
             causes[points.labels[at]] = f"it is where {other} is drawn{RENAMED}"
-    fitted = _fitted(fit, pairs, measured, [causes[label] for label in pairs.labels], setting)
+    centre = np.asarray(pairs.nominal[fit.agreement.mask].mean(axis=0))
+    fitted = _fitted(
+        fit, pairs, measured, [causes[label] for label in pairs.labels], centre, setting
+    )
     count = len(set(pairs.labels))
     several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
     share = "" if used == count else f"{used} of "
     spare = {"spare_points": list(pairs.spare_labels)} if pairs.spare_labels else {}
-    return _fixture_frame(
-        fitted,
-        np.asarray(pairs.nominal[fitted.agrees].mean(axis=0)),
+    return fitted.frame(
         f"best fit of {several}{share}{count} points to {drawing.source}",
         tuple(_drawing_findings(fit, fitted, measured, pairs, used, setting)),
         {
             "scale": {"value": fit.scale.value, "sigma": fit.scale.sigma},
             "coplanar": not fit.hand_known,
             "equal_orders": fit.numbering.equally_good,
+            **_worst_details(fitted),
             **spare,
         },
         setting,
@@ -433,7 +419,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
 def _drawing_findings(
     fit: DrawingFit,
-    fitted: PointsFit[Placement],
+    fitted: PointsFit,
     measured: MeasuredPoints,
     pairs: PointPairs,
     used: int,
@@ -457,7 +443,21 @@ def _drawing_findings(
             is_fatal=deviation > _WARM * 10,
         )
     if not fit.hand_known:
-        yield from _mirror_findings(fitted, measured, pairs, setting.words.side)
+        normal = spreads(pairs.nominal[fitted.agrees])[1][2]
+        cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
+        # The side of the touches determines the handedness of points in the drawing's xy plane.
+        side = float(cosines.mean()) if abs(normal[2]) > _FLAT else 0.0
+        if side < -_ASIDE:
+            words = (
+                "and the fixture's z axis points away from the side that "
+                f"{setting.words.side}: a mirrored drawing looks like this."
+            )
+            yield _mirrored(words, "Check that z of the drawing points into the part.")
+        elif not side > _ASIDE:
+            yield _mirrored(
+                "and a mirrored drawing would fit them as well, turned to the other side.",
+                "Check to which side its axes point, or measure a point beside the plane.",
+            )
     if not fit.numbering.is_unique:
         yield Finding(
             "symmetric",
@@ -476,32 +476,5 @@ def _drawing_findings(
         )
 
 
-def _mirror_findings(
-    fitted: PointsFit[Placement],
-    measured: MeasuredPoints,
-    pairs: PointPairs,
-    seen_from: str,
-) -> Iterator[Finding]:
-    """Finding on coplanar points, unless the side of the touches determines their handedness."""
-    nominal = pairs.nominal[fitted.agrees]
-    normal = np.linalg.svd(nominal - nominal.mean(axis=0))[2][2]
-    cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
-    side = float(cosines.mean()) if abs(normal[2]) > _FLAT else 0.0
-    if side > _ASIDE:
-        return
-    if side < -_ASIDE:
-        yield Finding(
-            "mirrored",
-            "The points lie in one plane, and the fixture's z axis points away from the side that "
-            f"{seen_from}: a mirrored drawing looks like this.",
-            Remedy("Check that z of the drawing points into the part."),
-        )
-        return
-    yield Finding(
-        "mirrored",
-        "The points lie in one plane, and a mirrored drawing would fit them as well, turned to the "
-        "other side.",
-        Remedy(
-            "Check to which side the fixture's axes point, or measure a point beside the plane."
-        ),
-    )
+def _mirrored(words: str, step: str) -> Finding:
+    return Finding("mirrored", f"The points lie in one plane, {words}", Remedy(step))

@@ -1,6 +1,5 @@
 """Offset between the clocks of a camera and a robot: the result, and messages about it."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,7 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.motion import RobotMotion
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.number_format import figure, mm_and_deg, some_of
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Mask, Rejection
 from visioncal.core.verdict import GUESS, Finding, Remedy
 from visioncal.estimation.clock import ClockFit
@@ -153,35 +152,15 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
             f"{best.correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are not of "
             "the same motion, or it was too slow"
         )
-    if not fits or fits[0].sigma_s > LARGEST_SIGMA_S:
-        sigma_ms = 1e3 * fits[0].sigma_s if fits else np.inf
+    if not fits:
+        return "camera and robot move alike at no offset: are these the times of the images?"
+    if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
-            f"the motion is too even: it determines the offset to {figure(sigma_ms)} ms only "
-            f"({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
+            "the motion is too even: it determines the offset to "
+            f"{figure(1e3 * fits[0].sigma_s)} ms only ({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
         )
     several = " and ".join(f"{1e3 * fit.offset_s:+.0f}" for fit in fits)
     return f"the motion repeats itself: offsets of {several} ms explain it alike"
-
-
-def check_shared_stamps(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> None:
-    """Refuses views in motion most of which have the stamp of another view of the same board.
-
-    Raises:
-        DataError: More than half of the views do.
-    """
-    keys = [(view.stamp_s, poses[view.number].board) for view in views]
-    shared = {key: count for key, count in Counter(keys).items() if count > 1}
-    if 2 * sum(shared.values()) <= len(views):
-        return
-    worst = max(shared, key=lambda key: shared[key])
-    names = [str(view.number) for view, key in zip(views, keys, strict=True) if key == worst]
-    raise DataError(
-        f"{sum(shared.values())} of {len(views)} views have the same stamp_s as others: it is "
-        f"{worst[0]:.6f} s in views {some_of(names)}.",
-        culprits=["views.csv: stamp_s"],
-        next_step="Write the time at which each image was taken into stamp_s, in seconds with all "
-        "the digits that the camera gives.",
-    )
 
 
 def undetermined_error(

@@ -17,7 +17,6 @@ from visioncal.calibration.stages.clock_offset import (
     LEAST_CORRELATION,
     ClockedViews,
     ClockPair,
-    check_shared_stamps,
     motion_notes,
     offset_doubts,
     speed_words,
@@ -255,7 +254,6 @@ def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
             "taken at rest, where this does not count."
         )
         return _at_offset(sweep, clock, (), (note,))
-    check_shared_stamps(views, sweep.poses)
     if clock.stated_s is not None:
         words = (
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * offset_s:+.4g} ms, to "
