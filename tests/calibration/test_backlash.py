@@ -21,12 +21,12 @@ def worn():
 
 def test_play_is_told_and_is_no_stiffness(worn):
     assert worn.robot_arm.kinematics.level == "elastic"
-    plays = arm_found(worn).backlash
+    plays = arm_found(worn).sections.arm.backlash
     for play, true in zip(plays, PLAY, strict=True):
         assert play.is_sure
         # Six draws, at three and a half sigma.
         assert abs(play.deadband_rad - true) < 3.5 * play.sigma_rad
-    springs = arm_found(worn).springs.springs
+    springs = arm_found(worn).sections.elastic.joints
     for at in (1, 2):
         assert (
             abs(springs[at].compliance_rad_per_nm - 1.0 / COBOT[at])
@@ -47,7 +47,7 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     # Some write the side that the joints moved to; a dead-band is a width all the same.
     known = calibrated(reporting(cell, approach=way * cell.robot.approach))
     assert known.robot_arm.kinematics.level == "backlash"
-    told = [play.deadband_rad for play in arm_found(known).backlash]
+    told = [play.deadband_rad for play in arm_found(known).sections.arm.backlash]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
     # In the middle of its play the arm is the one that was stated.
     q = known.robot_arm.joints_rad
@@ -62,4 +62,4 @@ def test_an_arm_that_is_right_but_for_its_play(way):
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     known = calibrated(reporting(cell, approach=np.ones(len(cell.robot.approach))))
-    assert arm_found(known).backlash == ()
+    assert arm_found(known).sections.arm.backlash == ()

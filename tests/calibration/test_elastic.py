@@ -43,7 +43,7 @@ def test_a_sagging_arm_is_calibrated_all_over_its_workspace():
     assert error_m(cell, rigid, rigid.robot_arm.model) > 0.3 * before
     assert any("speak for more" in reason for reason in rigid.verdict.reasons)
     # The first axis is upright: no weight turns it.
-    assert arm_found(known).springs.rigid[0] == "shoulder_pan_joint"
+    assert arm_found(known).sections.elastic.not_determined[0] == "shoulder_pan_joint"
     assert any("taken for rigid" in reason for reason in known.verdict.reasons)
 
 
@@ -52,7 +52,7 @@ def test_springs_are_told_to_their_bound(carrying):
     # Some disagree with the arm as stated, which does not bend; they come back.
     assert len(known.used) == len(cell.corners)
     bound = compliance_bound(cell)
-    for at, spring in enumerate(arm_found(known).springs.springs[1:5], start=1):
+    for at, spring in enumerate(arm_found(known).sections.elastic.joints[1:5], start=1):
         assert spring.determined
         # The bound knows the sizes of all errors; the fit estimates them from forty stops.
         assert spring.sigma_rad_per_nm < 1.2 * bound[at]
@@ -109,11 +109,11 @@ def test_stops_are_planned_that_tell_springs():
 @pytest.mark.slow
 def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
-    factor = arm_found(known).springs.payload
+    factor = arm_found(known).sections.elastic.payload_factor
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
     light = tuple(replace(load, kg=load.kg / 2.0) for load in cell.robot.loads)
     wrong = calibrated(reporting(cell, loads=light))
-    assert arm_found(wrong).springs.payload.value > 1.3
+    assert arm_found(wrong).sections.elastic.payload_factor.value > 1.3
     assert any("Load and bend do not fit" in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status != "good"
 
@@ -139,7 +139,7 @@ def test_a_loaded_arm_read_by_a_tracker():
     """Loads of 10, 20 and 50 N on a shoulder of 1.4e6 and an elbow of 9e5 N m/rad."""
     shop, known = loaded(seed=2)
     for joint in (1, 2):
-        spring = arm_found(known).springs.springs[joint]
+        spring = arm_found(known).sections.elastic.joints[joint]
         assert abs(spring.compliance_rad_per_nm - COMPLIANCE[joint]) < 3.0 * spring.sigma_rad_per_nm
         assert spring.sigma_rad_per_nm < 0.1 * COMPLIANCE[joint]
     q = np.vstack([STRETCHED, shop.joints[::4]])

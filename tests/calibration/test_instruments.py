@@ -118,7 +118,7 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
     Three points have six values more than one, of their places.
     """
     shop = tracked(replace(options, **WRONG))
-    seen = arm_found(known_of(session_of(shop))).identifiability.counts
+    seen = arm_found(known_of(session_of(shop))).sections.arm.observability
     assert (seen.identifiable, seen.determined) == (rank, rank)
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))

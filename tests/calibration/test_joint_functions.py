@@ -125,7 +125,7 @@ def test_places_alone_tell_of_them():
 
 
 def test_where_it_carries_over_is_what_is_predicted_there(known):
-    found = arm_found(known).carries_over
+    found = arm_found(known).sections.arm.carries_over
     assert found.measured_mm == known.robot_arm.kinematics.result.chosen.held_out_mm
     # The wave's own noise and another session's share come on top of what is not known of the arm.
     squares = [found.session_mm**2, 1e6 * np.mean(sigmas_m(known) ** 2)]
@@ -143,7 +143,7 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
     near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
     shop = tracked(options, near)
     known = known_of(session_of(shop), level="kinematics")
-    found = arm_found(known).carries_over
+    found = arm_found(known).sections.arm.carries_over
     assert found.sigma_mm > 3.0 * found.measured_mm
     # One arm of errors that few values tell of: its error is within a factor of what is predicted.
     ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
@@ -151,7 +151,7 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
 
 
 def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
-    found = arm_found(known).functions
+    found = arm_found(known).sections.arm.functions
     assert [joint.joint for joint in found.joints] == list(known.robot.joint_names)
     angles = np.linspace(-np.pi, np.pi, 180, endpoint=False)
     nodes = np.linspace(0.0, 2 * np.pi, len(shop.true_arm.beyond), endpoint=False)

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.bound import workspace_bound_m
-from support.cells import arm_found, calibrated, error_of, known_of, reporting
+from support.cells import calibrated, error_of, known_of, reporting
 from support.marks import slow
 from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
 import visioncal
+from visioncal.calibration.pipeline.budget import middles_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.kinematics import select_errors
 from visioncal.core.errors import DataError
@@ -20,6 +21,14 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.workspace import postures
 from visioncal.simulation import simulate
+
+
+def place_sigmas_m(known):
+    """(k,) predicted sigmas of the place of what the arm carries, over its workspace [m]."""
+    answer, arm = known.assessment, known.robot_arm
+    middles = middles_of(known.cell_fit.cell)
+    data = arm.data(answer.problem, answer.fit, answer.covariance, middles)
+    return data.place_sigmas_m(postures(arm.model.robot))
 
 
 @pytest.mark.slow
@@ -88,7 +97,7 @@ def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     # three sigma; what was measured to a millionth is kept.
     assert 9 in known.cell_fit.linearised_corners.free
     assert known.cell_fit.linearised_corners.held.all()
-    sigma = float(np.sqrt(np.mean(arm_found(known).identifiability.sigmas_m ** 2)))
+    sigma = float(np.sqrt(np.mean(place_sigmas_m(known) ** 2)))
     assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
 
 
@@ -141,7 +150,7 @@ def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     # The bound takes the lens for exact; here nothing speaks against that.
     cell = simulate(replace(WRONG_LINKS, seed=7, mount=mount, target=sure))
     known = calibrated(cell)
-    sigma = float(np.sqrt(np.mean(arm_found(known).identifiability.sigmas_m ** 2)))
+    sigma = float(np.sqrt(np.mean(place_sigmas_m(known) ** 2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
     # The bound knows the size of each error; the fit estimates one size and the noise's levels from
     # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.

@@ -40,7 +40,9 @@ def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=bare)
     assert known.robot_arm.kinematics.level == "elastic"
-    assert all(spring.stiffness_nm_per_rad is None for spring in arm_found(known).springs.springs)
+    assert all(
+        spring.stiffness_nm_per_rad is None for spring in arm_found(known).sections.elastic.joints
+    )
     assert any("of which its model states nothing" in reason for reason in known.verdict.reasons)
     before = error_m(cell, calibrated(cell, joints=False), bare)
     assert error_m(cell, known, known.robot_arm.model) < 0.06 * before

@@ -73,7 +73,7 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         sigma = known.robot_arm.errors.sigma
         if not joints:
             (found,) = known.assessment.arms.values()
-            sigma = np.deg2rad(known.robot_arm.result(found, ()).arm_errors.sigma_deg)
+            sigma = np.deg2rad(found.sections.arm_errors.sigma_deg)
         assert 1e-4 < sigma < 3e-3
         told = known.notes if joints else [warning.words for warning in known.warnings]
         assert any(("was calibrated" if joints else "arm's posture") in name for name in told)

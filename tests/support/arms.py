@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.stages.arm_report import add_parameters
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
@@ -14,6 +15,7 @@ from visioncal.estimation.solve import (
     Solution,
     covariance_of,
 )
+from visioncal.results.arm import ArmLevel, ArmResult
 from visioncal.robot import Loads
 
 ERROR_RAD = 1e-3
@@ -65,3 +67,10 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
         np.zeros(3),
         np.arange(12),
     )
+
+
+def identified(data, convention=None):
+    """The arm's section with its parameters, and which stops to add; stops are views 0, 1 ..."""
+    level = ArmLevel(level="nominal", unknowns=0, rms_mm=0.0, held_out_mm=0.0, likelihood_ratio=0.0)
+    result = ArmResult(level="nominal", levels=(level,))
+    return add_parameters(result, data, range(len(data.stops)), convention)

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.arms import IdentifiedArm
+from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.reported_poses import RobotReport
@@ -37,7 +37,7 @@ def session_of(cell: SimulatedCell) -> Session:
     )
 
 
-def arm_found(known: RunState) -> IdentifiedArm:
+def arm_found(known: RunState) -> ArmReport:
     """What the stops determine of the only robot's arm."""
     return next(iter(known.assessment.arms.values()))
 

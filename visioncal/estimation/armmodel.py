@@ -1,7 +1,7 @@
 """Kinematic model of an arm whose errors are estimated, and its Jacobian."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,20 @@ _FEWEST_TWISTS, _BY_CHANCE = 6, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
+class JointFunctions:
+    """Estimated functions of an arm's n joints, by k harmonics from order 2 on."""
+
+    # (2 n k,) prior sizes of sine and cosine of each joint and order, relative to their block.
+    sizes: FloatArray
+    # (2 n k, r) Jacobian of these by the block's values: combinations that the observations
+    # determine. What it does not span keeps its prior.
+    directions: FloatArray
+    sigma_rad: float  # Their size [rad].
+    length_rad: float  # Their correlation length over the joint angle [rad].
+    gain: float  # Twice the gain in log-likelihood over the same arm without them.
+
+
+@dataclass(frozen=True, eq=False)
 class ArmModel:
     """A robot's nominal model and the current values of its errors."""
 
@@ -43,12 +57,7 @@ class ArmModel:
     yielding: Mask | None = None  # (n,) mask of the joints that bend; None for all.
     # Bending functions of unknown link masses; None where masses are known.
     functions: WeightFunctions | None = None
-    # (2 n k, r) Jacobian of sine and cosine of each joint and order from 2 on, by the values of
-    # `harmonics`.
-    harmonic_directions: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    # (2 n k,) prior sizes of these, relative to the size of their block; what `harmonic_directions`
-    # does not span keeps its prior.
-    harmonic_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
+    waves: JointFunctions | None = None  # Functions of the joints; None without any.
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -70,14 +79,23 @@ class ArmModel:
         greatest = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
         return replace(self, torque_nm=greatest or 1.0)
 
-    def with_errors(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
-        """Returns the arm with error blocks to be estimated, all zero."""
+    def with_errors(
+        self, errors: Mapping[str, ArmErrors], functions: JointFunctions | None = None
+    ) -> "ArmModel":
+        """Returns the arm with error blocks to be estimated, all zero.
+
+        `functions` are those of the joints, where `harmonics` is among the blocks.
+        """
         count = sum(error.basis.shape[2] for error in errors.values())
         first = next(iter(errors.values())).sigma
-        weights = {name: error.sigma / first for name, error in errors.items()}
         compliance = errors.get(COMPLIANCE)
-        yielding = None if compliance is None else np.any(compliance.basis, axis=(0, 1)) > 0
-        return replace(self, weights=weights, values=np.zeros(count), yielding=yielding)
+        return replace(
+            self,
+            weights={name: error.sigma / first for name, error in errors.items()},
+            values=np.zeros(count),
+            yielding=None if compliance is None else np.any(compliance.basis, axis=(0, 1)) > 0,
+            waves=functions,
+        )
 
     def moved(self, step: FloatArray) -> "ArmModel":
         """Returns the arm after a (p,) step of its values."""
@@ -118,7 +136,7 @@ class ArmModel:
         if name == WEIGHT:
             return 0 if self.functions is None else self.functions.size
         if name == HARMONICS:
-            return int(self.harmonic_directions.shape[1])
+            return 0 if self.waves is None else int(self.waves.directions.shape[1])
         return block_size(name, self.nominal.joint_count)
 
     @cached_property
@@ -142,9 +160,9 @@ class ArmModel:
     @property
     def harmonics(self) -> FloatArray | None:
         """(n, k, 2) harmonics of the joints' functions [rad]; None without any."""
-        if HARMONICS not in self.weights:
+        if self.waves is None:
             return None
-        waves = self.harmonic_directions @ self.values[self.columns_of(HARMONICS)]
+        waves = self.waves.directions @ self.values[self.columns_of(HARMONICS)]
         return np.asarray(self.weights[HARMONICS] * waves.reshape(self.nominal.joint_count, -1, 2))
 
     @property
@@ -159,12 +177,15 @@ class ArmModel:
 
         It is that for errors of unit size.
         """
-        if HARMONICS not in self.weights:
+        if self.waves is None:
             return np.zeros((len(q), 6, 6))
-        orders = len(self.harmonic_sizes) // (2 * self.nominal.joint_count)
-        jacobian = self.weights[HARMONICS] * self.robot.harmonic_jacobian(q, orders)
-        prior, known = jacobian * self.harmonic_sizes, jacobian @ self.harmonic_directions
+        jacobian = self.weights[HARMONICS] * self._wave_jacobian(q, self.waves)
+        prior, known = jacobian * self.waves.sizes, jacobian @ self.waves.directions
         return np.asarray(prior @ np.swapaxes(prior, 1, 2) - known @ np.swapaxes(known, 1, 2))
+
+    def _wave_jacobian(self, q: FloatArray, waves: JointFunctions) -> FloatArray:
+        orders = len(waves.sizes) // (2 * self.nominal.joint_count)
+        return self.robot.harmonic_jacobian(q, orders)
 
     def _joint_values(self, name: str) -> FloatArray:
         """Values (n,) of a block with one per joint; zeros where the arm lacks it."""
@@ -225,10 +246,8 @@ class ArmModel:
             # The last link's own twist acts on the flange, before what is mounted on it.
             jacobian[:, :, -6:] = adjoint(invert(self.flange_from_reported))
             return np.asarray(jacobian * units)
-        if name == HARMONICS:
-            orders = len(self.harmonic_directions) // (2 * self.nominal.joint_count)
-            jacobian = self.robot.harmonic_jacobian(bent, orders)
-            return np.asarray(jacobian @ self.harmonic_directions)
+        if name == HARMONICS and self.waves is not None:
+            return np.asarray(self._wave_jacobian(bent, self.waves) @ self.waves.directions)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
         return np.concatenate([functions[..., function] for function in _FUNCTIONS[name]], axis=2)

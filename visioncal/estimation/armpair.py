@@ -220,20 +220,23 @@ class ArmData:
         count, chain = model.nominal.joint_count, model.bare.chain
         turned = np.repeat(angles[:, None], count, axis=1)
         errors = chain.effective(turned) - chain.functions[:, 0] - chain.functions[:, 1] * turned
-        orders = len(model.harmonic_sizes) // (2 * count)
+        waves = model.waves
+        if waves is None:
+            return errors.T, np.zeros_like(errors.T)
+        orders = len(waves.sizes) // (2 * count)
         phases = np.arange(1, orders + 2) * angles[:, None]
-        waves = np.stack([np.sin(phases), np.cos(phases)], axis=2)
-        first = model.weights["eccentricity"] * waves[:, 0]
-        higher = model.weights[HARMONICS] * waves[:, 1:].reshape(len(angles), -1)
+        columns = np.stack([np.sin(phases), np.cos(phases)], axis=2)
+        higher = model.weights[HARMONICS] * columns[:, 1:].reshape(len(angles), -1)
         eccentric, harmonic = (model.columns_of(name) for name in ("eccentricity", HARMONICS))
         variances = np.zeros((count, len(angles)))
         for joint in range(count):
             rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
-            determined = higher @ model.harmonic_directions[rows]
+            determined = higher @ waves.directions[rows]
             jacobian = np.zeros((len(angles), len(model.values)))
             jacobian[:, harmonic] = determined
-            jacobian[:, [eccentric.start + joint, eccentric.start + count + joint]] = first
-            prior = np.sum((higher * model.harmonic_sizes[rows]) ** 2, axis=1)
+            first = [eccentric.start + joint, eccentric.start + count + joint]
+            jacobian[:, first] = model.weights["eccentricity"] * columns[:, 0]
+            prior = np.sum((higher * waves.sizes[rows]) ** 2, axis=1)
             variances[joint] = np.einsum("kp,pq,kq->k", jacobian, self.arm_covariance, jacobian)
             variances[joint] += self.error_rad**2 * (prior - np.sum(determined**2, axis=1))
         return errors.T, np.sqrt(np.maximum(variances, 0.0))

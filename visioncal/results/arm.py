@@ -11,7 +11,6 @@ from visioncal.core.choices import Convention
 from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
 from visioncal.core.number_format import figure, listed, percent
 from visioncal.core.types import FloatArray
-from visioncal.estimation.bending import Factor
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel
@@ -303,6 +302,19 @@ class JointSpring:
     stiffness_nm_per_rad: float | None = None  # Stiffness [N m/rad]; None where practically rigid.
     # Its standard deviation, to first order [N m/rad].
     stiffness_sigma_nm_per_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Factor with its standard deviation; it is 1 where the model is right."""
+
+    value: float
+    sigma: float
+
+    @property
+    def is_off(self) -> bool:
+        """Whether it differs from 1 by more than three standard deviations."""
+        return abs(self.value - 1.0) > _SURE * self.sigma
 
 
 @dataclass(frozen=True)

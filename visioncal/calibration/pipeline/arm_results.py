@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages import thermal
-from visioncal.calibration.stages.arms import IdentifiedArm, RobotArm
+from visioncal.calibration.stages.arm_report import ArmReport
+from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.random_effects import random_effect_rms
@@ -75,21 +76,29 @@ def covariance_from_other_sources(
         steps: Steps that the residuals show, likeliest first.
         is_fit: Whether it minimises the problem; a closed form is not biased by held values alone.
     """
-    parts: dict[str, FloatArray] = {}
+    parts, covariance = dict[str, FloatArray](), covariance_of(problem, fit)
     if len(problem.units[1]):
-        noise = replace(fit.noise, robots=_expected_levels(problem, fit, arms))
-        raised = covariance_of(problem, replace(fit, noise=noise))
-        parts["noise_level"] = raised - covariance_of(problem, fit)
+        levels = expected_levels(problem, fit.state, fit.noise)
+        # Where an arm has errors that are not estimated, the noise is what remains beside them, not
+        # the expected level of a fit without them.
+        beside = [
+            problem.robots.index(robot)
+            for robot, arm in arms.items()
+            if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated
+        ]
+        levels[beside] = fit.noise.robots[beside]
+        raised = replace(fit, noise=replace(fit.noise, robots=levels))
+        parts["noise_level"] = covariance_of(problem, raised) - covariance
     shift = held_shift(problem, fit) * float(is_fit)
     if shift.any():
         parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
+        suffix = f" of robot {robot}" if len(arms) > 1 else ""
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
-            parts[f"arm{_source_suffix(arms, robot)}"] = errors
+            parts[f"arm{suffix}"] = errors
         elif arm.errors is not None:
-            covariance = covariance_of(problem, fit)
-            parts[f"size of arm errors{_source_suffix(arms, robot)}"] = covariance_of_size(
+            parts[f"size of arm errors{suffix}"] = covariance_of_size(
                 problem, covariance, robot, arm.errors
             )
     if steps and steps[0].kind != DRIFT:
@@ -97,27 +106,10 @@ def covariance_from_other_sources(
     return parts
 
 
-def _expected_levels(problem: Problem, fit: Solution, arms: Mapping[str, RobotArm]) -> FloatArray:
-    """Expected noise levels of the robots."""
-    levels = expected_levels(problem, fit.state, fit.noise)
-    for robot, arm in arms.items():
-        # Where an arm has errors that are not estimated, the noise is what remains beside them, not
-        # the expected level of a fit without them.
-        if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated:
-            at = problem.robots.index(robot)
-            levels[at] = fit.noise.robots[at]
-    return levels
-
-
-def _source_suffix(arms: Mapping[str, RobotArm], robot: str) -> str:
-    """Suffix with the robot's name for a source of uncertainty; empty for a single robot."""
-    return "" if len(arms) == 1 else f" of robot {robot}"
-
-
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
     steps: tuple[Step, ...],
-    results: Mapping[str, IdentifiedArm],
+    results: Mapping[str, ArmReport],
     level: str,
     cell: Cell,
 ) -> Iterator[Finding]:
@@ -129,7 +121,7 @@ def doubts_of_arms(
         return words if len(arms) == 1 else f"{words} of robot {slip.of}"
 
     for robot, arm in arms.items():
-        for finding in (*_findings_on(arm, level), *results[robot].doubts()):
+        for finding in (*_findings_on(arm, level), *results[robot].doubts):
             yield finding.of(_robot_name(arms, robot))
     for found in step_finding(steps, cell, joint):
         aside = [arm.heat.set_aside for arm in arms.values() if arm.heat and arm.heat.set_aside]
@@ -140,14 +132,12 @@ def doubts_of_arms(
             yield found
 
 
-def notes_on_arms(
-    arms: Mapping[str, RobotArm], results: Mapping[str, IdentifiedArm]
-) -> Iterator[str]:
+def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmReport]) -> Iterator[str]:
     """Notes on the arms that are no reason for doubt."""
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         levels = () if arm.kinematics is None else findings(arm.kinematics)
-        for remark in remarks((*drifts, *levels, *results[robot].notes()), NOTE):
+        for remark in remarks((*drifts, *levels, *results[robot].notes), NOTE):
             yield remark.of(_robot_name(arms, robot)).words
 
 

@@ -25,7 +25,7 @@ from visioncal.calibration.pipeline.fault_messages import (
 )
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
-from visioncal.calibration.stages.arms import IdentifiedArm
+from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
@@ -67,7 +67,7 @@ class FitAssessment:
     covariance_by_source: Mapping[str, FloatArray]
     lenses: Mapping[str, LensErrors]  # Lens errors beyond the camera models, by camera.
     steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
-    arms: Mapping[str, IdentifiedArm]  # Results on the arms, by robot.
+    arms: Mapping[str, ArmReport]  # What was found of the arms, by robot.
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
     faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.
@@ -188,6 +188,8 @@ def assess_fit(
     covariance = sum(beside.values(), covariance_of(part, fit))
     held_out = left_out(solved, is_misread=observed.is_misread)
     faults, middles = pose_faults(solved), middles_of(solved.cell)
+    # The first view of each stop.
+    first = {row.station: row.view for row in reversed(solved.cell.rows)}
     return FitAssessment(
         solved,
         part,
@@ -196,7 +198,7 @@ def assess_fit(
         lens_errors(solved),
         steps,
         {
-            name: arm.identified(part, fit, covariance, middles, convention)
+            name: arm.report(part, fit, covariance, middles, first, convention)
             for name, arm in solved.arms.items()
         },
         held_out,

@@ -231,7 +231,8 @@ def _absorbing(run: RunState) -> Iterator[str]:
     """
     answer, cell = run.assessment, run.cell_fit.cell
     for robot, base in cell.tree.bases.items():
-        if answer.arms[robot].identifiability is None:
+        found = answer.arms[robot].sections.arm
+        if found is None or found.workspace_sigma_mm is None:
             continue
         bodies = {cell.tree.flanges[robot]}
         # Static frames are placed from the reference, and rotate with the zero of its arm.
@@ -329,11 +330,12 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
-        numbers, arm = answer.arms[robot].identifiability, solved.arms[robot]
+        arm, found = solved.arms[robot], answer.arms[robot].sections.arm
+        accuracy = None if found is None else found.workspace_sigma_mm
         judged = JudgedArm(
             len(stops_of(problem, robot)),
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
-            workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
+            workspace_mm=None if accuracy is None else accuracy.median,
             modelled=robot in modelled,
             by_functions=arm.function_gain > 0.0,
             can_tilt=arm.can_tilt,

@@ -8,7 +8,6 @@ from visioncal.calibration.stages.cell import pair_edges
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
 from visioncal.calibration.stages.image_checks import pairing
 from visioncal.calibration.stages.kinematics import check_level_is_possible
-from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
 from visioncal.calibration.stages.readings import (
@@ -17,7 +16,12 @@ from visioncal.calibration.stages.readings import (
     read_instrument,
     read_instruments,
 )
-from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
+from visioncal.calibration.stages.robots import (
+    check_joints,
+    check_loads,
+    check_read_joints,
+    read_robots,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.verdict import Finding, Remedy
@@ -113,7 +117,7 @@ def _reported(run: RunState) -> RunState:
         )
     views = tuple(run.base_from_flange)
     declared = {view.number: view.stop for view in session.views}
-    check_stops(run.loads(views), views, [declared[view] for view in views])
+    check_loads(run.loads(views), views, [declared[view] for view in views])
     return run
 
 

@@ -25,7 +25,7 @@ from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
-from visioncal.estimation.arm import misfit_jacobian, stops_of
+from visioncal.estimation.arm import misfit_jacobian
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import State
@@ -40,7 +40,6 @@ from visioncal.results import (
     Validation,
     ViewResult,
 )
-from visioncal.results.arm import ArmSections
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import (
     BoardResult,
@@ -141,7 +140,7 @@ def _sections_of_pair(
     """The sections of one camera and one robot, which have no names."""
     session, answer, readings, arm = run.session, run.assessment, run.readings, run.robot_arm
     solutions = compare_solvers(answer.problem, answer.state, session.mount, run.solver)
-    sections = _arm_sections(run, arm.robot)
+    sections = run.assessment.arms[arm.robot].sections
     if sections.arm is not None and arm.model is not None:
         views = held_back_by_arm(run.cell_fit, run, arm.robot)
         sections = replace(sections, arm=replace(sections.arm, holdout=views))
@@ -356,7 +355,7 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
         for name in session.robots
     }
     for name in solved.arms:
-        robots[name] = RobotResult(robots[name].model, **vars(_arm_sections(run, name)))
+        robots[name] = RobotResult(robots[name].model, **vars(run.assessment.arms[name].sections))
     return CellResult(
         reference=cell.reference,
         tree=kept | {frame: name.partition("_from_")[0] for frame, name in edges.items()},
@@ -378,16 +377,6 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
             noise_95=answer.noise_95,
         ),
     )
-
-
-def _arm_sections(run: RunState, robot: str) -> ArmSections:
-    """The result's sections on a robot's arm."""
-    solved, answer, first = run.cell_fit, run.assessment, dict[int, int]()
-    for row in solved.cell.rows:
-        first.setdefault(row.station, row.view)
-    stops = stops_of(answer.problem, robot)
-    views = [first[index] for index in stops.tolist()]
-    return solved.arms[robot].at(stops).result(answer.arms[robot], views)
 
 
 def _cameras(run: RunState) -> dict[str, CameraResult]:

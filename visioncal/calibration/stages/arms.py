@@ -6,24 +6,20 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages import elastic, thermal
-from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
-from visioncal.calibration.stages.arm_transfer import carries_over, functions_of
-from visioncal.calibration.stages.elastic import Elastic, plays_of, springs_of
+from visioncal.calibration.stages import thermal
+from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import (
     SelectedArmLevel,
     allows_functions,
     select_errors,
 )
-from visioncal.calibration.stages.loads import check_elastic, check_poses
 from visioncal.calibration.stages.reported_poses import move_to_arm
-from visioncal.calibration.stages.thermal import Heat, drift_result, find_drift, heating
-from visioncal.calibration.stages.thermal_fit import ThermalFit, ThermalStops
+from visioncal.calibration.stages.thermal import HeatedStops, ThermalFit, drift_result, find_drift
 from visioncal.core.choices import Convention
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import Finding
 from visioncal.estimation.arm import (
     LEVER_M,
     ArmErrors,
@@ -34,61 +30,21 @@ from visioncal.estimation.arm import (
     stops_of,
 )
 from visioncal.estimation.arm_sizes import most_orders
-from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
+from visioncal.estimation.armmodel import ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.robot_likelihood import (
-    RobotLikelihood,
-    robot_likelihood,
-)
+from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.solve import Solution
-from visioncal.results.arm import (
-    ArmErrorsResult,
-    ArmSections,
-    CarriesOver,
-    JointBacklash,
-    JointFunctions,
-    JointRange,
-    ThermalResult,
-)
+from visioncal.results.arm import ArmErrorsResult, ArmSections
 from visioncal.robot import Loads
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
 # Rounding of written poses and joints [m, rad].
 _ROUNDING = 1e-5
-
-
-@dataclass(frozen=True, eq=False)
-class IdentifiedArm:
-    """Identified properties of an arm."""
-
-    # Identifiability of its parameters; None for a nominal arm.
-    identifiability: ArmIdentifiability | None = None
-    springs: Elastic | None = None  # Joint compliances; None for a rigid arm.
-    # Backlash of the joints; empty where stops were not approached from both sides.
-    backlash: tuple[JointBacklash, ...] = ()
-    drift: ThermalResult | None = None  # Drift with temperature; None without one.
-    # Where the calibrated arm beats the nominal one; None for a nominal arm.
-    carries_over: CarriesOver | None = None
-    functions: JointFunctions | None = None  # Joint error functions; None without any.
-    measured: tuple[JointRange, ...] = ()  # Joint ranges of the stops.
-
-    def notes(self) -> Iterator[str]:
-        """Remarks that are no reason for doubt."""
-        if self.carries_over is not None:
-            yield self.carries_over.words
-        if self.identifiability is not None and self.identifiability.advice:
-            yield self.identifiability.advice
-        yield from elastic.play_remarks(self.backlash)
-        if self.springs is not None:
-            yield from elastic.remarks(self.springs)
-
-    def doubts(self) -> Iterator[Finding]:
-        """Findings against the arm."""
-        if self.springs is not None:
-            yield from elastic.doubts(self.springs)
+# Stops that differ by less are at one pose: a loaded arm may deflect by so much [m, rad].
+_SAME_M, _SAME_RAD = 0.02, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +59,7 @@ class RobotArm:
     loads: Loads  # Loads at these.
     # Model, matched with poses and joints; None where none is known.
     matched: MatchedJoints | None = None
-    heat: Heat | None = None  # Heat inputs; None where joints are not known.
+    heat: HeatedStops | None = None  # Heat inputs; None where joints are not known.
     # Thermal drift fit; None where it was not requested or is impossible.
     thermal: ThermalFit | None = None
     errors: ArmErrors | None = None  # Posture-dependent errors, where they are likely.
@@ -130,24 +86,18 @@ class RobotArm:
             matched: Model, matched with poses and joints; None where none is known.
             recorded: The session, and the robot's name there.
         """
-        joints = [] if matched is None else [matched.joints_rad.get(view.number) for view in views]
-        q = [joint for joint in joints if joint is not None]
-        has_joints, heat = 0 < len(q) == len(views), None
-        if has_joints:
+        known = {} if matched is None else matched.joints_rad
+        joints = [known[view.number] for view in views if view.number in known]
+        q, heat = None, None
+        if 0 < len(joints) == len(views):
+            q = np.array(joints)
             stamps_s = np.array([view.stamp_s for view in views], dtype=float)
             numbers = np.array([view.number for view in views])
-            heat = Heat(*recorded, len(q[0]), numbers, stamps_s)
-        return cls(
-            robot,
-            reported,
-            np.isfinite(reported[:, 0, 0]),
-            np.array(q) if has_joints else None,
-            loads_of(
-                [view.numbers for view in views], [view.text.get("approach", "") for view in views]
-            ),
-            matched,
-            heat,
-        )
+            heat = HeatedStops(*recorded, q, numbers, stamps_s)
+        sides = [view.text.get("approach", "") for view in views]
+        loads = loads_of([view.numbers for view in views], sides)
+        has_pose = np.isfinite(reported[:, 0, 0])
+        return cls(robot, reported, has_pose, q, loads, matched, heat)
 
     @property
     def is_modelled(self) -> bool:
@@ -183,16 +133,7 @@ class RobotArm:
     @property
     def drift(self) -> ThermalFit | None:
         """Significant drift with temperature; None without one."""
-        return None if self.thermal is None or not thermal.is_found(self.thermal) else self.thermal
-
-    @property
-    def warming(self) -> ThermalStops:
-        """Joints and times of the stops; a stop without a time counts as at the start."""
-        if self.joints_rad is None or self.heat is None or self.thermal is None:
-            raise RuntimeError("an arm drifts by its joints and what heats them")
-        start_s = self.thermal.inputs.stamps_s[0]
-        stamps_s = np.nan_to_num(self.heat.stamps_s, nan=start_s)
-        return ThermalStops(self.robot, np.flatnonzero(self.has_pose), self.joints_rad, stamps_s)
+        return self.thermal if self.thermal is not None and self.thermal.is_found else None
 
     def with_found_errors(self, errors: ArmErrors | None) -> Self:
         """The arm with errors found at some of its stops, none of them estimated yet."""
@@ -202,11 +143,11 @@ class RobotArm:
     @property
     def poses(self) -> FloatArray:
         """(s, 4, 4) poses of the flange, by the calibrated arm where there is one."""
-        poses = self.reported.copy()
+        poses, drift = self.reported.copy(), self.drift
         if self.model is not None and self.joints_rad is not None:
             poses[self.has_pose] = self.model.base_from_flange(self.joints_rad, self.loads)
-        if self.drift is not None:
-            poses[self.has_pose] = poses[self.has_pose] @ self.drift.motion(self.warming)
+        if drift is not None and self.heat is not None:
+            poses[self.has_pose] = poses[self.has_pose] @ drift.motion(self.heat)
         return poses
 
     def has_free_errors(self, *, freely: bool = False) -> bool:
@@ -216,8 +157,8 @@ class RobotArm:
     def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
         """Effects that move its flange at the stops: drift uncertainty and errors."""
         drift, found = self.drift, []
-        if drift is not None:
-            found.append(drift.effect(self.warming, len(self.has_pose)))
+        if drift is not None and self.heat is not None:
+            found.append(drift.effect(self.robot, self.heat, self.has_pose))
         if self.errors is not None and self.has_free_errors(freely=freely):
             values = None if self.model is None else self.model.values
             found.append(self.errors.effect(self.robot, values=values))
@@ -245,13 +186,16 @@ class RobotArm:
             DataError: The level requires the drift, and the session lacks its inputs.
             DegenerateError: The level requires the drift, and the temperature hardly changed.
         """
-        places = stops_of(problem, self.robot)
-        arm = self.at(places)
-        inputs = heating(arm.heat if self.is_modelled else None, asked)
-        if inputs is None or arm.heat is None or arm.joints_rad is None or self.matched is None:
+        heat = self.at(stops_of(problem, self.robot)).heat
+        if heat is None or self.matched is None:
+            if asked == thermal.LEVEL:
+                raise thermal.missing_error()
             return self
-        stops = ThermalStops(self.robot, places, arm.joints_rad, arm.heat.stamps_s)
-        return replace(self, thermal=find_drift(problem, start, stops, inputs, self.matched.arm))
+        inputs = heat.inputs(asked)
+        if inputs is None:
+            return self
+        drift = find_drift(problem, start, self.robot, heat, inputs, self.matched.arm)
+        return replace(self, thermal=drift)
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
         """Looks for posture-dependent errors, by the likelihood at the fit with the nominal arm."""
@@ -290,12 +234,12 @@ class RobotArm:
         covariance: FloatArray,
         middles: Mapping[str, FloatArray],
     ) -> ArmData | None:
-        """The observations of its errors; None for a nominal arm."""
+        """The observations of its errors; None for a nominal arm. See `report`."""
         columns = problem.effect_columns.get(f"arm of {self.robot}")
-        if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
+        stops = stops_of(problem, self.robot)
+        used, every = self.at(stops), np.arange(problem.size)
+        if self.model is None or self.errors is None or used.joints_rad is None or columns is None:
             return None
-        stops, every = stops_of(problem, self.robot), np.arange(problem.size)
-        rows = np.searchsorted(np.flatnonzero(self.has_pose), stops)
         pair = ArmPair.of(problem, fit.state, self.robot)
         # A single point shows no rotation; several points make a frame.
         shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
@@ -313,77 +257,46 @@ class RobotArm:
             every[columns],
             self.errors.sigma,
             stops,
-            self.joints_rad[rows],
-            self.loads.chosen(rows),
+            used.joints_rad,
+            used.loads,
             middles.get(pair.observed, np.zeros(3)),
             every[edges],
             measured=np.repeat([shows_pose, True], 3),
         )
 
-    def identified(
+    def report(
         self,
         problem: Problem,
         fit: Solution,
         covariance: FloatArray,
         middles: Mapping[str, FloatArray],
+        views: Mapping[int, int],
         convention: Convention | None = None,
-    ) -> IdentifiedArm:
-        """Identified properties of the arm.
+    ) -> ArmReport:
+        """What was found of the arm.
 
         Args:
             problem: The inlier observations, with the arm's errors among the unknowns.
             fit: Their fit.
             covariance: (p, p) its covariance.
             middles: (3,) centre of each printed target by its frame, in that frame [m].
-            convention: Convention of the arm's table; see `stages.arm_identifiability`.
+            views: The first view of each stop.
+            convention: Convention of the arm's table; see `arm_report.add_parameters`.
         """
-        drift = None
-        if self.drift is not None and self.heat is not None:
-            places = stops_of(problem, self.robot)
-            arm = self.at(places)
-            views = [] if arm.heat is None else arm.heat.views.tolist()
-            stops = replace(arm.warming, places=places)
-            drift = drift_result(self.drift, stops, views, problem, fit)
-        data = self.data(problem, fit, covariance, middles)
-        if data is None or self.kinematics is None:
-            return IdentifiedArm(drift=drift)
-        # With backlash and compliance alone the table stays nominal.
-        has_rigid_errors = data.model.weights.keys() & set(RIGID)
-        return IdentifiedArm(
-            identify_arm(data, convention) if has_rigid_errors else None,
-            springs_of(data, self.kinematics.errors),
-            plays_of(data.model, data.arm_covariance),
-            drift,
-            carries_over(data, self.kinematics) if has_rigid_errors else None,
-            functions_of(data, self.kinematics),
-            tuple(
-                JointRange(name, float(column.min()), float(column.max()))
-                for name, column in zip(data.model.nominal.joint_names, data.q.T, strict=True)
-            ),
-        )
-
-    def result(self, found: IdentifiedArm, views: Sequence[int]) -> ArmSections:
-        """The arm's sections of a calibration; `views` are those of the stops."""
-        sections = ArmSections(
-            arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
-            thermal=found.drift,
-            arm=None if self.kinematics is None else self.kinematics.result,
-        )
-        if sections.arm is None or self.kinematics is None or self.model is None:
-            return sections
-        arm = replace(
-            sections.arm,
-            robot=self.model.robot,
-            backlash=found.backlash,
-            functions=found.functions,
-            measured=found.measured,
-        )
-        if found.identifiability is not None:
+        stops, data = stops_of(problem, self.robot), self.data(problem, fit, covariance, middles)
+        seen = [views[stop] for stop in stops.tolist()]
+        heat, levels, found = self.at(stops).heat, self.kinematics, ArmReport()
+        sections = ArmSections(arm=None if levels is None else levels.result)
+        if data is not None and levels is not None:
             zero = None if self.matched is None else self.matched.zero
-            arm = found.identifiability.add_to(arm, self.model.nominal, views, zero)
-            arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries_over)
-        springs = None if found.springs is None else found.springs.result(views)
-        return replace(sections, arm=arm, elastic=springs)
+            found = report_of(data, levels, seen, convention, zero)
+            sections = found.sections
+        if self.errors is not None and self.errors.is_likely:
+            sections = replace(sections, arm_errors=_size_of(self.errors))
+        if self.drift is not None and heat is not None:
+            drift = drift_result(self.drift, self.robot, heat, problem, fit)
+            sections = replace(sections, thermal=drift)
+        return replace(found, sections=sections)
 
     @property
     def basis(self) -> FloatArray:
@@ -403,7 +316,8 @@ class RobotArm:
         if self.matched is None or self.joints_rad is None:
             return None
         nominal = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.has_pose])
-        return self._block_jacobian(self.model or nominal, "offsets")
+        model = self.model or nominal
+        return self._by_stop(model.columns("offsets", self.joints_rad, self.loads))
 
     def with_level(
         self,
@@ -427,19 +341,18 @@ class RobotArm:
                 none are significant, the arm stays as it is.
         """
         used = self.at(stops_of(problem, self.robot))
-        q, loads = used.joints_rad, used.loads
-        if self.matched is None or self.joints_rad is None or q is None or not len(q):
+        q, every = used.joints_rad, self.joints_rad
+        if self.matched is None or q is None or every is None or not len(q):
             return self
         if functions and not allows_functions(asked, len(q)):
             return self
-        model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, loads)
-        blocks = blocks_of(model.nominal, self.loads)
-        bases = {name: self._block_jacobian(model, name) for name in blocks}
-        harmonics = None
-        if functions:
-            jacobian = model.robot.harmonic_jacobian(self.joints_rad, most_orders())
-            columns = self._by_stop(jacobian.reshape(len(jacobian), 6, -1))
-            harmonics = columns.reshape(len(columns), 6, model.nominal.joint_count, -1, 2)
+        model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, used.loads)
+        bases = {
+            name: self._by_stop(model.columns(name, every, self.loads))
+            for name in blocks_of(model.nominal, self.loads)
+        }
+        harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
+        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         kinematics = select_errors(
             problem,
             start,
@@ -448,20 +361,15 @@ class RobotArm:
             model.torque_nm,
             asked,
             noise,
-            harmonics,
+            None if harmonics is None else self._by_stop(harmonics),
             self.with_nominal_zero(problem),
+            tuple(views[index] for index in mine),
         )
         if kinematics is None:
             return self
-        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
-        arm_views = tuple(views[index] for index in mine)
-        arm = replace(self, kinematics=replace(kinematics, views=arm_views))
+        arm = replace(self, kinematics=kinematics)
         if kinematics.errors:
-            if (found := kinematics.functions) is not None:
-                model = replace(
-                    model, harmonic_directions=found.directions, harmonic_sizes=found.sizes
-                )
-            return arm._with_model(model.with_errors(kinematics.errors))
+            return arm._with_model(model.with_errors(kinematics.errors, kinematics.functions))
         if self.model is None:
             return arm
         # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
@@ -469,23 +377,15 @@ class RobotArm:
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
-    def _block_jacobian(self, model: ArmModel, name: str) -> FloatArray:
-        """Jacobian (s, 6, p) of the flange by the errors of a block."""
-        if self.joints_rad is None:
-            raise RuntimeError("an arm is calibrated by its joints")
-        return self._by_stop(model.columns(name, self.joints_rad, self.loads))
-
     def relinearised(self, problem: Problem, state: State) -> tuple[Self, float]:
         """Relinearises the calibrated arm at a fit.
 
         Returns:
             The arm, and the largest step of its errors [rad].
         """
-        if self.model is None:
-            return self, 0.0
         name = f"arm of {self.robot}"
         start = [effect.values for effect in problem.effects if effect.name == name]
-        if not start:
+        if self.model is None or not start:
             return self, 0.0
         step = problem.values_of(name, state) - start[0]
         return self._with_model(self.model.moved(step)), float(np.abs(step).max())
@@ -507,32 +407,33 @@ class RobotArm:
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """Size of the errors, as a section of a calibration."""
-    if errors.fit_sigmas is not None and errors.white is not None:
-        sigma_rad, sigma_m = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
-        result = ArmErrorsResult(
-            sigma_mm=1e3 * float(sigma_m),
-            sigma_deg=float(np.rad2deg(sigma_rad)),
+    units = np.array([np.rad2deg(1.0), 1e3])
+    if errors.fit_sigmas is None or errors.white is None:
+        deg, mm = (errors.sigma * units * [1.0, LEVER_M]).tolist()
+        return ArmErrorsResult(
+            sigma_mm=mm,
+            sigma_deg=deg,
             likelihood_ratio=errors.gain,
-            estimated=False,
-            of="flange",
+            estimated=errors.is_estimated,
         )
-        if errors.far_posture_errors is None:
-            return result
-        (deg, mm), (predicted_deg, predicted_mm) = (
-            errors.far_posture_errors * [np.rad2deg(1.0), 1e3]
-        ).tolist()
-        return replace(
-            result,
-            away_mm=mm,
-            away_deg=deg,
-            away_predicted_mm=predicted_mm,
-            away_predicted_deg=predicted_deg,
-        )
-    return ArmErrorsResult(
-        sigma_mm=1e3 * LEVER_M * errors.sigma,
-        sigma_deg=float(np.rad2deg(errors.sigma)),
+    sigmas = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
+    deg, mm = (sigmas * units).tolist()
+    result = ArmErrorsResult(
+        sigma_mm=mm,
+        sigma_deg=deg,
         likelihood_ratio=errors.gain,
-        estimated=errors.is_estimated,
+        estimated=False,
+        of="flange",
+    )
+    if errors.far_posture_errors is None:
+        return result
+    (deg, mm), (predicted_deg, predicted_mm) = (errors.far_posture_errors * units).tolist()
+    return replace(
+        result,
+        away_mm=mm,
+        away_deg=deg,
+        away_predicted_mm=predicted_mm,
+        away_predicted_deg=predicted_deg,
     )
 
 
@@ -550,5 +451,28 @@ def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
         DegenerateError: Loads change while an arm stands still.
     """
     for arm in arms.values():
-        check_poses(arm.loads, arm.reported[arm.has_pose])
-        check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)
+        kg, force_n = arm.loads.payload_kg, np.linalg.norm(arm.loads.force_n, axis=1)
+        poses, robot = arm.reported[arm.has_pose], arm.matched.robot if arm.matched else None
+        if len(poses) > 1 and (np.ptp(kg) > 0.0 or np.ptp(force_n) > 0.0):
+            shift, angle = distances(poses, poses[0])
+            if shift.max() <= _SAME_M and angle.max() <= _SAME_RAD:
+                by_mass = bool(np.ptp(kg))
+                changed = (
+                    f"{kg.min():g} to {kg.max():g} kg" if by_mass else f"0 to {force_n.max():g} N"
+                )
+                raise DegenerateError(
+                    f"the load changes ({changed}), and all {len(poses)} views are of one pose of "
+                    "the arm: where the frames are cannot be separated from how far the joints "
+                    "bend.",
+                    culprits=["payload_kg" if by_mass else "force_x_n"],
+                    next_step="Take the same loads to other poses, all over the workspace: ten or "
+                    "more.",
+                )
+        if asked == "elastic" and robot and robot.masses is None and not arm.loads.any:
+            raise DataError(
+                f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "
+                "not state the masses of its links, and no view has a payload_kg or a force.",
+                culprits=["level", robot.name],
+                next_step="Add mass_kg and com_m to each [[joint]] of its table, take its URDF, or "
+                "record payload_kg (with payload_x_m, payload_y_m, payload_z_m) with every view.",
+            )

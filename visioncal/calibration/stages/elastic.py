@@ -1,166 +1,178 @@
 """Joint stiffness and backlash by the stops, and the check of stated loads against deflections."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
-from visioncal.estimation.bending import (
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.normal_equations import normal_equations
+from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.solve import whitened
+from visioncal.results.arm import (
+    ElasticResult,
     Factor,
-    compliance_unit,
-    flange_bends,
-    observed_bends,
-    payload_factor,
+    JointBacklash,
+    JointSpring,
+    LoadedStop,
+    Sag,
 )
-from visioncal.results.arm import ElasticResult, JointBacklash, JointSpring, LoadedStop, Sag
 
-# A compliance is determined where its sigma is below this share of its prior sigma.
-_DETERMINED = 0.5
-# Least torque on a loaded joint [N m].
-_LOADED_NM = 0.05
-# Least compliance of a joint with a stiffness [sigma].
-_SURE = 2.0
+# A compliance is determined where its sigma is below this share of its prior sigma, on a joint with
+# this torque [N m]; a joint has a stiffness where its compliance is this many sigmas.
+_DETERMINED, _LOADED_NM, _SURE = 0.5, 0.05, 2.0
+# Least torque at which a stop determines a joint's bend, as a share of the greatest torque.
+_LEAST_SHARE = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Elastic:
-    """Compliances of an arm's joints, with the loads and deflections at the stops."""
+def elastic_of(
+    arm: ArmData, errors: Mapping[str, ArmErrors], views: Sequence[int]
+) -> ElasticResult | None:
+    """Estimated springs of an arm, with loads and deflections at its stops; None for a rigid one.
 
-    springs: tuple[JointSpring, ...]  # The springs, joint by joint.
-    torques_nm: FloatArray  # (m, n) torques on the joints at the stops [N m].
-    # (m, n) deflection of each joint by each stop alone [rad]; NaN where undetermined.
-    bends_rad: FloatArray
-    sag_mm: FloatArray  # (m,) flange deflection under the loads of each stop [mm].
-    payload_kg: FloatArray  # (m,) payload at each stop [kg].
-    # Ratio of the deflection under load to that expected from the stated load; None without any
-    # load on the flange.
-    payload: Factor | None
-    weighs: bool  # Whether the model of the arm states the masses of its links.
-    # (n, 4 n) compliance of the joints to the weight of links of unknown mass (see `bent_joints`);
-    # None where masses are known, or hardly matter.
-    weight_moments: FloatArray | None
-
-    @property
-    def rigid(self) -> tuple[str, ...]:
-        """The joints whose compliance the loads do not determine."""
-        return tuple(spring.joint for spring in self.springs if not spring.determined)
-
-    def result(self, views: Sequence[int]) -> ElasticResult:
-        """The springs as a section of a calibration; `views` (m,) are those of the stops."""
-        return ElasticResult(
-            joints=self.springs,
-            not_determined=self.rigid,
-            weight="of the model's masses" if self.weighs else "unknown",
-            payload_kg=(float(self.payload_kg.min()), float(self.payload_kg.max())),
-            sag_mm=Sag(float(np.median(self.sag_mm)), float(self.sag_mm.max())),
-            stops=tuple(self._stop(at, view) for at, view in enumerate(views)),
-            weight_moments=self.weight_moments,
-            payload_factor=self.payload,
-        )
-
-    def _stop(self, at: int, view: int) -> LoadedStop:
-        """Torques and bends of a stop; a bend that is not determined is left out."""
-        joints = (spring.joint for spring in self.springs)
-        bends = zip(joints, self.bends_rad[at].tolist(), strict=True)
-        return LoadedStop(
-            view=view,
-            payload_kg=float(self.payload_kg[at]),
-            sag_mm=float(self.sag_mm[at]),
-            torque_nm=tuple(self.torques_nm[at].tolist()),
-            bend_mrad={name: 1e3 * bend for name, bend in bends if np.isfinite(bend)},
-        )
-
-
-def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
-    """Estimated springs of an arm, by its errors with prior sizes; None for a rigid one."""
+    Args:
+        arm: The observations of the arm.
+        errors: Its errors with prior sizes, by block.
+        views: (m,) the view of each stop.
+    """
     if not errors.keys() & {COMPLIANCE, WEIGHT}:
         return None
-    model, q, loads = arm.model, arm.q, arm.loads
+    model, loads, names = arm.model, arm.loads, arm.model.nominal.joint_names
+    torques = model.robot.load_torques(model.bent(arm.q, loads), loads)
+    greatest = np.abs(torques).max(axis=0)
     prior = errors[COMPLIANCE].sigma / model.torque_nm if COMPLIANCE in errors else 0.0
-    torques = model.robot.load_torques(model.bent(q, loads), loads)
-    sigmas = np.full(model.nominal.joint_count, prior)
-    bends_rad = np.full(torques.shape, np.nan)
+    sigmas, bends = np.full(len(names), prior), np.full(torques.shape, np.nan)
     if COMPLIANCE in model.weights:
+        unit = model.weights[COMPLIANCE] / model.torque_nm
         variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
-        sigmas = compliance_unit(model) * np.sqrt(variances)
-        bends_rad = observed_bends(arm, torques)
-    is_determined = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _DETERMINED * prior)
-    return Elastic(
-        tuple(_springs(model, np.minimum(sigmas, prior), is_determined, torques)),
-        torques,
-        bends_rad,
-        1e3 * flange_bends(model, q, loads),
-        loads.payload_kg,
-        payload_factor(arm),
-        model.nominal.masses is not None,
-        model.moments,
-    )
-
-
-def _springs(
-    model: ArmModel, sigmas: FloatArray, determined: Mask, torques: FloatArray
-) -> Iterator[JointSpring]:
-    names, compliances = model.nominal.joint_names, model.compliance.tolist()
-    columns = (names, compliances, sigmas.tolist(), determined.tolist())
-    for at, (name, compliance, sigma, is_determined) in enumerate(zip(*columns, strict=True)):
-        stiff = 1.0 / compliance if is_determined and compliance >= _SURE * sigma else None
-        yield JointSpring(
+        sigmas = np.minimum(unit * np.sqrt(variances), prior)
+        bends = torques * model.compliance + torques * unit * _corrections(arm)
+        bends[np.abs(torques) <= np.maximum(_LOADED_NM, _LEAST_SHARE * greatest)] = np.nan
+    determined = (greatest > _LOADED_NM) & (sigmas < _DETERMINED * prior)
+    is_stiff = determined & (model.compliance > 0.0) & (model.compliance >= _SURE * sigmas)
+    springs = []
+    for at, (name, compliance, sigma) in enumerate(
+        zip(names, model.compliance.tolist(), sigmas.tolist(), strict=True)
+    ):
+        stiff = 1.0 / compliance if is_stiff[at] else None
+        spring = JointSpring(
             joint=name,
             compliance_rad_per_nm=compliance,
             sigma_rad_per_nm=sigma,
-            determined=is_determined,
+            determined=bool(determined[at]),
             torque_nm=(float(torques[:, at].min()), float(torques[:, at].max())),
             stiffness_nm_per_rad=stiff,
             stiffness_sigma_nm_per_rad=None if stiff is None else sigma * stiff**2,
         )
+        springs.append(spring)
+    rigid = model.robot.base_from_flange(arm.q)[:, :3, 3]
+    deflection = model.base_from_flange(arm.q, loads)[:, :3, 3] - rigid
+    sag_mm = 1e3 * np.linalg.norm(deflection, axis=1)
+    rows = zip(views, loads.payload_kg.tolist(), sag_mm.tolist(), torques.tolist(), strict=True)
+    return ElasticResult(
+        joints=tuple(springs),
+        not_determined=tuple(spring.joint for spring in springs if not spring.determined),
+        weight="unknown" if model.nominal.masses is None else "of the model's masses",
+        payload_kg=(float(loads.payload_kg.min()), float(loads.payload_kg.max())),
+        sag_mm=Sag(float(np.median(sag_mm)), float(sag_mm.max())),
+        stops=tuple(
+            LoadedStop(
+                view=view,
+                payload_kg=kg,
+                sag_mm=mm,
+                torque_nm=tuple(torque),
+                bend_mrad={
+                    name: 1e3 * float(bend)
+                    for name, bend in zip(names, bends_at_stop, strict=True)
+                    if np.isfinite(bend)
+                },
+            )
+            for (view, kg, mm, torque), bends_at_stop in zip(rows, bends, strict=True)
+        ),
+        weight_moments=model.moments,
+        payload_factor=_payload_factor(arm),
+    )
 
 
-def _stiffness_words(spring: JointSpring) -> str:
-    """The stiffness of a joint with its sigma; empty where it has none."""
-    stiffness, sigma = spring.stiffness_nm_per_rad, spring.stiffness_sigma_nm_per_rad
-    if stiffness is None or sigma is None:
-        return ""
-    return f"{spring.joint} {1e-3 * stiffness:.4g} +- {figure(1e-3 * sigma)} kN m/rad"
+def _corrections(arm: ArmData) -> FloatArray:
+    """Correction (m, n) of each compliance's value by each stop alone; NaN where it shows none.
+
+    A partial residual of a regression (Larsen and McCleary 1972) is the fitted bend plus the
+    residual, weighted by its covariance, along the joint.
+    """
+    residuals, jacobian = whitened(arm.problem, arm.state, arm.noise, ideal=False)
+    columns = jacobian[:, :, arm.columns[arm.model.columns_of(COMPLIANCE)]]
+    of_stops = (arm.problem.observations.stops == stop for stop in arm.stops.tolist())
+    pairs = [(columns[mask], residuals[mask]) for mask in of_stops]
+    gradient = np.array([np.einsum("mij,mi->j", part, residual) for part, residual in pairs])
+    information = np.array([np.einsum("mij,mij->j", part, part) for part, _ in pairs])
+    return -gradient / np.where(information > 0.0, information, np.nan)
 
 
-def remarks(elastic: Elastic) -> Iterator[str]:
+def _payload_factor(arm: ArmData) -> Factor | None:
+    """Ratio of the actual to the predicted bending under the stated payload and force.
+
+    One more unknown beside all others, tested at the solution (Rao's score test). The compliances
+    are determined by the arm's own weight, and by the loads' differences between postures. None
+    where there were no loads or they bend nothing.
+    """
+    model, problem, loads = arm.model, arm.problem, arm.loads
+    if not loads.any or not model.compliance.any():
+        return None
+    bent, robot = model.bent(arm.q, loads), model.robot
+    load_torques = robot.load_torques(bent, loads) - robot.load_torques(bent)
+    flange_jacobian = np.zeros((len(problem.poses[arm.robot]), 6, 1))
+    twists = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * load_torques)
+    flange_jacobian[arm.stops] = twists[:, :, None]
+    flanges = {arm.robot: flange_jacobian}
+    payload = Effect.free("payload", PriorInformation.flat(1), flange_jacobian=flanges)
+    widened = problem.with_effects([*problem.effects, payload])
+    widened_state = State(arm.state.edges, np.append(arm.state.values, 0.0))
+    information, gradient = normal_equations(widened, widened_state, arm.noise)
+    covariance = covariance_among(information, widened.moving)
+    sigma = float(np.sqrt(covariance[-1, -1]))
+    return Factor(1.0 - float(covariance[-1] @ gradient), sigma)
+
+
+def remarks(elastic: ElasticResult) -> Iterator[str]:
     """Remarks on the springs, for the verdict."""
-    words = ", ".join(filter(None, map(_stiffness_words, elastic.springs)))
+    words = ", ".join(
+        f"{spring.joint} {1e-3 * spring.stiffness_nm_per_rad:.4g} +- "
+        f"{figure(1e-3 * spring.stiffness_sigma_nm_per_rad)} kN m/rad"
+        for spring in elastic.joints
+        if spring.stiffness_nm_per_rad is not None and spring.stiffness_sigma_nm_per_rad is not None
+    )
     if words:
         yield (
             f"The joints bend under load: their stiffness is {words}. At these stops that moves "
-            f"the flange by up to {figure(float(elastic.sag_mm.max()))} mm."
+            f"the flange by up to {figure(elastic.sag_mm.most)} mm."
         )
+    rigid, is_one = elastic.not_determined, len(elastic.not_determined) == 1
     if elastic.weight_moments is not None:
         yield (
             "The arm yields to its own weight, of which its model states nothing: how far is "
             "estimated at every posture, and counted. A payload_kg that changes, or mass_kg and "
             "com_m in the joints' table, determine the stiffness."
         )
-    elif elastic.rigid and len(elastic.rigid) == len(elastic.springs):
+    elif rigid:
+        which = "All joints" if len(rigid) == len(elastic.joints) else some_of(rigid)
         yield (
-            "Of this level no joint is seen to bend under the loads of these stops: all are taken "
-            "for rigid, and what was estimated is links, offsets and gears."
-        )
-    elif elastic.rigid:
-        several = len(elastic.rigid) > 1
-        yield (
-            f"{some_of(elastic.rigid)} {'are' if several else 'is'} not seen to bend under the "
-            f"loads of these stops, and {'are' if several else 'is'} taken for rigid. A load of "
-            "another direction, or farther out, would show it."
+            f"{which} {'is' if is_one else 'are'} not seen to bend under the loads of these stops, "
+            f"and {'is' if is_one else 'are'} taken for rigid. A load of another direction, or "
+            "farther out, would show it."
         )
 
 
-def doubts(elastic: Elastic) -> Iterator[Finding]:
+def doubts(elastic: ElasticResult) -> Iterator[Finding]:
     """Findings where the stated load contradicts the deflection."""
-    factor = elastic.payload
-    if factor is not None and elastic.weighs and factor.is_off:
+    factor = elastic.payload_factor
+    if factor is not None and elastic.weight != "unknown" and factor.is_off:
         more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
         yield Finding(
             "load",
@@ -184,25 +196,23 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
     """
     if BACKLASH not in model.weights:
         return ()
-    place = model.columns_of(BACKLASH)
-    sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
-    names = model.nominal.joint_names
-    sign = np.copysign(1.0, np.sum(model.backlash / sigmas**2))
-    columns = zip(names, (sign * model.backlash).tolist(), sigmas.tolist(), strict=True)
-    return tuple(JointBacklash(name, band, sigma) for name, band, sigma in columns)
+    variances = np.diag(covariance)[model.columns_of(BACKLASH)]
+    sigmas = model.weights[BACKLASH] * np.sqrt(variances)
+    bands = np.copysign(1.0, np.sum(model.backlash / sigmas**2)) * model.backlash
+    columns = (model.nominal.joint_names, bands.tolist(), sigmas.tolist())
+    return tuple(JointBacklash(*row) for row in zip(*columns, strict=True))
 
 
 def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
     """Remark on joints with significant backlash, for the verdict."""
-    sure = [play for play in plays if play.is_sure]
-    if not sure:
-        return
     words = ", ".join(
-        f"{backlash.joint} {figure(1e3 * abs(backlash.deadband_rad))} +- "
-        f"{figure(1e3 * backlash.sigma_rad)} mrad"
-        for backlash in sure
+        f"{play.joint} {figure(1e3 * abs(play.deadband_rad))} +- "
+        f"{figure(1e3 * play.sigma_rad)} mrad"
+        for play in plays
+        if play.is_sure
     )
-    yield (
-        f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach every "
-        "stop from the same side where half of that matters."
-    )
+    if words:
+        yield (
+            f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach "
+            "every stop from the same side where half of that matters."
+        )

@@ -1,6 +1,6 @@
 """Check of joint angles against the robot's model and its reported poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -17,30 +17,23 @@ from visioncal.calibration.guess.readings import HALF_TURN
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Remedy
 from visioncal.robot import Robot, robot_names, with_base, with_joint_offsets
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
 
-# Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
-# another convention differs by far more.
-_AGREE_M, _AGREE_RAD = 1e-3, 2e-3
-# Controllers with their own arm's calibration report poses that differ from the nominal model by up
-# to this.
-_CALIBRATED_M, _CALIBRATED_RAD = 1e-2, 2e-2
-# Beyond this, the model is of another arm.
-_SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
+# Differences of poses and model [m, rad]: controllers print poses to 0.01 mm or 1e-5 rad at worst;
+# those with their own arm's calibration differ from the nominal model by up to the second; beyond
+# the third the model is of another arm.
+_AGREE, _CALIBRATED, _SAME_ARM = (1e-3, 2e-3), (1e-2, 2e-2), (0.05, 0.1)
 # Ratio of the model's own base's residuals to those of another base that is preferred.
 _BETTER_BASE = 3.0
 # Limits for a half turn of the base [mm], [deg]: nominal models err less.
 _NEAR_MM, _NEAR_DEG = 10.0, 2.0
-# Outlier rows have residuals beyond this many medians.
-_OUTLIER = 7.0
-# More outlier rows are not two rows exchanged.
-_MOST_OUTLIERS = 8
-# With at least this share of outlier rows, it is not the rows that are wrong.
-_HALF = 0.5
+# Outlier rows have residuals beyond this many medians. More are not two rows exchanged; from a half
+# of all rows on, it is not the rows that are wrong.
+_OUTLIER, _MOST_OUTLIERS = 7.0, 8
 _LISTED_COLUMNS = 7
 # Exports the calibrated arm for other programs.
 EXPORT_ARM = "visioncal export OUT --to robot-urdf -o robot.urdf"
@@ -84,36 +77,6 @@ class MatchedJoints:
         return np.asarray(self.arm.base_from_flange(joints[None])[0] @ self.flange_from_reported)
 
 
-@dataclass(frozen=True, eq=False)
-class _BaseAndFlange:
-    """Constant transforms between model and reported poses, and the residual of each row.
-
-    `fit` has x, the model's base in the poses' base, and z, its flange in the poses' flange.
-    """
-
-    fit: Fit
-
-    @property
-    def typical(self) -> tuple[float, float]:
-        """Median residual [m], [rad]."""
-        return float(np.median(self.fit.shift)), float(np.median(self.fit.angle))
-
-    def limits(self) -> tuple[float, float]:
-        """Limits beyond which a row is an outlier [m], [rad]."""
-        shift, angle = self.typical
-        return max(_AGREE_M, _OUTLIER * shift), max(_AGREE_RAD, _OUTLIER * angle)
-
-    @property
-    def outliers(self) -> Mask:
-        """(n,) outlier rows."""
-        shift, angle = self.limits()
-        return np.asarray((self.fit.shift > shift) | (self.fit.angle > angle))
-
-    @property
-    def figures(self) -> str:
-        return _words(self.fit.shift.max(), self.fit.angle.max())
-
-
 def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
     """Compares the joint angles of a robot with its reported poses.
 
@@ -124,7 +87,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
         The angles that belong to it, and what is wrong with the others.
     """
     joints = {row.number: q for row in rows if (q := row.joints_rad) is not None}
-    poses = reported_matrices([row for row in rows if row.number in joints])
+    by_view = reported_matrices([row for row in rows if row.number in joints])
     counts = {len(joint) for joint in joints.values()} - {robot.joint_count}
     if counts:
         words = (
@@ -133,47 +96,62 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
         )
         step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
         finding = Finding("misread_joints", words, Remedy(step))
-        return MatchedJoints(robot, warnings=(finding,) if poses else ())
-    if not poses:
-        return MatchedJoints(robot, joints)
-    views, q = tuple(poses), np.array([joints[view] for view in poses])
-    return _compared(MatchedJoints(robot, joints), views, q, np.array(list(poses.values())))
-
-
-def _compared(
-    matched: MatchedJoints, views: Sequence[int], q: FloatArray, poses: FloatArray
-) -> MatchedJoints:
-    robot, guess = matched.robot, None
+        return MatchedJoints(robot, warnings=(finding,) if by_view else ())
+    matched, guess = MatchedJoints(robot, joints), None
+    if not by_view:
+        return matched
+    views, poses = tuple(by_view), np.array(list(by_view.values()))
+    q = np.array([joints[view] for view in views])
     if len(q) >= FEWEST_JOINT_ROWS:
         guess = guess_joints(robot, q, poses)
         if _is_calibrated(robot, guess):
             guess = replace(guess, best=guess.declared, rivals=())
-    if guess is not None and guess.stands_out and guess.zero is None:
-        sentence = guess.sentence("the reported poses")
-        words = f"The joint angles were not used: they are misread. {sentence}"
-        misread = f"The angles of this session are misread. {sentence} {guess.fix}"
-        doubt = Finding("misread_joints", words, Remedy(guess.fix))
-        return MatchedJoints(robot, misread=misread, warnings=(doubt,))
-    if guess is not None and (zero := guess.zero) is not None:
+    if guess is not None and guess.stands_out:
+        sentence, zero = guess.sentence("the reported poses"), guess.zero
+        if zero is None:
+            misread = f"The angles of this session are misread. {sentence} {guess.fix}"
+            words = f"The joint angles were not used: they are misread. {sentence}"
+            doubt = Finding("misread_joints", words, Remedy(guess.fix))
+            return MatchedJoints(robot, misread=misread, warnings=(doubt,))
         words = (
             "The joint angles do not belong to the reported poses as they are declared. "
-            f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
+            f"{sentence} {zero_taken(zero)}"
         )
         shifted = Finding("misread_joints", words, Remedy(zero.fix, EXPORT_ARM))
         matched = replace(matched, zero=zero, warnings=(shifted,))
     model = matched.arm.base_from_flange(q)
-    constants = _fit_base_and_flange(model, poses, guess)
-    typical_m, typical_rad = constants.typical
-    outliers = constants.outliers
-    if typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or outliers.mean() >= _HALF:
-        finding = _other_arm(robot, constants.figures)
+    fit = _base_and_flange(model, poses, guess)
+    residuals, typical = np.array([fit.shift, fit.angle]), _typical(fit)
+    limits = np.maximum(_AGREE, _OUTLIER * typical)
+    is_outlier = np.any(residuals > limits[:, None], axis=0)
+    if np.any(typical > _SAME_ARM) or is_outlier.mean() >= 0.5:
+        finding = _other_arm(robot, residuals.max(axis=1))
         words = f"{finding.words} The joint angles were not used."
         return MatchedJoints(robot, warnings=(replace(finding, words=words),))
-    matched = _report_outliers(matched, constants, views, (model, poses))
-    if not np.array_equal(constants.fit.x, np.eye(4)):
-        matched = replace(_report_base(matched, constants), robot=with_base(robot, constants.fit.x))
-    tool = mean_transform(invert(matched.arm.base_from_flange(q[~outliers])) @ poses[~outliers])
-    return _report_tool_frame(replace(matched, flange_from_reported=tool), constants)
+    outliers = np.flatnonzero(is_outlier).tolist()
+    if outliers:
+        swapped = _exchanged(fit, limits, outliers, (model, poses))
+        found = _contradictions(residuals, outliers, swapped, views)
+        reasons = {
+            views[row]: f"its joint angles lead {_words(residuals[:, row])} away from its pose"
+            for row in outliers
+        }
+        reasons |= {
+            views[row]: f"its joint angles are those of view {views[sum(swapped) - row]}"
+            for row in swapped
+        }
+        warnings = (*matched.warnings, *found)
+        matched = replace(matched, contradicting=reasons, warnings=warnings)
+    if not np.array_equal(fit.x, np.eye(4)):
+        matched = replace(_report_base(matched, fit.x), robot=with_base(robot, fit.x))
+    inlier_tools = invert(matched.arm.base_from_flange(q[~is_outlier])) @ poses[~is_outlier]
+    matched = replace(matched, flange_from_reported=mean_transform(inlier_tools))
+    return _report_tool_frame(matched, residuals[:, ~is_outlier].max(axis=1), typical)
+
+
+def _typical(fit: Fit) -> FloatArray:
+    """(2,) median residual [m, rad]."""
+    return np.array([np.median(fit.shift), np.median(fit.angle)])
 
 
 def _is_calibrated(robot: Robot, guess: JointGuess) -> bool:
@@ -181,54 +159,46 @@ def _is_calibrated(robot: Robot, guess: JointGuess) -> bool:
 
     Its controller computes with the built-in one, which fits the poses that it reports exactly.
     """
-    reading, fit = guess.best.reading, guess.declared.fit
-    is_near = np.median(fit.shift) <= _CALIBRATED_M and np.median(fit.angle) <= _CALIBRATED_RAD
+    reading = guess.best.reading
+    is_near = np.all(_typical(guess.declared.fit) <= _CALIBRATED)
     is_other = not reading.is_zero and np.array_equal(reading.mixing, np.eye(robot.joint_count))
     return bool(is_near and is_other and robot.name not in robot_names())
 
 
-def _fit_base_and_flange(
-    model: FloatArray, poses: FloatArray, guess: JointGuess | None
-) -> _BaseAndFlange:
-    """Fits the flange with the model's own base; another base where clearly better."""
-    flange_from_reported, flange_from_base = invert(model) @ poses, invert(poses)
-    lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE_M)
+def _base_and_flange(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -> Fit:
+    """Fits the flange with the model's own base; another base where clearly better.
+
+    The fit has x, the model's base in the poses' base, and z, its flange in the poses' flange.
+    """
+    flange_from_base = invert(poses)
+    lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE[0])
     # The most central one, robust to wrong rows; those of one stop give the same.
-    first = np.unique(flange_from_reported, axis=0, return_index=True)[1]
-    fits = [
-        distances(flange_from_base, model, lever, (np.eye(4), invert(flange_from_reported[index])))
-        for index in np.sort(first)
-    ]
-    own = _BaseAndFlange(min(fits, key=lambda value: float(np.median(value.residuals))))
-    if guess is None:
+    tools = np.unique(invert(invert(model) @ poses), axis=0)
+    fits = [distances(flange_from_base, model, lever, (np.eye(4), tool)) for tool in tools]
+    own = min(fits, key=lambda fit: float(np.median(fit.residuals)))
+    if guess is None or np.all(_typical(own) <= _AGREE):
         return own
-    other = _BaseAndFlange(guess.best.fit)
-    (own_m, own_rad), (other_m, other_rad) = own.typical, other.typical
-    disagree = own_m > _AGREE_M or own_rad > _AGREE_RAD
-    better = own_m > _BETTER_BASE * other_m and own_rad >= other_rad
-    better |= own_rad > _BETTER_BASE * other_rad and own_m >= other_m
-    return other if disagree and better else own
+    ratios = _typical(own) / np.maximum(_typical(guess.best.fit), np.finfo(float).tiny)
+    return guess.best.fit if ratios.max() > _BETTER_BASE and ratios.min() >= 1.0 else own
 
 
-def _report_outliers(
-    matched: MatchedJoints,
-    constants: _BaseAndFlange,
-    views: Sequence[int],
-    sides: tuple[FloatArray, FloatArray],
-) -> MatchedJoints:
-    """Reports the views whose pose is not that of their angles."""
-    outliers = np.flatnonzero(constants.outliers)
-    if not len(outliers):
-        return matched
-    swapped = _exchanged(constants, outliers, sides)
-    reasons: dict[int, str] = {}
-    warnings = list(matched.warnings)
-    for row in outliers.tolist():
-        residual = _words(constants.fit.shift[row], constants.fit.angle[row])
-        reasons[views[row]] = f"its joint angles lead {residual} away from its pose"
-        if row in swapped:
-            mate = views[sum(swapped) - row]
-            reasons[views[row]] = f"its joint angles are those of view {mate}"
+def _exchanged(
+    fit: Fit, limits: FloatArray, outliers: Sequence[int], sides: tuple[FloatArray, FloatArray]
+) -> tuple[int, ...]:
+    """The two rows whose angles lead to each other's pose; empty for none or several."""
+    (model, poses), pairs = sides, []
+    for pair in combinations(outliers, 2) if len(outliers) <= _MOST_OUTLIERS else ():
+        flange_from_base, crossed = invert(poses[list(pair)]), model[list(pair[::-1])]
+        residuals = distances(flange_from_base, crossed, fit.lever, (fit.x, fit.z))
+        if residuals.shift.max() < limits[0] and residuals.angle.max() < limits[1]:
+            pairs.append(pair)
+    return pairs[0] if len(pairs) == 1 else ()
+
+
+def _contradictions(
+    residuals: FloatArray, outliers: Sequence[int], swapped: Sequence[int], views: Sequence[int]
+) -> Iterator[Finding]:
+    """Reports outlier rows, by (2, n) residuals: two exchanged ones, and the others."""
     if swapped:
         first, second = (views[row] for row in swapped)
         words = (
@@ -240,41 +210,22 @@ def _report_outliers(
             "and calibrate again.",
             CALIBRATE,
         )
-        warnings.append(Finding("exchanged_joints", words, step, (first, second)))
-    rest = [row for row in outliers.tolist() if row not in swapped]
+        yield Finding("exchanged_joints", words, step, (first, second))
+    rest = [row for row in outliers if row not in swapped]
     if rest:
-        shift, angle = constants.fit.shift[rest].max(), constants.fit.angle[rest].max()
+        named = tuple(views[row] for row in rest)
         words = (
-            f"Pose and joint angles disagree in "
-            f"{', '.join(f'view {views[index]}' for index in rest)}, "
-            f"by up to {_words(shift, angle)}; in the other views they agree. The hand-eye result "
-            "uses the poses."
+            f"Pose and joint angles disagree in {', '.join(f'view {view}' for view in named)}, by "
+            f"up to {_words(residuals[:, rest].max(axis=1))}; in the other views they agree. The "
+            "hand-eye result uses the poses."
         )
         step = Remedy("Correct what is wrong there in views.csv.")
-        named = tuple(views[index] for index in rest)
-        warnings.append(Finding("contradicting_joints", words, step, named))
-    return replace(matched, contradicting=reasons, warnings=tuple(warnings))
+        yield Finding("contradicting_joints", words, step, named)
 
 
-def _exchanged(
-    constants: _BaseAndFlange, outliers: IntArray, sides: tuple[FloatArray, FloatArray]
-) -> tuple[int, ...]:
-    """The two rows whose angles lead to each other's pose; empty for none or several."""
-    model, poses = sides
-    fit, limits = constants.fit, constants.limits()
-    pairs = []
-    for pair in combinations(outliers.tolist(), 2) if len(outliers) <= _MOST_OUTLIERS else ():
-        crossed = distances(
-            invert(poses[list(pair)]), model[list(pair[::-1])], fit.lever, (fit.x, fit.z)
-        )
-        if crossed.shift.max() < limits[0] and crossed.angle.max() < limits[1]:
-            pairs.append(pair)
-    return pairs[0] if len(pairs) == 1 else ()
-
-
-def _report_base(matched: MatchedJoints, constants: _BaseAndFlange) -> MatchedJoints:
-    """Reports the frame in which the poses are."""
-    name, base = matched.robot.name, constants.fit.x
+def _report_base(matched: MatchedJoints, base: FloatArray) -> MatchedJoints:
+    """Reports the frame in which the poses are, by the (4, 4) base of the model in it."""
+    name = matched.robot.name
     away_mm, away_deg = pose_difference(HALF_TURN, base)
     if away_mm < _NEAR_MM and away_deg < _NEAR_DEG:
         words = (
@@ -289,33 +240,34 @@ def _report_base(matched: MatchedJoints, constants: _BaseAndFlange) -> MatchedJo
         )
         return replace(matched, warnings=(*matched.warnings, Finding("base_link", words, step)))
     x, y, z = 1e3 * base[:3, 3]
-    turn = pose_difference(np.eye(4), base)[1]
     words = (
         f"The reported poses are in a frame in which the base of {name} is at ({x:.1f}, {y:.1f}, "
-        f"{z:.1f}) mm and turned by {turn:.2f} deg. The arm was put there."
+        f"{z:.1f}) mm and turned by {pose_difference(np.eye(4), base)[1]:.2f} deg. The arm was put "
+        "there."
     )
     return replace(matched, notes=(*matched.notes, words))
 
 
-def _report_tool_frame(matched: MatchedJoints, constants: _BaseAndFlange) -> MatchedJoints:
-    """Reports the frame whose poses are given, and how well the model predicts them."""
-    robot, tool = matched.robot, matched.flange_from_reported
-    warnings, notes = list(matched.warnings), list(matched.notes)
-    fit, inliers = constants.fit, ~constants.outliers
-    shift, angle = fit.shift[inliers].max(), fit.angle[inliers].max()
-    if shift > _AGREE_M or angle > _AGREE_RAD:
-        differ = _words(shift, angle)
-        typical_m, typical_rad = constants.typical
-        if typical_m > _CALIBRATED_M or typical_rad > _CALIBRATED_RAD:
-            warnings.append(_other_arm(robot, differ))
+def _report_tool_frame(
+    matched: MatchedJoints, largest: FloatArray, typical: FloatArray
+) -> MatchedJoints:
+    """Reports the frame whose poses are given, and how well the model predicts them.
+
+    Both are (2,) residuals [m, rad]: the largest inlier, and the typical one.
+    """
+    robot, warnings, notes = matched.robot, list(matched.warnings), list(matched.notes)
+    if np.any(largest > _AGREE):
+        if np.any(typical > _CALIBRATED):
+            warnings.append(_other_arm(robot, largest))
         else:
             notes.append(
                 f"Through the model of {robot.name} the joint angles give poses that differ by up "
-                f"to {differ} from the reported ones, as where one of model and controller has the "
-                "arm's calibration, and the other has not."
+                f"to {_words(largest)} from the reported ones, as where one of model and "
+                "controller has the arm's calibration, and the other has not."
             )
-    offset_mm, turn_deg = pose_difference(np.eye(4), tool)
-    if offset_mm > 1e3 * _AGREE_M + shift * 1e3 or turn_deg > np.rad2deg(_AGREE_RAD + angle):
+    offset_mm, turn_deg = pose_difference(np.eye(4), matched.flange_from_reported)
+    limit_m, limit_rad = (largest + _AGREE).tolist()
+    if offset_mm > 1e3 * limit_m or turn_deg > np.rad2deg(limit_rad):
         words = (
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
             f"from the flange of {robot.name}: what the flange carries is placed in that frame."
@@ -328,11 +280,11 @@ def _report_tool_frame(matched: MatchedJoints, constants: _BaseAndFlange) -> Mat
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))
 
 
-def _other_arm(robot: Robot, figures: str) -> Finding:
+def _other_arm(robot: Robot, largest: FloatArray) -> Finding:
     return Finding(
         "other_arm",
         f"Poses and joint angles disagree: through the model of {robot.name} the joints give poses "
-        f"that differ by up to {figures}. The hand-eye result uses the poses.",
+        f"that differ by up to {_words(largest)}. The hand-eye result uses the poses.",
         Remedy("Check [robot] model and tip, and whether the base frame is the controller's."),
     )
 
@@ -343,5 +295,6 @@ def zero_taken(zero: JointReading) -> str:
     return f"The zero of {name} was taken so, and the arm is calibrated from there."
 
 
-def _words(shift_m: float, angle_rad: float) -> str:
-    return mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle_rad)))
+def _words(residual: FloatArray) -> str:
+    """A (2,) residual [m, rad] in words."""
+    return mm_and_deg(1e3 * residual[0], float(np.rad2deg(residual[1])))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,8 +13,15 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of, stops_of
-from visioncal.estimation.arm_sizes import ArmSizes, JointFunctions, estimate_arm_sizes
-from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, RIGID, WEIGHT
+from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
+from visioncal.estimation.armmodel import (
+    BACKLASH,
+    COMPLIANCE,
+    HARMONICS,
+    RIGID,
+    WEIGHT,
+    JointFunctions,
+)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import (
@@ -24,7 +31,6 @@ from visioncal.estimation.solve import (
     robot_levels,
     starting_noise,
 )
-from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
 
 # Prior sigma of a zero that was found from the target's poses, and of the other joints' zeros
@@ -61,13 +67,14 @@ _LEVEL_OF = {
 class LevelFit:
     """Fit with some blocks of errors of a robot's arm free."""
 
-    errors: Mapping[str, ArmErrors]  # The errors by block; empty for the nominal arm.
     fit: Solution
-    gain: float  # Twice the gain in log-likelihood over the nominal arm.
-    # (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
-    inside: FloatArray
-    left_out: FloatArray  # (m, 6) leave-one-out residuals of each stop, to first order.
+    # (m, 2, 2) squared lengths of rotation [rad^2] and translation [m^2] of the residuals of the
+    # robot's observations, in the fit and to first order without the observation's stop.
+    squares: FloatArray
     has_rotation: Mask  # (m,) which observations include a rotation.
+    # The errors by block; empty for the nominal arm.
+    errors: Mapping[str, ArmErrors] = field(default_factory=dict)
+    gain: float = 0.0  # Twice the gain in log-likelihood over the nominal arm.
     functions: JointFunctions | None = None  # Functions of the joints; None without any.
 
     @classmethod
@@ -75,50 +82,45 @@ class LevelFit:
         cls, problem: Problem, state: State, robot: str, noise: Noise, sizes: ArmSizes | None
     ) -> "LevelFit":
         """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
-        errors = {} if sizes is None else sizes.errors
-        effects = [error.effect(robot, name) for name, error in errors.items()]
-        problem = problem.with_effects([*problem.effects, *effects])
-        values = np.append(state.values, problem.start_values[len(state.values) :])
         if sizes is not None:
+            effects = [error.effect(robot, name) for name, error in sizes.errors.items()]
+            problem = problem.with_effects([*problem.effects, *effects])
             noise = replace(noise, robots=sizes.levels)
+        values = np.append(state.values, problem.start_values[len(state.values) :])
         fit = fit_problem(problem, State(state.edges, values), noise)
-        rows, points = rows_of(problem, robot), problem.points
-        pairs = zip(problem.observations.has_rotation, problem.observations.observed, strict=True)
-        rotation = np.array([has and name not in points for has, name in pairs], dtype=bool)
-        return cls(
-            errors,
-            fit,
-            0.0 if sizes is None else sizes.gain,
+        rows, seen = rows_of(problem, robot), problem.observations
+        residuals = [
             problem.linear(fit.state).residuals[rows],
             left_out_residuals(problem, fit.state, fit.noise, rows)[rows],
-            rotation[rows],
-            None if sizes is None else sizes.functions,
-        )
-
-    @property
-    def level(self) -> str:
-        """The name of the level."""
-        names = [level for block, level in _LEVEL_OF.items() if block in self.errors]
-        return names[-1] if names else NOMINAL
+        ]
+        squares = np.sum(np.stack(residuals, axis=1).reshape(-1, 2, 2, 3) ** 2, axis=3)
+        is_point = np.array([name in problem.points for name in seen.observed], dtype=bool)
+        has_rotation = seen.has_rotation & ~is_point
+        level = cls(fit, squares, has_rotation[rows])
+        if sizes is None:
+            return level
+        return replace(level, errors=sizes.errors, gain=sizes.gain, functions=sizes.functions)
 
     @property
     def held_out_mm(self) -> float:
         """RMS of the residuals of left-out stops [mm]."""
-        return _rms(self.left_out, self.has_rotation).mm
+        return self.result.held_out_mm
 
     @cached_property
     def result(self) -> ArmLevel:
         """The fit as figures."""
-        inside, left_out = (
-            _rms(array, self.has_rotation) for array in (self.inside, self.left_out)
-        )
+        names = [level for block, level in _LEVEL_OF.items() if block in self.errors]
+        inside_mm, held_out_mm = (1e3 * np.sqrt(self.squares[:, :, 1].mean(axis=0))).tolist()
+        turned, degs = self.squares[self.has_rotation, :, 0], (None, None)
+        if len(turned):
+            degs = tuple(np.rad2deg(np.sqrt(turned.mean(axis=0))).tolist())
         return ArmLevel(
-            level=self.level,
+            level=names[-1] if names else NOMINAL,
             unknowns=sum(error.basis.shape[2] for error in self.errors.values()),
-            rms_mm=inside.mm,
-            rms_deg=inside.deg,
-            held_out_mm=left_out.mm,
-            held_out_deg=left_out.deg,
+            rms_mm=inside_mm,
+            rms_deg=degs[0],
+            held_out_mm=held_out_mm,
+            held_out_deg=degs[1],
             likelihood_ratio=self.gain,
         )
 
@@ -137,7 +139,7 @@ class SelectedArmLevel:
     @property
     def level(self) -> str:
         """Its name; `nominal` where no errors explain more than chance."""
-        return self.fit.level
+        return self.fit.result.level
 
     @property
     def errors(self) -> Mapping[str, ArmErrors]:
@@ -151,10 +153,7 @@ class SelectedArmLevel:
 
     def left_out(self) -> tuple[UnseenView, ...]:
         """Residuals of held-out stops with both arms, by view."""
-        before, after = (
-            np.linalg.norm(level_fit.left_out.reshape(-1, 2, 3), axis=2)
-            for level_fit in (self.nominal, self.fit)
-        )
+        before, after = (np.sqrt(level.squares[:, 1]) for level in (self.nominal, self.fit))
         return unseen_views(self.views, before, after, self.nominal.has_rotation)
 
     @cached_property
@@ -171,16 +170,17 @@ def unseen_views(
 
     Both are (m, 2), rotation [rad] and distance [m]; `turned` is whether a rotation was measured.
     """
-    columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
+    scale = np.array([np.rad2deg(1.0), 1e3])
+    columns = zip(views, (before * scale).tolist(), (after * scale).tolist(), turned, strict=True)
     return tuple(
         UnseenView(
             view=view,
-            nominal_mm=1e3 * was_m,
-            mm=1e3 * now_m,
-            nominal_deg=np.rad2deg(was_rad).item() if has_rotation else None,
-            deg=np.rad2deg(now_rad).item() if has_rotation else None,
+            nominal_mm=was_mm,
+            mm=now_mm,
+            nominal_deg=was_deg if has_rotation else None,
+            deg=now_deg if has_rotation else None,
         )
-        for view, (was_rad, was_m), (now_rad, now_m), has_rotation in columns
+        for view, (was_deg, was_mm), (now_deg, now_mm), has_rotation in columns
     )
 
 
@@ -194,6 +194,7 @@ def select_errors(
     noise: Noise,
     harmonics: FloatArray | None = None,
     stated: Problem | None = None,
+    views: tuple[int, ...] = (),
 ) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
@@ -211,6 +212,7 @@ def select_errors(
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
         stated: The observations with zeros as in the model, where `problem` has a shifted zero
             corrected; None without one. Then offsets are the least level.
+        views: The view of each of the robot's observations.
 
     Returns:
         The errors; with `harmonics` None where no functions of the joints are significant.
@@ -241,41 +243,19 @@ def select_errors(
         fit = beyond = fitted(sizes)
         if ASKED[asked] != _ALL:
             beyond = fitted(likely(_ALL))
+        is_beyond = beyond.gain - fit.gain > SIGNIFICANT
         if stated is not None:
+            # A shifted zero has a gain of its own.
             nominal = LevelFit.of(stated, state, robot, noise, None)
-            fit, beyond = (
-                _with_shifted_zero(level_fit, problem, start, stated, nominal, bases["offsets"])
-                for level_fit in (fit, beyond)
-            )
-    is_beyond = beyond.gain - fit.gain > SIGNIFICANT
-    asked_for = asked not in _AUTOMATIC
-    return SelectedArmLevel(nominal, fit, asked_for, beyond=beyond if is_beyond else None)
-
-
-def _with_shifted_zero(
-    fit: LevelFit,
-    problem: Problem,
-    zeroed: LevelFit,
-    stated: Problem,
-    nominal: LevelFit,
-    offsets: FloatArray,
-) -> LevelFit:
-    """A fit beside the nominal arm, with the gain of the shifted zero; offsets are its least."""
-    values = (
-        robot_levels(part, level.fit.state, starting_noise(part), from_above=True)[1]
-        for part, level in ((stated, nominal), (problem, zeroed))
-    )
-    gain = 2.0 * (next(values) - next(values))
-    errors = fit.errors or {"offsets": ArmErrors(offsets, _ZERO_SIGMA_RAD, gain, of_links=True)}
-    return replace(fit, errors=errors, gain=fit.gain + gain)
-
-
-def _rms(residuals: FloatArray, turned: Mask) -> Rms:
-    turns, shifts = (
-        np.sum(array**2, axis=1) for array in (residuals[turned, :3], residuals[:, 3:])
-    )
-    deg = float(np.rad2deg(np.sqrt(np.mean(turns)))) if turned.any() else None
-    return Rms(mm=1e3 * float(np.sqrt(np.mean(shifts))), deg=deg)
+            values = [
+                robot_levels(part, level.fit.state, starting_noise(part), from_above=True)[1]
+                for part, level in ((stated, nominal), (problem, start))
+            ]
+            gain = 2.0 * (values[0] - values[1])
+            least = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
+            fit = replace(fit, errors=fit.errors or {"offsets": least}, gain=fit.gain + gain)
+    was_asked = asked not in _AUTOMATIC
+    return SelectedArmLevel(nominal, fit, was_asked, views, beyond if is_beyond else None)
 
 
 def allows_functions(asked: str, stops: int) -> bool:
@@ -318,9 +298,9 @@ def doubts(kinematics: SelectedArmLevel) -> Iterator[Finding]:
     if best is not None and best.held_out_mm < chosen.held_out_mm:
         yield Finding(
             "level",
-            f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
-            f"left out are predicted to {figure(best.held_out_mm)} mm instead of "
-            f"{figure(chosen.held_out_mm)} mm.",
+            f"The views speak for more than the arm's {kinematics.level}: with its "
+            f"{best.result.level} stops left out are predicted to {figure(best.held_out_mm)} mm "
+            f"instead of {figure(chosen.held_out_mm)} mm.",
             Remedy("Leave --level out.", CALIBRATE),
         )
 

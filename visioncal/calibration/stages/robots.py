@@ -1,6 +1,6 @@
 """Reading of the robots' reports, and the check of their joints against the observations."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -11,7 +11,6 @@ from visioncal.calibration.guess.joints import (
     FEWEST_JOINT_ROWS,
     FITS_SEEN,
     JointGuess,
-    JointReading,
     guess_joints,
 )
 from visioncal.calibration.stages.joints import EXPORT_ARM, MatchedJoints, zero_taken
@@ -23,7 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy, remarks
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_camera_observation, name_of
 
@@ -91,6 +90,25 @@ def _lost_views(
             yield Rejection(row.view.number, f"{why}{of}")
 
 
+def check_loads(loads: Loads, views: Sequence[int], stops: Sequence[int | None]) -> None:
+    """Refuses views of one declared stop under different loads; `stops` has None for none.
+
+    Raises:
+        DataError: Two views of a stop differ; it names them.
+    """
+    first: dict[int, int] = {}
+    for at, stop in enumerate(stops):
+        other = at if stop is None else first.setdefault(stop, at)
+        if not np.array_equal(loads.rows[at], loads.rows[other]):
+            raise DataError(
+                f"views {views[other]} and {views[at]} are of stop {stop} and differ in payload, "
+                "force or approach: views of one stop share the pose of the arm, which these "
+                "change.",
+                culprits=[f"view {views[other]}", f"view {views[at]}"],
+                next_step="Give each of them a stop of its own.",
+            )
+
+
 def _label(session: Session, robot: str) -> str:
     """The name of the robot that findings concern; empty with a single one."""
     return f"Robot {robot}" if len(session.robots) > 1 else ""
@@ -106,51 +124,36 @@ def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
         DataError: Joints are misread.
     """
     for name, reported in observed.robots.items():
-        if reported.matched is not None:
-            observed = _checked(observed, name, reported, reported.matched, (drops, takes))
-    return observed
-
-
-def _checked(
-    observed: T,
-    name: str,
-    reported: RobotReport,
-    matched: MatchedJoints,
-    options: tuple[bool, bool],
-) -> T:
-    session, joints, (drops, takes) = observed.session, reported.joints_rad or {}, options
-    pair = next(iter(pairs_of(observed, name)), _NO_PAIR)
-    target_poses = {
-        view: poses.cam_from_target[0] for view, poses in pair.poses.items() if view in joints
-    }
-    if not target_poses:
-        return observed
-    excluded = {*matched.contradicting, *observed.held_back}
-    views = [view for view in target_poses if view not in excluded]
-    rows = np.array([target_poses[view] for view in views])
-    q = np.array([joints[view] for view in views]).reshape(len(views), matched.robot.joint_count)
-    guess = _guess_seen_joints(matched.arm, q, rows, pair.mount)
-    if drops:
-        contradicting = {
-            view: (reported.base_from_flange[view], pose)
-            for view, pose in target_poses.items()
-            if view in matched.contradicting
+        pairs, label = pairs_of(observed, name), _label(observed.session, name)
+        matched, joints = reported.matched, reported.joints_rad or {}
+        seen = {
+            view: _as_flange(poses.cam_from_target[0], pairs[0].mount)
+            for view, poses in (pairs[0].poses if pairs else {}).items()
+            if view in joints
         }
-        lost = tuple(_contradicted_joints(matched, guess, contradicting, pair.mount))
-        reported = reported.without({rejection.view for rejection in lost})
-        observed = observed.noting(lost).with_robot(name, reported)
-    if guess is None or not guess.stands_out:
-        return observed
-    zero = guess.zero
-    if zero is None:
-        of_robot = [view for view in session.views if view.number in reported.base_from_flange]
-        has_poses = any(view.base_from_flange() is not None for view in of_robot)
-        error = misread_joints(guess, matched.robot, has_poses=has_poses)
-        raise error.within(f"robot {name}") if len(session.robots) > 1 else error
-    used = takes and matched.zero is None
-    finding = _lost_zero_finding(guess, zero, is_used=used)
-    observed = observed.noting((), (finding.of(_label(session, name)),))
-    return observed.with_robot(name, reported.with_zero(zero)) if used else observed
+        if matched is None or not seen:
+            continue
+        guess = _guessed(matched, joints, seen, {*matched.contradicting, *observed.held_back})
+        if drops:
+            lost = tuple(_contradicted_joints(reported, matched, guess, seen))
+            kept = reported.without({rejection.view for rejection in lost})
+            observed = observed.noting(lost).with_robot(name, kept)
+        if guess is None or not guess.stands_out:
+            continue
+        if (zero := guess.zero) is None:
+            error = _misread(observed, reported, matched, guess, "what the camera sees")
+            raise error.within(f"robot {name}") if label else error
+        used = takes and matched.zero is None
+        words = (
+            f"The joint angles do not belong to {zero.robot.name} as they are declared. "
+            f"{guess.sentence('what the camera sees')}"
+        )
+        words, command = (f"{words} {zero_taken(zero)}", EXPORT_ARM) if used else (words, "")
+        finding = Finding("misread_joints", words, Remedy(zero.fix, command))
+        observed = observed.noting((), (finding.of(label),))
+        if used:
+            observed = observed.with_robot(name, observed.robots[name].with_zero(zero))
+    return observed
 
 
 def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> None:
@@ -164,17 +167,78 @@ def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> N
     """
     for reported in observed.robots.values():
         matched, joints = reported.matched, reported.joints_rad or {}
-        views = [probe for probe in probes if probe in joints and probe not in observed.held_back]
-        if matched is None or not views:
+        if matched is None:
             continue
-        q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
         # The instrument is fixed beside the robot, as a camera may be.
-        guess = _guess_seen_joints(matched.arm, q, poses, "eye-to-hand")
+        seen = {view: probe for view, probe in probes.items() if view in joints}
+        guess = _guessed(matched, joints, seen, observed.held_back)
         if guess is not None and guess.stands_out and guess.zero is None:
-            with_joints = (view for view in observed.session.views if view.number in joints)
-            has_poses = any(view.base_from_flange() is not None for view in with_joints)
-            source = "what the instrument reads"
-            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=source)
+            raise _misread(observed, reported, matched, guess, "what the instrument reads")
+
+
+def _guessed(
+    matched: MatchedJoints,
+    joints: Mapping[int, FloatArray],
+    seen: Mapping[int, FloatArray],
+    excluded: Collection[int],
+) -> JointGuess | None:
+    """Searches for the right reading of joint angles, with enough views.
+
+    `seen` has `base_from_flange` by view, up to the two unknown edges.
+    """
+    views = [view for view in seen if view not in excluded]
+    if len(views) < FEWEST_JOINT_ROWS:
+        return None
+    q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, seen))
+    return guess_joints(matched.arm, q, poses, FITS_SEEN)
+
+
+def _contradicted_joints(
+    reported: RobotReport,
+    matched: MatchedJoints,
+    guess: JointGuess | None,
+    seen: Mapping[int, FloatArray],
+) -> Iterator[Rejection]:
+    """Rejects the views whose pose and angles contradict each other with wrong angles."""
+    for view in [view for view in seen if view in matched.contradicting]:
+        reason = matched.contradicting[view]
+        if guess is None:
+            yield Rejection(view, f"{reason}, and too few views show which of them is right")
+            continue
+        model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
+        reported_pose = reported.base_from_flange[view]
+        pose = reported_pose @ invert(matched.flange_from_reported)
+        fit, flange_from_base = guess.best.fit, np.tile(invert(seen[view]), (2, 1, 1))
+        both = distances(flange_from_base, np.array([model, pose]), fit.lever, (fit.x, fit.z))
+        by_joints, by_pose = both.residuals
+        if by_pose < by_joints:
+            yield Rejection(view, f"{reason}, with which the camera agrees")
+
+
+def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
+    """`base_from_flange` up to the two unknown edges."""
+    # For a fixed camera it is `cam_from_target`, for a fixed target its inverse.
+    return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
+
+
+def _misread(
+    observed: Observed,
+    reported: RobotReport,
+    matched: MatchedJoints,
+    guess: JointGuess,
+    seen: str,
+) -> DataError:
+    """The error for joint angles that only another reading makes fit what is seen."""
+    of_robot = (view for view in observed.session.views if view.number in reported.base_from_flange)
+    has_poses = any(view.base_from_flange() is not None for view in of_robot)
+    also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
+    columns = guess.best.reading.columns or range(matched.robot.joint_count)
+    return DataError(
+        f"views.csv: the joint angles are not those of {matched.robot.name} as they are recorded. "
+        f"{guess.sentence(seen)}{also}",
+        culprits=[f"views.csv: q{at + 1}_rad" for at in columns],
+        next_step=guess.fix,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +249,6 @@ class CameraTargetPair:
     target: str
     mount: Mount
     poses: Mapping[int, ViewPoses]
-
-
-_NO_PAIR = CameraTargetPair("", "", "eye-in-hand", {})
 
 
 def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
@@ -207,65 +268,3 @@ def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
         found_pairs.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
     return found_pairs
-
-
-def _guess_seen_joints(
-    robot: Robot, q: FloatArray, cam_from_target: FloatArray, mount: Mount
-) -> JointGuess | None:
-    """Searches for the right reading of joint angles, with enough views."""
-    if len(q) < FEWEST_JOINT_ROWS:
-        return None
-    return guess_joints(robot, q, _as_flange(cam_from_target, mount), FITS_SEEN)
-
-
-def _contradicted_joints(
-    matched: MatchedJoints,
-    guess: JointGuess | None,
-    seen: Mapping[int, tuple[FloatArray, FloatArray]],
-    mount: Mount,
-) -> Iterator[Rejection]:
-    """Rejects the views whose pose and angles contradict each other with wrong angles."""
-    for view, (pose, cam_from_target) in seen.items():
-        reason = matched.contradicting[view]
-        if guess is None:
-            yield Rejection(view, f"{reason}, and too few views show which of them is right")
-            continue
-        model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
-        both = np.array([model, pose @ invert(matched.flange_from_reported)])
-        flange_from_base = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
-        fit = guess.best.fit
-        by_joints, by_pose = distances(flange_from_base, both, fit.lever, (fit.x, fit.z)).residuals
-        if by_pose < by_joints:
-            yield Rejection(view, f"{reason}, with which the camera agrees")
-
-
-def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
-    """`base_from_flange` up to the two unknown edges."""
-    # For a fixed camera it is `cam_from_target`, for a fixed target its inverse.
-    return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
-
-
-def misread_joints(
-    guess: JointGuess, robot: Robot, *, has_poses: bool, seen: str = "what the camera sees"
-) -> DataError:
-    """The error for joint angles that only another reading makes fit the observations."""
-    sentence = guess.sentence(seen)
-    also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
-    columns = guess.best.reading.columns or range(robot.joint_count)
-    return DataError(
-        f"views.csv: the joint angles are not those of {robot.name} as they are recorded. "
-        f"{sentence}{also}",
-        culprits=[f"views.csv: q{at + 1}_rad" for at in columns],
-        next_step=guess.fix,
-    )
-
-
-def _lost_zero_finding(guess: JointGuess, zero: JointReading, *, is_used: bool) -> Finding:
-    """Reports the joint with a lost zero, and how it is used."""
-    words = (
-        f"The joint angles do not belong to {zero.robot.name} as they are declared. "
-        f"{guess.sentence('what the camera sees')}"
-    )
-    if not is_used:
-        return Finding("misread_joints", words, Remedy(zero.fix))
-    return Finding("misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, EXPORT_ARM))

@@ -1,34 +1,32 @@
-"""Thermal level: whether temperatures explain how the views drift during a session.
+"""Thermal level: drift of an arm with its temperature, estimated with the chain its views close.
 
-Temperatures or currents are read from its streams, or else from columns of its views.
+Growth of links and drift of zeros per kelvin, time constants and gains are further unknowns beside
+frames and errors of the arm. Known properties of steel, aluminium and warm-up are their prior;
+coefficients that the views do not determine stay there. Temperatures or currents are read from
+streams, or else from columns of views.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.thermal_fit import (
-    ThermalFit,
-    ThermalStops,
-    fit_thermal,
-    uninformative,
-)
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import (
-    Solution,
-    starting_noise,
-)
+from visioncal.estimation.solve import Solution, fit_problem, robot_levels, starting_noise
 from visioncal.results.arm import (
     DriftPoint,
     DriftResidual,
@@ -38,103 +36,123 @@ from visioncal.results.arm import (
     ViewDrift,
 )
 from visioncal.robot import Robot
-from visioncal.robot.thermal import Inputs, Kind, ThermalModel
+from visioncal.robot.thermal import Heating, Inputs, Kind, ThermalModel
 from visioncal.session import Session
 from visioncal.session.kinds import name_of
 from visioncal.session.selecting import streams_of
 from visioncal.session.streams import STAMP, Stream
 
 LEVEL = "thermal"
-NO_JOINTS = "the joint angles of every view, a known model of the robot and the joint fit"
-# Largest time of views before the first and after the last sample [s].
-_BEYOND_S = 300.0
-# Largest difference of joints in one posture [rad].
-_SAME_RAD = 1e-3
-# Points of the reported course.
-_COURSE_POINTS = 200
-_ADVICE = (
-    "Begin with a cold robot, let it work for an hour or more, and look at the same few reference "
-    "views every five to ten minutes."
-)
-# More samples determine warm-up no better: they are averaged in groups.
-_MOST_SAMPLES = 8192
-_FEWEST_SAMPLES = 3
 _AMBIENT = "ambient_c"
 _FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}_a"}
+# Largest time of views before the first and after the last sample [s].
+_BEYOND_S = 300.0
+# More samples determine warm-up no better: they are averaged in groups.
+_MOST_SAMPLES, _FEWEST_SAMPLES = 8192, 3
+# Prior: relative growth per kelvin (12e-6 of steel, 23e-6 of aluminium); a zero drifts by about a
+# hundredth of a millimetre at one metre per kelvin, either way.
+_GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
+_DRIFT_SIGMA_RAD_PER_K = 1e-5
+# Gearboxes warm up in half an hour to an hour and a half; links follow a sensor in minutes.
+_TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
+_TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
+# Rise of joints at work above the air, within a factor [K].
+_RISE_K, _GAIN_SIGMA = 20.0, 0.8
+# Smaller rises of all joints determine nothing: temperatures [K], and shares of the final rise.
+_LEAST_RISE_K, _LEAST_SHARE = 3.0, 0.15
+# A parameter counts as determined where its sigma is at most this share of its prior's.
+_UNDETERMINED = 0.8
+# Linearisations, largest step of one, and step at convergence [prior sigmas].
+_ROUNDS, _LONGEST, _SETTLED = 20, 1.0, 1e-3
+# Largest difference of joints in one posture [rad], and points of the reported course.
+_SAME_RAD, _COURSE_POINTS = 1e-3, 200
 
 
 @dataclass(frozen=True, eq=False)
-class Heat:
-    """Recorded heating of an arm, and when its views were taken."""
+class HeatedStops:
+    """A robot's m stops, with the session that records what heats its arm."""
 
-    session: Session  # The session that records it.
+    session: Session
     robot: str  # The robot's name there.
-    joints: int  # Number of joints.
-    views: IntArray  # (m,) a view of each of the arm's m stops.
+    q: FloatArray  # (m, n) joint angles [rad].
+    views: IntArray  # (m,) a view of each stop.
     stamps_s: FloatArray  # (m,) when that was taken [s]; NaN where unknown.
 
     def at(self, rows: IntArray) -> Self:
-        """Returns it for some of the stops."""
-        return replace(self, views=self.views[rows], stamps_s=self.stamps_s[rows])
+        """Returns some of the stops."""
+        views, stamps_s = self.views[rows], self.stamps_s[rows]
+        return replace(self, q=self.q[rows], views=views, stamps_s=stamps_s)
 
     @cached_property
     def _read(self) -> tuple[Inputs | None, str]:
-        return inputs_of(self.session, self.joints, self.robot)
-
-    @property
-    def inputs(self) -> Inputs | None:
-        """Temperatures or currents; None where they do not cover all of the stops."""
-        return None if self.missing else self._read[0]
-
-    @property
-    def missing(self) -> str:
-        """What is missing, in words; empty for nothing."""
-        inputs, missing = self._read
-        if inputs is None:
-            return missing
+        inputs, missing = inputs_of(self.session, self.q.shape[1], self.robot)
         untimed = self.views[np.isnan(self.stamps_s)].tolist()
-        if untimed:
-            return f"view {untimed[0]} has no stamp_s"
-        first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
-        stamps = self.stamps_s
-        if stamps.min() < first_s - _BEYOND_S or stamps.max() > last_s + _BEYOND_S:
-            return (
-                f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views were "
-                f"taken from {stamps.min():.10g} to {stamps.max():.10g} s"
-            )
-        return ""
+        if inputs is not None and untimed:
+            missing = f"view {untimed[0]} has no stamp_s"
+        elif inputs is not None:
+            first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
+            least_s, most_s = self.stamps_s.min(), self.stamps_s.max()
+            if least_s < first_s - _BEYOND_S or most_s > last_s + _BEYOND_S:
+                missing = (
+                    f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views "
+                    f"were taken from {least_s:.10g} to {most_s:.10g} s"
+                )
+        return inputs, missing
 
     @property
     def set_aside(self) -> str:
         """Why recorded inputs cannot be used; empty where they can, or none were recorded."""
-        return "" if self._read[0] is None else self.missing
+        inputs, missing = self._read
+        return "" if inputs is None else missing
+
+    def inputs(self, asked: str) -> Inputs | None:
+        """What heats the arm; None where not requested, or not determined by the session.
+
+        Raises:
+            DataError: The level requires it, and the session lacks data.
+            DegenerateError: The level requires it, and all views were taken about equally warm.
+        """
+        inputs, missing = self._read
+        if asked not in ("auto", LEVEL):
+            return None
+        if inputs is None or missing:
+            if asked == LEVEL:
+                raise missing_error(missing)
+            return None
+        why = self._uninformative(inputs)
+        if why and asked == LEVEL:
+            raise DegenerateError(
+                f"thermal: {why}: the views do not show how the arm drifts.",
+                culprits=["temperatures"],
+                next_step="Begin with a cold robot, let it work for an hour or more, and look at "
+                "the same few reference views every five to ten minutes.",
+            )
+        return None if why else inputs
+
+    def _uninformative(self, inputs: Inputs) -> str:
+        """States why views were all taken about equally warm; empty where they were not."""
+        links = _expected(inputs).links_c(inputs, self.stamps_s)
+        rise = float(np.ptp(links, axis=0).max())
+        hours = float(np.ptp(self.stamps_s)) / 3600.0
+        during = f"in the {figure(hours)} h of the {len(self.stamps_s)} used stops"
+        if inputs.kind == "temperatures" and rise < _LEAST_RISE_K:
+            return (
+                f"the joints' temperatures change by at most {figure(rise)} K {during}, and "
+                f"{_LEAST_RISE_K:g} K are needed"
+            )
+        share = rise / _RISE_K
+        if inputs.kind == "currents" and share < _LEAST_SHARE:
+            return (
+                f"by their currents the joints warm up by at most {figure(100.0 * share)} % of the "
+                f"way {during}, and {100.0 * _LEAST_SHARE:g} % are needed"
+            )
+        return ""
 
 
-def heating(heat: Heat | None, asked: str) -> Inputs | None:
-    """The inputs that heat an arm; None where not requested, or not determined by the session.
-
-    Raises:
-        DataError: The level requires it, and the session lacks data.
-        DegenerateError: The level requires it, and all views were taken about equally warm.
-    """
-    if asked not in ("auto", LEVEL):
-        return None
-    inputs = None if heat is None else heat.inputs
-    if heat is None or inputs is None:
-        if asked == LEVEL:
-            raise _missing_error(NO_JOINTS if heat is None else heat.missing)
-        return None
-    why = uninformative(inputs, heat.stamps_s)
-    if why and asked == LEVEL:
-        raise DegenerateError(
-            f"thermal: {why}: the views do not show how the arm drifts.",
-            culprits=["temperatures"],
-            next_step=_ADVICE,
-        )
-    return None if why else inputs
-
-
-def _missing_error(missing: str) -> DataError:
+def missing_error(
+    missing: str = "the joint angles of every view, a known model of the robot and the joint fit",
+) -> DataError:
+    """The error where the level lacks inputs."""
     return DataError(
         f"level {LEVEL!r} needs to know what heats the arm: {missing}.",
         culprits=["level"],
@@ -143,34 +161,229 @@ def _missing_error(missing: str) -> DataError:
     )
 
 
+def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
+    """Reads what heats an arm with some joints; temperatures come before currents.
+
+    Returns:
+        The inputs; or None, and what is missing.
+    """
+    numbers = {
+        view.stamp_s: view.numbers
+        for view in session.views
+        if view.stamp_s is not None and name_of(session.declaration, "robot", view) == robot
+    }
+    names = sorted({name for row in numbers.values() for name in row} - {STAMP})
+    rows = [
+        [stamp_s, *(row.get(name, np.nan) for name in names)]
+        for stamp_s, row in sorted(numbers.items())
+    ]
+    of_views = Stream((STAMP, *names), np.array(rows).reshape(len(rows), len(names) + 1))
+    tables, missing = [*streams_of(session, robot).values(), of_views], ""
+    columns = {name for table in tables for name in table.columns}
+    for kind, form in _FORMS.items():
+        names = [form.format(at + 1) for at in range(joints)]
+        for table in tables:
+            stamps_s, heat = table.group(names)
+            if len(stamps_s) >= _FEWEST_SAMPLES:
+                return _averaged(kind, stamps_s, heat, tables), ""
+        absent = [name for name in names if name not in columns]
+        if len(absent) < joints and not missing:
+            missing = (
+                f"{some_of(absent)} of {names[0]} ... {names[-1]} are missing"
+                if absent
+                else f"{names[0]} ... {names[-1]} are filled together in fewer than "
+                f"{_FEWEST_SAMPLES} rows with a time"
+            )
+    return None, missing or (
+        f"neither a stream nor timed rows of views.csv have temp1_c ... temp{joints}_c or "
+        f"current1_a ... current{joints}_a"
+    )
+
+
+def _averaged(
+    kind: Kind, stamps_s: FloatArray, heat: FloatArray, tables: Sequence[Stream]
+) -> Inputs:
+    """The inputs with the first recorded air temperature, averaged in groups of samples."""
+    of_air = (table.group((_AMBIENT,)) for table in tables)
+    at_s, air = next((group for group in of_air if len(group[0])), (stamps_s, np.zeros((1, 1))))
+    ambient = np.interp(stamps_s, at_s, np.broadcast_to(air[:, 0], len(at_s)))
+    columns = np.column_stack([stamps_s, ambient, heat if kind == "temperatures" else heat**2])
+    starts = np.arange(0, len(columns), -(-len(columns) // _MOST_SAMPLES))
+    lengths = np.diff(np.append(starts, len(columns)))
+    means = np.add.reduceat(columns, starts) / lengths[:, None]
+    return Inputs(kind, means[:, 0], means[:, 2:], means[:, 1])
+
+
+def _expected(inputs: Inputs) -> Heating:
+    """The prior of how links follow what heats them."""
+    count = inputs.signal.shape[1]
+    gain = np.ones(count)
+    if inputs.kind == "currents":
+        gain = _RISE_K / np.maximum(inputs.signal.mean(axis=0), 1e-9)
+    return Heating(inputs.kind, np.full(count, _TAU_S[inputs.kind]), gain)
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalFit:
+    """Drift of an arm."""
+
+    model: ThermalModel  # The arm with its coefficients and their covariance.
+    inputs: Inputs  # What heated the arm.
+    values: FloatArray  # (p,) deviation of the parameters from their prior, in its sigmas.
+    # (p,) posterior over prior sigma of each parameter.
+    shares: FloatArray = field(default_factory=lambda: np.zeros(0))
+    gain: float = 0.0  # Twice the gain in log-likelihood over an arm without drift.
+    before_m: float = 0.0  # Residual of the views without drift, as a root mean square [m].
+    after_m: float = 0.0  # The same with drift [m].
+    # (n,) range of each link's temperature over the views [K].
+    rises_k: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def expected(cls, robot: Robot, nominal: Robot, inputs: Inputs) -> Self:
+        """The prior; `robot` is up to the frame of its poses, the lengths of `nominal` grow."""
+        count, heating = robot.joint_count, _expected(inputs)
+        model = ThermalModel(
+            robot,
+            heating,
+            heating.cold(inputs.signal, inputs.ambient_c),
+            np.full(count, _GROWTH_PER_K),
+            np.zeros(count),
+            np.zeros((0, 0)),
+            nominal.chain.placements[:, :3, 3],
+        )
+        return cls(model, inputs, np.zeros(2 * count + heating.size))
+
+    @property
+    def is_found(self) -> bool:
+        """Whether drift explains the views significantly."""
+        return self.gain > SIGNIFICANT
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(p,) the prior's sigmas."""
+        kind = self.inputs.kind
+        sizes = [_GROWTH_SIGMA_PER_K, _DRIFT_SIGMA_RAD_PER_K, _TAU_SIGMA[kind]]
+        sizes += [_GAIN_SIGMA] * (kind == "currents")
+        return np.repeat(sizes, self.model.joint_count)
+
+    @property
+    def not_determined(self) -> tuple[str, ...]:
+        """The parameters that stay at their prior, by joint."""
+        kinds = ("growth", "drift", "tau", "gain")
+        names = [f"{kind} of {joint}" for kind in kinds for joint in self.model.robot.joint_names]
+        pairs = zip(names, self.shares, strict=False)
+        return tuple(name for name, share in pairs if share > _UNDETERMINED)
+
+    def moved(self, step: FloatArray) -> Self:
+        """The drift after a (p,) step of its values."""
+        model, steps, count = self.model, self.sigmas * step, self.model.joint_count
+        model = replace(
+            model,
+            growth_per_k=model.growth_per_k + steps[:count],
+            drift_rad_per_k=model.drift_rad_per_k + steps[count : 2 * count],
+            heating=model.heating.changed(steps[2 * count :]),
+        )
+        return replace(self, model=model, values=self.values + step)
+
+    def links_c(self, stops: HeatedStops) -> FloatArray:
+        """(m, n) temperatures of the links [deg C]; those without a time are as at the start."""
+        stamps_s = np.nan_to_num(stops.stamps_s, nan=self.inputs.stamps_s[0])
+        return self.model.heating.links_c(self.inputs, stamps_s)
+
+    def motion(self, stops: HeatedStops) -> FloatArray:
+        """(m, 4, 4) drift of the flange at some stops, in its own frame."""
+        return self.model.motion(stops.q, self.links_c(stops))
+
+    def effect(self, robot: str, stops: HeatedStops, stood: Mask, *, held: bool = True) -> Effect:
+        """The parameters as an effect on all s stops, of which the (s,) mask `stood` has the m.
+
+        Held values are at zero and count in the covariance with their prior: the information of the
+        stops is in the problem itself.
+        """
+        stamps_s = np.nan_to_num(stops.stamps_s, nan=self.inputs.stamps_s[0])
+        heated = self.model.heating.jacobian(self.inputs, stamps_s)
+        basis = np.zeros((len(stood), 6, len(self.values)))
+        basis[stood] = self.model.basis(stops.q, self.links_c(stops), heated) * self.sigmas
+        values = np.zeros_like(self.values) if held else self.values
+        prior = PriorInformation(np.eye(len(values)), self.values)
+        fixed = np.full(len(values), held)
+        return Effect(f"temperature of {robot}", values, prior, fixed, None, {robot: basis})
+
+    def applied_to(self, problem: Problem, robot: str, stops: HeatedStops, stood: Mask) -> Problem:
+        """A problem of the cold arm with its drift, whose parameters are free."""
+        poses = problem.poses[robot].copy()
+        poses[stood] = poses[stood] @ self.motion(stops)
+        effect = self.effect(robot, stops, stood, held=False)
+        problem = replace(problem, poses={**problem.poses, robot: poses})
+        return problem.with_effects([*problem.effects, effect])
+
+
 def find_drift(
-    problem: Problem, start: State, stops: ThermalStops, inputs: Inputs, nominal: Robot
+    problem: Problem, start: State, robot: str, stops: HeatedStops, inputs: Inputs, nominal: Robot
 ) -> ThermalFit:
     """Fits an arm's drift with the frames and, where these have significant errors, its links.
 
-    `problem` has the arm as reported, `nominal` is its model.
+    Args:
+        problem: The observations, with the arm as reported.
+        start: Starting values.
+        robot: The robot in the problem.
+        stops: Its stops there, ascending.
+        inputs: What heats the arm.
+        nominal: Its model.
     """
-    robot, poses = stops.robot, problem.poses[stops.robot]
-    model = ArmModel.of(nominal, stops.q, poses[stops.places])
+    poses = problem.poses[robot]
+    mine = np.isin(np.arange(len(poses)), problem.observations.stops[rows_of(problem, robot)])
+    model = ArmModel.of(nominal, stops.q, poses[mine])
     basis = np.zeros((len(poses), 6, model.size_of("links")))
-    basis[stops.places] = model.columns("links", stops.q)
-    noise = starting_noise(problem)
-    likelihood = robot_likelihood(problem, start, noise)
-    links = find_arm_errors(likelihood, problem.robots.index(robot), basis, of_links=True)
-    if links is not None:
-        problem = problem.with_effects([*problem.effects, links.effect(robot)])
-        start = State(start.edges, problem.start_values)
-    return fit_thermal(problem, start, model.robot, stops, inputs, nominal)
-
-
-def is_found(fit: ThermalFit) -> bool:
-    """Whether drift explains the views significantly."""
-    return fit.gain > SIGNIFICANT
+    basis[mine] = model.columns("links", stops.q)
+    with one_blas_thread():
+        likelihood = robot_likelihood(problem, start, starting_noise(problem))
+        links = find_arm_errors(likelihood, problem.robots.index(robot), basis, of_links=True)
+        if links is not None:
+            problem = problem.with_effects([*problem.effects, links.effect(robot)])
+            start = State(start.edges, problem.start_values)
+        cold = fit = fit_problem(problem, start)
+        drift = ThermalFit.expected(model.robot, nominal, inputs)
+        size = len(drift.values)
+        for _ in range(_ROUNDS):
+            warm = drift.applied_to(problem, robot, stops, mine)
+            values = np.append(fit.state.values[: len(cold.state.values)], drift.values)
+            fit = fit_problem(warm, State(fit.state.edges, values), fit.noise)
+            step = fit.state.values[-size:] - drift.values
+            largest = float(np.abs(step).max())
+            drift = drift.moved(step * min(1.0, _LONGEST / max(largest, _SETTLED)))
+            if largest < _SETTLED:
+                break
+        warm = drift.applied_to(problem, robot, stops, mine)
+        state = State(fit.state.edges, np.append(fit.state.values[:-size], drift.values))
+        costs = [
+            robot_levels(part, at, fit.noise, from_above=True)[1]
+            for part, at in ((problem, cold.state), (warm, state))
+        ]
+        information = fisher_information(warm, state, fit.noise)
+        covariance = covariance_among(information, warm.counted)[-size:, -size:]
+        before_m, after_m = (
+            float(np.sqrt(np.mean(np.sum(residuals[rows_of(part, robot), 3:] ** 2, axis=1))))
+            for part, residuals in (
+                (problem, problem.linear(cold.state).residuals),
+                (warm, warm.linear(state).residuals),
+            )
+        )
+    scaled = covariance * np.outer(drift.sigmas, drift.sigmas)
+    return replace(
+        drift,
+        model=replace(drift.model, covariance=scaled),
+        shares=np.sqrt(np.diag(covariance)),
+        gain=2.0 * (costs[0] - costs[1]),
+        before_m=before_m,
+        after_m=after_m,
+        rises_k=np.ptp(drift.links_c(stops), axis=0),
+    )
 
 
 def findings(fit: ThermalFit) -> Iterator[str]:
     """States the drift, for the verdict."""
-    if not is_found(fit):
+    if not fit.is_found:
         yield (
             f"The joints warmed up by {figure(float(fit.rises_k.max()))} K, and the views show no "
             "drift with it beyond chance: none is compensated."
@@ -182,7 +395,7 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
     )
     # Currents determine only the product of a gain and a growth.
-    measured = fit.model.heating.kind == "temperatures"
+    measured = fit.inputs.kind == "temperatures"
     counted = ("growth", "drift") if measured else ("drift",)
     names = [name for name in fit.not_determined if name.startswith(counted)]
     if names:
@@ -193,181 +406,96 @@ def findings(fit: ThermalFit) -> Iterator[str]:
 
 
 def drift_result(
-    fit: ThermalFit, stops: ThermalStops, views: Sequence[int], problem: Problem, solved: Solution
+    fit: ThermalFit, robot: str, stops: HeatedStops, problem: Problem, solved: Solution
 ) -> ThermalResult:
     """A drift's coefficients and its course, as a section of a calibration.
 
-    `views` has a view of each stop, `problem` the inlier observations, and `solved` is their fit.
+    Args:
+        fit: The drift.
+        robot: The robot in the problem.
+        stops: Its stops there, ascending.
+        problem: The inlier observations.
+        solved: Their fit.
     """
-    model = fit.model
-    return ThermalResult(
-        heated_by=model.heating.kind,
-        joints=_joints(model),
-        covariance=model.covariance,
-        lengths_m=model.lengths,
-        not_determined=tuple(fit.not_determined),
-        residual_mm=DriftResidual(without=1e3 * fit.before_m, with_drift=1e3 * fit.after_m),
-        likelihood_ratio=fit.gain,
-        rises_k=tuple(fit.rises_k.tolist()),
-        trained_s=float(np.ptp(stops.stamps_s)),
-        course=_course(fit, _typical_posture(stops.q)),
-        seen=_observed_drift(fit, stops, views, problem, solved.state),
-        views=_by_view(fit, stops, views),
-    )
-
-
-def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
-    """The coefficients joint by joint; sigmas of tau and gain are relative."""
+    model, inputs = fit.model, fit.inputs
     columns = {
         "reference_c": model.reference_c,
         "growth_per_k": model.growth_per_k,
         "drift_rad_per_k": model.drift_rad_per_k,
         "tau_s": model.heating.tau_s,
     }
+    # Sigmas of tau and gain are relative.
     sigmas = np.sqrt(np.diag(model.covariance)).reshape(-1, model.joint_count)
-    names = ["growth_sigma_per_k", "drift_sigma_rad_per_k", "tau_sigma"]
-    if model.heating.kind == "currents":
+    names = ["growth_sigma_per_k", "drift_sigma_rad_per_k", "tau_sigma", "gain_sigma"]
+    if inputs.kind == "currents":
         columns["gain_k_per_a2"] = model.heating.gain_k_per_a2
-        names.append("gain_sigma")
-    columns |= dict(zip(names, sigmas, strict=True))
-    return tuple(
-        JointDrift(joint=joint, **{name: float(column[at]) for name, column in columns.items()})
-        for at, joint in enumerate(model.robot.joint_names)
+    columns |= dict(zip(names, sigmas, strict=False))
+    # Drift over time in the most frequent posture; of several, in the most central one.
+    counts = [int((np.abs(stops.q - q).max(axis=1) < _SAME_RAD).sum()) for q in stops.q]
+    distance = np.abs(stops.q - np.median(stops.q, axis=0)).sum(axis=1)
+    typical = stops.q[np.lexsort((distance, -np.array(counts)))[0]]
+    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _COURSE_POINTS)
+    links, rows = model.heating.links_c(inputs, at_s), np.tile(typical, (_COURSE_POINTS, 1))
+    course = (
+        at_s,
+        1e3 * np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1),
+        1e3 * model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s)),
+        model.rises(links).max(axis=1),
+    )
+    drift_m = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
+    rises, views = model.rises(fit.links_c(stops)).max(axis=1), stops.views.tolist()
+    by_view = zip(views, (1e3 * drift_m).tolist(), rises.tolist(), strict=True)
+    return ThermalResult(
+        heated_by=inputs.kind,
+        joints=tuple(
+            JointDrift(joint=joint, **{name: float(column[at]) for name, column in columns.items()})
+            for at, joint in enumerate(model.robot.joint_names)
+        ),
+        covariance=model.covariance,
+        lengths_m=model.lengths,
+        not_determined=fit.not_determined,
+        residual_mm=DriftResidual(without=1e3 * fit.before_m, with_drift=1e3 * fit.after_m),
+        likelihood_ratio=fit.gain,
+        rises_k=tuple(fit.rises_k.tolist()),
+        trained_s=float(np.ptp(stops.stamps_s)),
+        course=tuple(DriftPoint(*row) for row in np.stack(course, axis=1).tolist()),
+        seen=_observed_drift(fit, robot, stops, typical, problem, solved.state),
+        views=tuple(ViewDrift(*row) for row in by_view),
     )
 
 
-def _by_view(fit: ThermalFit, stops: ThermalStops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
-    """Drift of the flange at (m,) views, and the largest temperature rise of a link."""
-    drift_m = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
-    rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
-    rows = zip(views, (1e3 * drift_m).tolist(), rises.tolist(), strict=True)
-    return tuple(ViewDrift(*row) for row in rows)
-
-
-def _course(fit: ThermalFit, q: FloatArray) -> tuple[DriftPoint, ...]:
-    """Drift of the flange at (n,) joint angles over time, with its sigma."""
-    model, inputs = fit.model, fit.inputs
-    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _COURSE_POINTS)
-    links = model.heating.links_c(inputs, at_s)
-    rows = np.tile(q, (len(at_s), 1))
-    drift_m = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
-    sigma_m = model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s))
-    rises = model.rises(links).max(axis=1)
-    columns = (at_s, 1e3 * drift_m, 1e3 * sigma_m, rises)
-    return tuple(DriftPoint(*row) for row in np.stack(columns, axis=1).tolist())
-
-
 def _observed_drift(
-    fit: ThermalFit, stops: ThermalStops, views: Sequence[int], problem: Problem, state: State
+    fit: ThermalFit,
+    robot: str,
+    stops: HeatedStops,
+    typical: FloatArray,
+    problem: Problem,
+    state: State,
 ) -> tuple[ObservedDrift, ...]:
     """Observed drift of the flange at the stops in the typical posture, by their first view.
 
     The residual of a stop is attributed to its flange, and projected on the drift's direction: its
     length alone would grow with noise.
     """
-    problem = replace(problem, is_combined=False)
-    linearised, pair = problem.linear(state), ArmPair.of(problem, state, stops.robot)
-    of, members = problem.units
-    slots = (members[of[pair.rows]] == problem.robots.index(stops.robot)).argmax(axis=1)
-    stop_ids, first = np.unique(problem.observations.stops[pair.rows], return_index=True)
-    typical = np.abs(stops.q - _typical_posture(stops.q)).max(axis=1) < _SAME_RAD
-    places = np.where(typical, stops.places, -1)
-    _, chosen, at_stops = np.intersect1d(places, stop_ids, return_indices=True)
+    pair, observations = ArmPair.of(problem, state, robot), problem.observations
+    places = np.unique(observations.stops[rows_of(problem, robot)])
+    places[np.abs(stops.q - typical).max(axis=1) >= _SAME_RAD] = -1
+    seen, first = np.unique(observations.stops[pair.rows], return_index=True)
+    _, chosen, at_stops = np.intersect1d(places, seen, return_indices=True)
     if not len(chosen):
         return ()
-    rows, slots = pair.rows[first[at_stops]], slots[first[at_stops]]
-    errors = linearised.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
+    rows = pair.rows[first[at_stops]]
+    errors = pair.at(problem.poses[robot][places[chosen]])[0].by_errors
     # A point alone does not separate a flange's rotation from its position: all counts as position.
-    used = problem.observations.has_rotation[rows, None] | (np.arange(6) >= 3)
-    of_flange = np.linalg.pinv(errors * used[:, None]) @ linearised.residuals[rows, :, None]
-    residual_m = -of_flange[:, 3:, 0]
+    used = observations.has_rotation[rows, None] | (np.arange(6) >= 3)
+    residuals = problem.linear(state).residuals[rows, :, None]
+    residual_m = -(np.linalg.pinv(errors * used[:, None]) @ residuals)[:, 3:, 0]
     drift_m = fit.motion(stops)[chosen, :3, 3]
     # With hardly any drift there is no direction: that of the largest drift is used for all.
     lengths = np.linalg.norm(drift_m, axis=1)
     direction = drift_m[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
-    observed_m = lengths + residual_m @ direction
+    observed_mm = 1e3 * (lengths + residual_m @ direction)
     return tuple(
-        ObservedDrift(views[at], float(stops.stamps_s[at]), 1e3 * drift)
-        for at, drift in zip(chosen.tolist(), observed_m.tolist(), strict=True)
-    )
-
-
-def _typical_posture(q: FloatArray) -> FloatArray:
-    """(n,) the most frequent posture of (s, n) stops; of several, the most central one."""
-    counts = [int((np.abs(q - value).max(axis=1) < _SAME_RAD).sum()) for value in q]
-    distance = np.abs(q - np.median(q, axis=0)).sum(axis=1)
-    return np.asarray(q[np.lexsort((distance, -np.array(counts)))[0]])
-
-
-def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
-    """Reads the inputs that heat an arm from a session; temperatures come before currents.
-
-    Returns:
-        The inputs; or None, and what is missing.
-    """
-    tables = [*streams_of(session, robot).values(), _views_as_stream(session, robot)]
-    for kind, form in _FORMS.items():
-        names = [form.format(at + 1) for at in range(joints)]
-        for table in tables:
-            stamps_s, heat = table.group(names)
-            if len(stamps_s) >= _FEWEST_SAMPLES:
-                return _inputs(kind, stamps_s, heat, tables), ""
-    return None, _missing_columns(tables, joints)
-
-
-def _inputs(kind: Kind, stamps_s: FloatArray, heat: FloatArray, tables: Sequence[Stream]) -> Inputs:
-    ambient = np.zeros(len(stamps_s))
-    for table in tables:
-        at_s, air = table.group((_AMBIENT,))
-        if len(at_s):
-            ambient = np.interp(stamps_s, at_s, air[:, 0])
-            break
-    heat = heat if kind == "temperatures" else heat**2
-    return _averaged(Inputs(kind, stamps_s, heat, ambient))
-
-
-def _averaged(inputs: Inputs) -> Inputs:
-    """Averages neighbouring samples where there are more than warm-up needs."""
-    count = len(inputs.stamps_s)
-    size = -(-count // _MOST_SAMPLES)
-    if size == 1:
-        return inputs
-    starts = np.arange(0, count, size)
-    lengths = np.diff(np.append(starts, count))
-    return Inputs(
-        inputs.kind,
-        np.add.reduceat(inputs.stamps_s, starts) / lengths,
-        np.add.reduceat(inputs.signal, starts, axis=0) / lengths[:, None],
-        np.add.reduceat(inputs.ambient_c, starts) / lengths,
-    )
-
-
-def _views_as_stream(session: Session, robot: str) -> Stream:
-    """A robot's views with a time, as a stream of their numbers."""
-    numbers = {
-        view.stamp_s: view.numbers
-        for view in session.views
-        if view.stamp_s is not None and name_of(session.declaration, "robot", view) == robot
-    }
-    rows = sorted(numbers.items())
-    names = sorted({name for _, row in rows for name in row} - {STAMP})
-    values = [[stamp_s, *(row.get(name, np.nan) for name in names)] for stamp_s, row in rows]
-    return Stream((STAMP, *names), np.array(values).reshape(len(rows), len(names) + 1))
-
-
-def _missing_columns(tables: Sequence[Stream], joints: int) -> str:
-    columns = {name for table in tables for name in table.columns}
-    for form in _FORMS.values():
-        names = [form.format(at + 1) for at in range(joints)]
-        absent = [name for name in names if name not in columns]
-        if len(absent) < joints:
-            return (
-                f"{some_of(absent)} of {names[0]} ... {names[-1]} are missing"
-                if absent
-                else f"{names[0]} ... {names[-1]} are filled together in fewer than "
-                f"{_FEWEST_SAMPLES} rows with a time"
-            )
-    return (
-        f"neither a stream nor timed rows of views.csv have temp1_c ... temp{joints}_c or "
-        f"current1_a ... current{joints}_a"
+        ObservedDrift(int(stops.views[at]), float(stops.stamps_s[at]), drift)
+        for at, drift in zip(chosen.tolist(), observed_mm.tolist(), strict=True)
     )

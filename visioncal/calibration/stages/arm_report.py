@@ -1,0 +1,337 @@
+"""What stops determine of a calibrated arm: its parameters, its accuracy, and remarks on both."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.calibration.guess.joints import JointReading
+from visioncal.calibration.stages import elastic
+from visioncal.calibration.stages.kinematics import SelectedArmLevel
+from visioncal.core.choices import Convention
+from visioncal.core.number_format import figure, listed
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, Mask
+from visioncal.core.verdict import Finding
+from visioncal.estimation.armmodel import RIGID
+from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.identifiability import (
+    Identifiability,
+    Indices,
+    Jacobians,
+    joint_words,
+    joints_to_move,
+    missing_parameters,
+    null_words,
+)
+from visioncal.estimation.parameters import (
+    free_parameters,
+    parameter_jacobian,
+    parameter_moves,
+)
+from visioncal.estimation.problem_parts import State
+from visioncal.estimation.solve import whitened
+from visioncal.estimation.stop_influence import stop_influence
+from visioncal.estimation.workspace import postures
+from visioncal.results.arm import (
+    ArmParameter,
+    ArmResult,
+    ArmSections,
+    CarriedRegion,
+    CarriesOver,
+    JointFunction,
+    JointFunctions,
+    JointRange,
+    Observability,
+    Region,
+    StopInfluence,
+    WorkspacePlace,
+    WorkspaceSigma,
+)
+from visioncal.robot import Robot, convert_table, parallel_axes, table_from_document, table_of
+
+# Number of postures of a map of the accuracy, and of angles per turn of joint error functions.
+_PLACES, _ANGLES = 200, 180
+# Error of real arms between sessions (warm-up, wear, remounting), which one session does not show
+# [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.
+_SESSION_SHARE = 1.2e-4
+# The calibrated arm is better where its error is below this share of the nominal arm's.
+_BETTER = 0.8
+# Angles about the base from the centre of the stops: ahead below the first, behind above the
+# second [rad].
+_AHEAD, _BEHIND = np.pi / 3, 2 * np.pi / 3
+
+
+@dataclass(frozen=True, eq=False)
+class ArmReport:
+    """What was found of an arm."""
+
+    sections: ArmSections = field(default_factory=ArmSections)  # Its sections of a calibration.
+    notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
+    doubts: tuple[Finding, ...] = ()  # Findings against the arm.
+
+
+def report_of(
+    arm: ArmData,
+    levels: SelectedArmLevel,
+    views: Sequence[int],
+    convention: Convention | None,
+    zero: JointReading | None,
+) -> ArmReport:
+    """Reports a calibrated arm.
+
+    Args:
+        arm: The observations of the arm.
+        levels: Its levels.
+        views: (m,) the view of each stop.
+        convention: Convention of the arm's table; see `add_parameters`.
+        zero: Reading of a joint with a lost zero; None without one.
+    """
+    model, notes = arm.model, list[str]()
+    result = replace(
+        levels.result,
+        robot=model.robot,
+        backlash=elastic.plays_of(model, arm.arm_covariance),
+        functions=_functions_of(arm, levels),
+        measured=tuple(
+            JointRange(name, float(column.min()), float(column.max()))
+            for name, column in zip(model.nominal.joint_names, arm.q.T, strict=True)
+        ),
+    )
+    # With backlash and compliance alone the table stays nominal.
+    if model.weights.keys() & set(RIGID):
+        result, advice = add_parameters(result, arm, views, convention, zero)
+        with one_blas_thread():
+            carried = _carries_over(arm, levels)
+        result = replace(result, left_out=levels.left_out(), carries_over=carried)
+        notes += [carried.words, advice] if advice else [carried.words]
+    springs = elastic.elastic_of(arm, levels.errors, views)
+    notes += elastic.play_remarks(result.backlash)
+    notes += () if springs is None else elastic.remarks(springs)
+    doubts = () if springs is None else tuple(elastic.doubts(springs))
+    return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), doubts)
+
+
+def add_parameters(
+    result: ArmResult,
+    arm: ArmData,
+    views: Sequence[int],
+    convention: Convention | None = None,
+    zero: JointReading | None = None,
+) -> tuple[ArmResult, str]:
+    """Adds the parameters of an arm that the stops determine, and how accurate the arm is.
+
+    Args:
+        result: The arm's section of a calibration.
+        arm: The observations of the arm.
+        views: (m,) the view of each stop.
+        convention: Convention of the table; None for the stated one, or Hayati's where axes are
+            nearly parallel, as it has no singularity there.
+        zero: Reading of a joint with a lost zero.
+
+    Returns:
+        The section, and which stops to add; empty where none would determine more.
+    """
+    model, nominal, advice = arm.model, arm.model.nominal, ""
+    has_table = "convention" in nominal.document
+    before = table_from_document(nominal.document) if has_table else table_of(nominal, "standard")
+    if convention is None and parallel_axes(nominal).any():
+        convention = "hayati"
+    before = convert_table(before, convention or before.convention)
+    after = table_of(model.bare, before.convention, like=before)
+    parameters = free_parameters(model, before)
+    anywhere = postures(model.robot)
+    shares = np.random.default_rng(0).uniform(size=(_PLACES, arm.q.shape[1]))
+    near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
+    with one_blas_thread():
+        weight = arm.pair.weight(arm.noise, arm.measured)
+        whole = whitened(arm.problem, arm.state, arm.noise, arm.measured)[1]
+        whole = whole.reshape(-1, arm.problem.size)
+        errors = whole[:, arm.columns[model.is_kept]] * arm.error_rad
+        by_errors = _error_jacobians(arm, anywhere, weight)
+        units = [parameter.unit for parameter in parameters]
+        by_parameters = _pair_jacobians(
+            arm.pair,
+            nominal.base_from_flange(anywhere) @ model.flange_from_reported,
+            parameter_jacobian(before, parameters, anywhere, model.flange_from_reported) * units,
+            weight,
+        )
+        counts = Identifiability.of(Jacobians(whole[:, arm.frames], errors), by_errors)
+        not_determined = list(null_words(by_parameters, parameters, nominal))
+        if counts.missing.size:
+            moves = joints_to_move(
+                model.robot,
+                arm.q,
+                lambda q: _error_jacobians(arm, q, weight).count_determined(),
+                counts.identifiable - counts.determined,
+            )
+            named = missing_parameters(
+                by_parameters, by_errors, counts.missing, parameters, nominal
+            )
+            wanted = [
+                f"joint {move.joint + 1} by {_distance_words(move.wanted, move.joint, nominal)}"
+                for move in moves
+            ]
+            moved = [
+                f"{joint_words(move.joint, nominal)} moved by "
+                f"{_distance_words(move.moved, move.joint, nominal)} only"
+                for move in moves
+            ]
+            not_determined.append(
+                f"{listed(moved)}, too little to determine {named}"
+                if moved
+                else f"these stops do not determine {named}"
+            )
+            further = f"that move {listed(wanted)} or more" if wanted else "all over the workspace"
+            advice = (
+                f"The stops determine {counts.determined} of the {counts.identifiable} "
+                f"identifiable values of this arm and its frames: {not_determined[-1]}. What is "
+                f"not determined stays about as stated. Add stops {further}."
+            )
+        place = arm.place_jacobian(anywhere)[0]
+        sigmas_mm, near_mm = (1e3 * arm.place_sigmas_m(array) for array in (anywhere, near))
+        influence = stop_influence(
+            arm.problem, arm.state, arm.noise, arm.stops, place, arm.chain
+        ).tolist()
+        jacobian = parameter_moves(model, after, parameters)
+        covariance = arm.arm_covariance
+        sigmas = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)).tolist()
+    links, rows = arm.error_rad * model.weights.get("links", 1.0), []
+    for parameter, sigma, by_row in zip(parameters, sigmas, jacobian, strict=True):
+        stated, identified = parameter.value(before), parameter.value(after)
+        if zero is not None and parameter.name == "theta_rad":
+            # The fit starts at the zero that was found; changes are from the stated one.
+            scale = nominal.chain.functions[parameter.joint, 1]
+            stated -= float(scale * zero.zeros[parameter.joint])
+        rows.append(
+            ArmParameter(
+                joint=nominal.joint_names[parameter.joint],
+                name=parameter.name,
+                nominal=stated,
+                identified=identified,
+                change=identified - stated,
+                # A parameter that base or flange absorbs keeps its prior sigma.
+                sigma=max(sigma, 0.0 if by_row.any() else links * parameter.unit),
+            )
+        )
+    indices = Indices.of(counts.values, len(arm.stops)) if len(counts.values) else None
+    figures = {} if indices is None else {"condition": indices.condition, **vars(indices)}
+    ordered = sorted(zip(influence, views, strict=True), key=lambda pair: -pair[0])
+    maps = (
+        np.column_stack([model.robot.base_from_flange(q)[:, :3, 3], mm])[:_PLACES].tolist()
+        for q, mm in ((anywhere, sigmas_mm), (near, near_mm))
+    )
+    workspace_map, measured_map = (tuple(WorkspacePlace(*row) for row in rows) for rows in maps)
+    result = replace(
+        result,
+        convention=before.convention,
+        parameters=tuple(rows),
+        workspace_sigma_mm=WorkspaceSigma(
+            float(np.median(sigmas_mm)), float(np.quantile(sigmas_mm, 0.95))
+        ),
+        workspace_map=workspace_map,
+        measured_map=measured_map,
+        observability=Observability(
+            columns=counts.columns,
+            identifiable=counts.identifiable,
+            determined=counts.determined,
+            **figures,
+        ),
+        not_determined=tuple(not_determined),
+        stops=tuple(StopInfluence(view, share) for share, view in ordered),
+    )
+    return result, advice
+
+
+def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
+    """Jacobians by frames and arm errors at (k, n) postures, weighted as for the stops' noise."""
+    columns = arm.model.basis_without_harmonics(q) * arm.error_rad
+    return _pair_jacobians(arm.pair, arm.model.base_from_flange(q), columns, weight)
+
+
+def _pair_jacobians(
+    pair: ArmPair, flange: FloatArray, flange_jacobian: FloatArray, weight: FloatArray
+) -> Jacobians:
+    """Jacobians of the pair by the frames at both ends, and through a (k, 6, p) flange Jacobian."""
+    by_flange = weight @ pair.at(flange)[0].by_errors
+    frames, arm = by_flange @ pair.frame_jacobian(flange), by_flange @ flange_jacobian
+    return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, flange_jacobian.shape[2]))
+
+
+def _distance_words(distance: float, joint: int, robot: Robot) -> str:
+    if robot.chain.prismatic[joint]:
+        return f"{figure(1e3 * distance)} mm"
+    return f"{figure(float(np.rad2deg(distance)))} deg"
+
+
+def _functions_of(arm: ArmData, levels: SelectedArmLevel) -> JointFunctions | None:
+    """Tables of an arm's joint error functions; None where none were found."""
+    if levels.functions is None:
+        return None
+    errors, sigmas = arm.function_errors(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False))
+    rows = zip(arm.model.nominal.joint_names, 1e3 * errors, 1e3 * sigmas, strict=True)
+    return JointFunctions(
+        size_mrad=1e3 * levels.functions.sigma_rad,
+        length_deg=float(np.rad2deg(levels.functions.length_rad)),
+        joints=tuple(
+            JointFunction(name, tuple(error.tolist()), tuple(sigma.tolist()))
+            for name, error, sigma in rows
+        ),
+    )
+
+
+def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:
+    """Computes where a calibrated arm is more accurate than the nominal one."""
+    model, q = arm.model, postures(arm.model.robot)
+    flange = model.base_from_flange(q)
+    places, jacobian = flange[:, :3, 3], arm.place_jacobian(q)[1]
+    noise = np.repeat(arm.noise.robots[arm.problem.robots.index(arm.robot)], 3) ** 2
+    session_m = _SESSION_SHARE * float(np.linalg.norm(places, axis=1).max())
+    variances = np.einsum("mij,j,mij->m", jacobian, noise, jacobian) + session_m**2
+    variances += arm.place_sigmas_m(q) ** 2
+    difference = _carried_position(arm, arm.state, flange) - _carried_position(
+        arm,
+        levels.nominal.fit.state,
+        model.nominal.base_from_flange(q) @ model.flange_from_reported,
+    )
+    # The calibrated arm's own error is independent of its difference from the nominal arm.
+    squares = 1e6 * np.array([variances, np.sum(difference**2, axis=1) + variances])
+    regions = list(_regions(places, model.base_from_flange(arm.q, arm.loads)[:, :3, 3]))
+    box = regions[0][1]
+    sigma_mm, nominal_mm = np.sqrt(squares[:, ~box if (~box).any() else box].mean(axis=1)).tolist()
+    carried = []
+    for name, region in regions:
+        if region.any():
+            ours_mm, theirs_mm = np.sqrt(squares[:, region].mean(axis=1)).tolist()
+            carried.append(CarriedRegion(name, ours_mm, theirs_mm, ours_mm < _BETTER * theirs_mm))
+    return CarriesOver(
+        measured_mm=levels.result.chosen.held_out_mm,
+        measured_nominal_mm=levels.result.nominal.held_out_mm,
+        sigma_mm=sigma_mm,
+        nominal_mm=nominal_mm,
+        session_mm=1e3 * session_m,
+        better_share=float(np.mean(squares[0] < _BETTER**2 * squares[1])),
+        regions=tuple(carried),
+    )
+
+
+def _carried_position(arm: ArmData, state: State, flange: FloatArray) -> FloatArray:
+    """Position (k, 3) of what the arm carries, in the frame of what stands still [m]."""
+    pair = ArmPair.of(arm.problem, state, arm.robot)
+    poses = pair.at(flange)[1]
+    if pair.is_observer_carried:
+        return invert(poses)[:, :3, 3]
+    return np.asarray(poses[:, :3, :3] @ arm.at + poses[:, :3, 3])
+
+
+def _regions(places: FloatArray, stops: FloatArray) -> Iterator[tuple[Region, Mask]]:
+    """Masks (k,) of places in the stops' bounding box, and outside it by angle about the base."""
+    box = np.all((places >= stops.min(axis=0)) & (places <= stops.max(axis=0)), axis=1)
+    centre = stops.mean(axis=0)
+    angle = np.arctan2(places[:, 1], places[:, 0]) - np.arctan2(centre[1], centre[0])
+    angle = np.abs((angle + np.pi) % (2 * np.pi) - np.pi)
+    yield "box", box
+    yield "ahead", ~box & (angle < _AHEAD)
+    yield "beside", ~box & (angle >= _AHEAD) & (angle <= _BEHIND)
+    yield "behind", ~box & (angle > _BEHIND)
