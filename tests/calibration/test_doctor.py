@@ -51,23 +51,6 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     assert f"visioncal calibrate {sound} -o out" in done.out
 
 
-def test_rows_that_no_image_shows_are_counted(sound, tmp_path):
-    folder = tmp_path / "rows"
-    shutil.copytree(sound, folder)
-    described = (
-        'kind = "charuco"\ncolumns = 9\nrows = 7\nsquare_m = 0.03\nmarker_m = 0.022\n'
-        'dictionary = "DICT_5X5_100"\n'
-    )
-    (folder / "board.toml").write_text(described)
-    edit(folder, lambda text: text.replace("charuco_9x6_30mm", "board.toml"))
-    found = visioncal.doctor(folder)
-    # Another row is no mistake of what is there.
-    assert found.is_sound
-    (said,) = (name for name in found.seen if "rows of squares" in name)
-    assert re.match(r"6 rows of squares, where 7 are declared and \d+ images have room", said)
-    assert "rows of squares" not in str(visioncal.doctor(sound))
-
-
 def test_images_that_are_named_without_their_folder_are_found_in_it(sound, tmp_path):
     folder = tmp_path / "bare"
     shutil.copytree(sound, folder)

@@ -17,7 +17,7 @@ from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import PartialCalibration, start_from_session
 from visioncal.results import Calibration
-from visioncal.session import MemoryImages, Session, View
+from visioncal.session import MemoryImages, Session
 from visioncal.simulation import CellOptions, Second, SimulatedCell, simulate
 from visioncal.simulation.records import cell_session
 
@@ -243,36 +243,3 @@ def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
     verdict = calibrate(cell_session(simulate(arm), "measured", seen="poses")).verdict
     assert "board_size" not in {finding.kind for finding in verdict.findings}
-
-
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_rotations_that_scatter_with_the_measurement_are_not_blamed_on_the_arm(mount):
-    session = cell_session(
-        simulate(CellOptions(mount=mount, views=16, seed=3)), "marker", seen="poses"
-    )
-    names = [f"cft_{name}" for name in POSE]
-
-    def turned(view: View) -> View:
-        # By how it is seen, as a single marker is by its own errors: its posture shows in them.
-        numbers = [view.numbers[name] for name in names]
-        seen = Rotation.from_quat(numbers[3:])
-        shift = 5e-4 * np.sin(2.0 * seen.as_rotvec())
-        quaternion = (seen * Rotation.from_rotvec(0.02 * np.sin(3.0 * seen.as_rotvec()))).as_quat()
-        new = [*np.add(numbers[:3], shift).tolist(), *quaternion.tolist()]
-        return replace(view, numbers={**view.numbers, **dict(zip(names, new, strict=True))})
-
-    views = tuple(turned(view) for view in session.views)
-    verdict = calibrate(replace(session, views=views)).verdict
-    assert verdict.status != "good"
-    assert verdict.ranked[0].kind == "measured_turns"
-    assert not any("joint angles" in str(finding.do) for finding in verdict.findings)
-
-
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_an_arm_whose_angles_are_off_is_no_bad_measurement_of_rotations(mount):
-    cell = simulate(CellOptions(mount=mount, views=16, dh_sigma_rad=5e-3, seed=1))
-    # Without the arm's model, which would be calibrated.
-    session = replace(cell_session(cell, "measured", seen="poses"), robot_document=None)
-    verdict = calibrate(session).verdict
-    assert verdict.ranked[0].kind == "arm_errors"
-    assert "measured_turns" not in {finding.kind for finding in verdict.findings}

@@ -1,18 +1,13 @@
 """The verdict: each doubt by itself, with the sentence that tells of it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.sound_findings import SOUND, changed, directions, left_out, views
 
-from visioncal.calibration.stages.need import Picks
 from visioncal.calibration.suspects.judge import judge
-from visioncal.calibration.suspects.judged import Sensor
 from visioncal.core.number_format import figure
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import remarks
-from visioncal.estimation.observability import Direction
 from visioncal.results import Rms
 
 LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
@@ -35,16 +30,6 @@ def test_noise_that_chance_makes_of_a_good_arms_is_no_doubt():
         ({"held_out": Rms(0.2, 0.011)}, "check", "fit 2.0 times worse than views in the fit"),
         ({"held_out": Rms(0.5, 0.011)}, "bad", "fit 5.0 times worse"),
         ({"held_out": Rms(0.11, 0.02)}, "check", "fit 2.0 times worse"),
-        (
-            {"views": views(residual_mm=0.9), "noise_mm": None},
-            "check",
-            "View 7 stands out: it places the target 0.9",
-        ),
-        (
-            {"noise_mm": None, "views": views(residual_deg=0.2)},
-            "check",
-            "0.2 deg from the others, 20 times",
-        ),
         ({"holdout": Rms(2.0, 0.01)}, "check", "holds back are missed by 2 mm"),
         ({"holdout": Rms(0.1, 0.4)}, "check", "0.4 deg, 36 times worse"),
         (
@@ -90,7 +75,6 @@ def test_each_doubt_has_its_sentence(changes, status, words):
     "changes",
     [
         {"holdout": Rms(0.2, 0.02)},
-        {"views": views(residual_mm=0.5)},
         {"lost": LOST[:3]},
         {"pixel_px": None},
         {"noise_mm": None},
@@ -162,16 +146,3 @@ def test_what_settles_it_comes_first():
     verdict = judge(changed(SOUND, pixel_px=4.0, warnings=remarks(("Something.",)), stops=8))
     assert verdict.reasons[0].startswith("Corners deviate")
     assert len(verdict.reasons) == 3
-
-
-def test_views_of_a_cell_are_planned_for_the_camera_that_is_known_least():
-    sensors = [Sensor(9, name=f"cam_{name}") for name in ("hand", "left", "top", "fixed")]
-    # No robot looks with the fixed one: of it no stop can be planned.
-    picks = [Picks(sensor.name, "b", {}, 9.0, 1.0) for sensor in sensors[:3]]
-    worst = [
-        Direction(f"{name}'s offset along the cell's x", sigma, 1e-3, is_rotation=False)
-        for name, sigma in (("cam_left", 1e-3), ("cam_top", 3e-3), ("cam_fixed", 5e-3))
-    ]
-    cell = replace(SOUND, sensors=sensors, picks=picks, worst=worst)
-    assert cell.of_camera == " --camera top"
-    assert SOUND.of_camera == ""

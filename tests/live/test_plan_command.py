@@ -13,7 +13,6 @@ from support.commands import Done, visioncal
 from support.drawn import column
 from support.marks import slow
 
-from visioncal.calibration.pipeline.explaining import with_proposal
 from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
@@ -339,16 +338,6 @@ def test_arms_that_no_ur_program_drives_get_none(tmp_path):
     assert {path.name for path in out.iterdir()} == FILES - {"plan.script"}
     header = (out / "stops.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
     assert header[:9] == ["view", "image", *(f"q{index}_rad" for index in range(1, 8))]
-
-
-def test_advice_to_add_views_names_the_command_once():
-    sentences = ("It is bent. Print it anew.", "Weak. Add views tilted.", "Few. Add 5 or more.")
-    first, second, third = with_proposal(sentences, modelled=True)
-    assert second == "Weak. Add views tilted. Let visioncal plan SESSION --add 5 propose them."
-    assert (first, third) == (sentences[0], sentences[2])
-    (arm,) = with_proposal(["Add stops that move joint 5 by 60 deg or more."], modelled=True)
-    assert arm.endswith("Let visioncal plan SESSION --add 5 --for kinematics propose them.")
-    assert with_proposal(["Measure the board."], modelled=True) == ("Measure the board.",)
 
 
 def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_path):

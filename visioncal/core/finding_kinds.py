@@ -49,7 +49,6 @@ _SOURCES = (
     "robot_noise_of_pick",
     "uncorrected_targets",
 )
-_OF_ROBOT = (ARM_ERRORS, "robot_noise", "robot_noise_of_pick")
 _STEPS = (MOVED_FRAME, "joint_slipped", BOARD_CHANGED)
 _BOARD = ("board_size", "board_shape")
 # A step makes errors by posture and time correlate before and after it, and is tested beside them.
@@ -61,7 +60,7 @@ _BY_CHAIN = (
     GOOD_FOR,
     *_SOURCES,
     *_BOARD,
-    *("lens", "lens_field", "corner_noise", ARM_ERRORS, "measured_turns", "prior"),
+    *("lens", "lens_field", "corner_noise", ARM_ERRORS, "prior"),
     *_STEPS,
 )
 
@@ -125,8 +124,6 @@ _KINDS = (
     Kind("focus", 1e-4, CHAIN),
     Kind(LENS_CHANGED, 1e-4, CHAIN, hides=(CHAIN,), inflates=_INFLATED),
     Kind("corner_noise", 1e-4, CORNERS),
-    # Badly measured rotations inflate all apparent errors of the robot.
-    Kind("measured_turns", 1e-4, CHAIN, hides=(ARM_ERRORS,), inflates=_OF_ROBOT),
     Kind(ARM_ERRORS, 1e-4, CHAIN, order=1),
     Kind(UNEXPLAINED, REMARK, CHAIN, size=3, order=1),
     # The size of errors.

@@ -17,9 +17,7 @@ from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cell import Cell, read_cell
 from visioncal.calibration.stages.image_checks import unnamed_images, unseen_cause
-from visioncal.calibration.stages.image_size import other_images
-from visioncal.calibration.stages.intrinsics import estimate_intrinsics
-from visioncal.calibration.stages.observed import CameraObservations, by_reason
+from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.suspects.ranking import LEAST_RUN
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
@@ -28,23 +26,14 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.summaries import html_card
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, Mask, Mount, Progress
+from visioncal.core.types import Mask, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
 from visioncal.session import Session
-from visioncal.vision.boards import kind_of
-from visioncal.vision.boards.board import hidden_corners
 
-# The image is divided into this many parts per axis; the estimation of a lens needs corners in at
-# least this many of all parts.
-_PARTS, _LEAST_PARTS = 4, 7
-# Fewest images with room for a board's row, but without it, that show that the row does not exist.
-_LEAST_WITHOUT = 3
-# Largest distance of the principal point from the middle of the image, as a share of the half size.
-_OFF_CENTRE = 0.15
 # Noise of corners beyond which a lens is in doubt [px], and of the flange [mm].
 _MOST_PX, _MOST_MM = CalibrationLimits().pixel_px[0], 1.0
-# Kinds of warnings that are no fault of the session.
-_NO_FAULT = ("unused",)
+# Kind of warnings that are no fault of the session.
+_NO_FAULT = "unused"
 
 
 @dataclass(frozen=True)
@@ -133,35 +122,38 @@ def _run_stages(run: RunState) -> tuple[RunState, VisioncalError | None]:
 
 def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     cause = unseen_cause(run) if error is not None or run.reasons else None
+    hint, read = None, list[Finding]()
+    if error is None and run.mount is not None:
+        hint = misread_pose_finding(run)
+        read += [] if hint is None else [hint]
+    elif error is None:
+        read += misreadings(run)
+    if error is None and not read:
+        read += turned_boards(run)
+    if run.mount is None and (error is not None or not read):
+        names = exchanged_names(run)
+        read = read if names is None else [names]
     if cause is not None:
         yield cause
-    hint = misread_pose_finding(run) if error is None and run.mount is not None else None
-    if hint is not None:
-        yield hint
-    readings = [*misreadings(run)] if error is None and run.mount is None else []
-    if error is None and hint is None and not readings:
-        yield from turned_boards(run)
-    if run.mount is None:
-        names = None if readings else exchanged_names(run)
-        yield from readings if names is None else [names]
+    yield from read
     if error is not None and cause is None:
         yield _refused("refused", error)
-    reported = () if cause is None else (cause.kind,)
     warnings = [
         warning
         for warning in run.warnings
-        if warning.kind not in (*_NO_FAULT, *reported)
+        if warning.kind != _NO_FAULT
+        and (cause is None or warning.kind != cause.kind)
         and (hint is None or warning.words not in hint.words)
     ]
-    has_lens = "other_lens" in {warning.kind for warning in warnings}
+    has_lens = any(warning.kind == "other_lens" for warning in warnings)
     lens = [] if error is not None or has_lens else list(_lenses(run))
     yield from sorted([*lens, *warnings], key=lambda value: value.do is None)
     if error is None:
         if hint is None and run.mount is not None and not lens:
             yield from _motion(run, run.mount)
         yield from _lost(run)
-        yield from _coverage(run)
-    if not {MISSING, "shared_image"} & {finding.kind for finding in (*warnings, cause) if finding}:
+    kinds = {finding.kind for finding in (*warnings, *([] if cause is None else [cause]))}
+    if not kinds & {MISSING, "shared_image"}:
         yield from unnamed_images(run.session)
 
 
@@ -171,46 +163,21 @@ def _refused(kind: str, error: VisioncalError) -> Finding:
 
 def _lenses(run: RunState) -> Iterator[Finding]:
     """Findings on stated lenses that do not fit the images."""
-    step = Remedy("In session.toml, delete matrix and distortion, so that they are estimated.")
     for frame, look in run.cameras.items():
-        stated = look.table.stated
-        if stated is None:
+        stated, noise_px = look.table.stated, look.pixel_px
+        # Noise that is only stated says nothing of the lens.
+        if stated is None or noise_px in {None, *(px.stated_px for px in look.corners.values())}:
             continue
-        middle = (np.array(stated.resolution) - 1.0) / 2.0
-        shares = stated.matrix[2:] / middle
-        words, mend = "", step
-        if np.all(np.abs(shares - 1.0) > _OFF_CENTRE) and abs(shares[0] / shares[1] - 1.0) < 0.1:
-            x, y = stated.matrix[2:]
-            words = (
-                f"The stated matrix is of images of another size: its centre is at ({x:.0f}, "
-                f"{y:.0f}) px, and the middle of these is at ({middle[0]:.0f}, {middle[1]:.0f}) px."
-            )
-            words, mend = _resized(run, look, stated) or (words, mend)
-        elif (noise_px := _measured_px(look)) > _MOST_PX:
-            words = (
-                f"Corners deviate by {figure(noise_px)} px from any pose of a flat board "
-                f"(doubt begins at {_MOST_PX:g}): the stated lens is not this camera's, or the "
-                "board is not flat."
-            )
-        if words:
-            yield Finding("lens", words, mend).of(frame if len(run.cameras) > 1 else "")
-
-
-def _resized(run: RunState, look: CameraObservations, stated: Camera) -> tuple[str, Remedy] | None:
-    """Message and remedy on a stated matrix of other images, by estimating the lens."""
-    targets, model = tuple(run.session.boards.values()), look.table.model
-    try:
-        estimated = estimate_intrinsics(look.corners, targets, stated.resolution, model)
-    except VisioncalError:
-        return None
-    words, do = other_images(stated, estimated.camera.matrix)
-    return (words, Remedy(do)) if words else None
-
-
-def _measured_px(look: CameraObservations) -> float:
-    """Measured noise of a corner's coordinate [px]; zero where it is only stated."""
-    stated = {corners.stated_px for corners in look.corners.values()}
-    return 0.0 if look.pixel_px is None or look.pixel_px in stated else look.pixel_px
+        if noise_px is not None and noise_px > _MOST_PX:
+            yield Finding(
+                "lens",
+                f"Corners deviate by {figure(noise_px)} px from any pose of a flat board (doubt "
+                f"begins at {_MOST_PX:g}): the stated lens is not this camera's, or the board is "
+                "not flat.",
+                Remedy(
+                    "In session.toml, delete matrix and distortion, so that they are estimated."
+                ),
+            ).of(frame if len(run.cameras) > 1 else "")
 
 
 def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
@@ -220,42 +187,39 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
     except VisioncalError as error:
         yield _refused("motion", error)
         return
-    outliers = [cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist()]
-    named = some_of([*map(str, outliers)])
+    views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist())
+    named, one = some_of([*map(str, views)]), len(views) == 1
     if _is_run(cell, inliers.used):
-        do = "Calibrate: the verdict says what it is, where one change explains it."
         yield Finding(
             "something_moved",
-            f"Views {named} disagree with the others, and follow each other: from view "
-            f"{outliers[0]} to view {outliers[-1]}, something stood elsewhere or was set up "
-            "otherwise.",
-            Remedy(do, CALIBRATE),
-            tuple(outliers),
+            f"Views {named} disagree with the others, and follow each other: from view {views[0]} "
+            f"to view {views[-1]}, something stood elsewhere or was set up otherwise.",
+            Remedy(
+                "Calibrate: the verdict says what it is, where one change explains it.", CALIBRATE
+            ),
+            views,
         )
-    elif outliers:
-        one, rows = len(outliers) == 1, ", ".join(map(str, outliers))
+    elif views:
         yield Finding(
             "wrong_views",
             f"{'View' if one else 'Views'} {named} {'disagrees' if one else 'disagree'} with the "
-            f"others: {'its' if one else 'their'} pose or image is wrong, or something moved.",
+            "others: a pose or an image is wrong, or something moved.",
             Remedy(
-                f"Look at {'its image and pose' if one else 'their images and poses'}: repeat "
-                f"{'it' if one else 'them'}, or in views.csv, delete the row{'' if one else 's'} "
-                f"of view {rows}."
+                "Look at images and poses: repeat these views, or in views.csv, delete the "
+                f"row{'' if one else 's'} of view {', '.join(map(str, views))}."
             ),
-            tuple(outliers),
+            views,
         )
     used, (enough, _) = int(inliers.used.sum()), CalibrationLimits().stops
     if used < enough:
-        do = (
-            f"Add {counted(enough - used, 'view')} or more, tilted by 20 to 40 degrees about "
-            "different axes."
-        )
         yield Finding(
             "few_stops",
             f"Only {counted(used, 'view')} can be used; {enough} or more give a result something "
             "to be checked with.",
-            Remedy(do),
+            Remedy(
+                f"Add {counted(enough - used, 'view')} or more, tilted by 20 to 40 degrees about "
+                "different axes."
+            ),
         )
     rad, metres = inliers.fit.noise.robots[0].tolist()
     if 1e3 * metres > _MOST_MM:
@@ -291,24 +255,6 @@ def _lost(run: RunState) -> Iterator[Finding]:
             yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Remedy(do))
 
 
-def _coverage(run: RunState) -> Iterator[Finding]:
-    """Findings on cameras whose lens is to be estimated from corners in too little of the image."""
-    for frame, look in run.cameras.items():
-        if look.resolution is None or look.table.stated is not None or not look.corners:
-            continue
-        px = np.concatenate([corners.px for corners in look.corners.values()])
-        part = np.floor(_PARTS * px / np.array(look.resolution)).clip(0, _PARTS - 1)
-        filled = len(np.unique(part @ [_PARTS, 1]))
-        if filled < _LEAST_PARTS:
-            words = (
-                f"The board was seen in {filled} of {_PARTS**2} parts of the image alone, and the "
-                f"lens, which session.toml does not state, needs it all over the image: "
-                f"{_LEAST_PARTS} parts and more."
-            )
-            step = Remedy("Add views with the board near the image's edges and corners, or nearer.")
-            yield Finding("coverage", words, step).of(frame if len(run.cameras) > 1 else "")
-
-
 def _contents(run: RunState) -> Iterator[str]:
     """The contents of the session, in a few words each."""
     session = run.session
@@ -323,7 +269,6 @@ def _contents(run: RunState) -> Iterator[str]:
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
         seen = counted(len(look.corners), "image" if images else "view")
         yield f"the board in {seen}{size}{edges}"
-        yield from _unseen_rows(session, look)
     for robot, reported in run.robots.items():
         # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
@@ -331,35 +276,6 @@ def _contents(run: RunState) -> Iterator[str]:
             yield f"{counted(len(poses), 'pose')} of {whose}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
-
-
-def _unseen_rows(session: Session, look: CameraObservations) -> Iterator[str]:
-    """Last rows of a ChArUco board that are in no image, though there is room for them."""
-    # A board with fewer rows has the same marker numbers: nothing else shows that too many rows are
-    # declared.
-    target = session.target
-    if (
-        target is None
-        or session.targets
-        or not kind_of(target).marks_squares
-        or look.resolution is None
-    ):
-        return
-    columns, rows = target.columns - 1, target.rows - 1
-    numbers = [int(corners.ids.max()) // columns + 1 for corners in look.corners.values()]
-    seen = max(numbers, default=rows)
-    last, shape = np.arange(seen * columns, rows * columns), look.resolution[::-1]
-    # With most of its corners seen, the board's place in the image is known well.
-    clear = (item for item in look.corners.values() if 2 * len(item.ids) > seen * columns)
-    squares = kind_of(target).corners(target) / target.square_m
-    without = [
-        corners for corners in clear if np.isin(last, hidden_corners(corners, shape, squares)).all()
-    ]
-    if len(last) and len(without) >= _LEAST_WITHOUT:
-        yield (
-            f"{seen + 1} rows of squares, where {target.rows} are declared and {len(without)} "
-            "images have room for all: count them, unless something covers the rest"
-        )
 
 
 def next_command(checkup: Checkup, session: Path | str) -> str:

@@ -21,9 +21,9 @@ from visioncal.calibration.pipeline.fault_messages import moved_finding
 from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.distance_scale import distance_scale, measured_turns
+from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.need import PickInputs, predict_picks
-from visioncal.calibration.stages.priors import prior_findings
+from visioncal.calibration.stages.priors import components
 from visioncal.calibration.stages.random_effects import random_effect_findings
 from visioncal.calibration.suspects.judged import (
     Findings,
@@ -67,7 +67,12 @@ def findings_of(run: RunState) -> Findings:
     of_arms = doubts_of_arms(solved.arms, answer.steps, answer.arms, solved.level, solved.cell)
     found = [*(_with_alternative(doubt, run) for doubt in of_arms), *lens_findings(answer.lenses)]
     of_rest = [
-        *prior_findings(answer.problem, answer.state, answer.covariance, solved.cell.priors),
+        *(
+            component.finding
+            for component in components(
+                answer.problem, answer.state, answer.covariance, solved.cell.priors
+            )
+        ),
         *solved.camera_findings(answer.covariance),
         *random_effect_findings(solved.inlier_problem, solved.inlier_fit.fit, answer.covariance),
     ]
@@ -188,24 +193,18 @@ def _place(words: str, budget_mm: Mapping[str, float], radius95_mm: float) -> Po
 
 
 def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
-    """Findings on measured poses whose scale or rotations differ from the robot's."""
+    """Finding on measured poses whose scale differs from the robot's."""
     usable = run.poses.keys() - run.reasons.keys()
     views = [view for view in run.base_from_flange if view in usable]
     if run.cameras or run.mount == "instrument" or not views:
         return
-    in_hand = run.mount == "eye-in-hand"
     poses = np.array([run.base_from_flange[view] for view in views])
     seen = np.array([run.poses[view].cam_from_target[0] for view in views])
-    parent = poses if in_hand else invert(poses)
+    parent = poses if run.mount == "eye-in-hand" else invert(poses)
     # The camera may have a name.
     (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
-    target = edge.matrix @ seen
-    for finding in (
-        distance_scale(parent, seen, edge.matrix),
-        measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target),
-    ):
-        if finding is not None:
-            yield finding
+    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
+        yield finding
 
 
 def _cell_accuracy(run: RunState) -> _Parts:

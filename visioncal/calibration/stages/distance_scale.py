@@ -1,20 +1,14 @@
-"""Scale and rotation errors of poses that another program measured, by the robot's motion."""
+"""Scale error of poses that another program measured, by the robot's motion."""
 
 import numpy as np
 
-from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import cross, invert, log, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 
 # A scale error is reported above the first share and this number of sigmas. An arm's lengths may
 # explain it, unless the scale leaves less than the third share of the misfit, or is above the last.
 _LEAST, _SURE, _EXPLAINED, _NO_ARM = 2e-3, 5.0, 0.1, 0.02
-
-# Least ratio of the shift that rotation scatter would cause to the actual one: arm errors and noise
-# give about one at most. Fewest views for the test.
-_BEYOND_ARM, _LEAST_VIEWS = 2.0, 8
 
 
 def distance_scale(
@@ -63,45 +57,4 @@ def distance_scale(
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."
         ),
         mahalanobis_sq=share**2 / variance if variance > 0.0 else np.inf,
-    )
-
-
-def measured_turns(
-    parent_from_flange: FloatArray, flange_from_target: FloatArray
-) -> Finding | None:
-    """Tests whether measured rotations scatter by more than the robot can explain.
-
-    A rotation of the flange moves the target, unless its axis passes through it.
-
-    Args:
-        parent_from_flange: (m, 4, 4) the robot's poses; the (4, 4) identity where it carries the
-            target.
-        flange_from_target: (m, 4, 4) measured poses.
-
-    Returns:
-        The finding; None where the robot can be the cause, or rotations agree well enough.
-    """
-    if len(flange_from_target) < _LEAST_VIEWS:
-        return None
-    poses = parent_from_flange @ flange_from_target
-    residuals = log(invert(mean_transform(poses)) @ poses)
-    turn = (flange_from_target[:, :3, :3] @ residuals[:, :3, None])[..., 0]
-    shift = cross(turn, flange_from_target[:, :3, 3])
-    rad, expected_m, actual_m = (
-        float(np.median(np.linalg.norm(array, axis=1))) for array in (turn, shift, residuals[:, 3:])
-    )
-    deg = float(np.rad2deg(rad))
-    if deg < CalibrationLimits.scatter_deg[0] or expected_m < _BEYOND_ARM * actual_m:
-        return None
-    return Finding(
-        "measured_turns",
-        f"A typical view has the target turned by {figure(deg)} deg and shifted by "
-        f"{figure(1e3 * actual_m)} mm against the others. A flange that is off by this turn would "
-        f"shift it by {figure(1e3 * expected_m)} mm: the measured rotations (cft_) are what "
-        "scatters, as those of a single small marker do.",
-        Remedy(
-            "Give visioncal the images; or measure the poses again, of a board of many corners "
-            "that fills much of the image, with a calibrated lens."
-        ),
-        until_mm=0.0,
     )

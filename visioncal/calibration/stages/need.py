@@ -26,7 +26,7 @@ to the above: one that carries its camera looks in the posture of one view, and 
 another.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,10 +38,10 @@ from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, apply_each, invert, log, skew
-from visioncal.core.types import FloatArray, IntArray, Need
+from visioncal.core.types import FloatArray, IntArray, Mask, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import NeedMet, Picker
@@ -106,14 +106,14 @@ class Picks:
     @property
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation of the position by source, and as a `total` [mm]."""
-        return {name: 1e3 * value for name, value in self._budget(slice(3, 6)).items()}
+        return self._budget(slice(3, 6), 1e3)
 
     @property
     def budget_deg(self) -> dict[str, float]:
         """Standard deviation of the rotation by source, and as a `total` [deg]."""
-        return {name: float(np.rad2deg(value)) for name, value in self._budget(slice(3)).items()}
+        return self._budget(slice(3), float(np.rad2deg(1.0)))
 
-    def _budget(self, axes: slice) -> dict[str, float]:
+    def _budget(self, axes: slice, unit: float) -> dict[str, float]:
         budget, known, total = {}, {}, self.covariances
         if self.offsets is not None:
             known = {CONTROLLER: self.offsets[:, :, None] * self.offsets[:, None]}
@@ -121,7 +121,7 @@ class Picks:
         for name, covariances in {**self.parts, **known, "total": total}.items():
             squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
             # Of two sources that compensate, one may be negative.
-            budget[name] = float(max(squares.mean(), 0.0) ** 0.5)
+            budget[name] = unit * float(max(squares.mean(), 0.0) ** 0.5)
         return budget
 
     def stays_within(self, need: Need | None) -> str:
@@ -239,14 +239,16 @@ def _picks(
             noise = replace(noise, robots=levels)
         pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:
-        parts["arm"] = _arm_covariance(problem, robot, errors)
+        stops = seen.stops
+        root = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
+        parts["arm"] = root @ root.mT
     of_boards = _board_part(covariance, fitted.board_columns)
     parts["calibration"] = linearised.covariance(covariance - of_boards)
     parts["board"] = linearised.covariance(of_boards)
     carried = carries[:, None, None]
     if problem.is_combined:
         # Combined noise counts as the robot's, where it carries the camera.
-        look = carried * (to_base @ _noise_covariance(level) @ to_base.mT)
+        look = carried * (to_base @ _diagonal(level) @ to_base.mT)
     else:
         look = observations.total_covariance(linearised, noise) - observations.covariance(noise)
     parts["look"] = look
@@ -261,8 +263,8 @@ def _picks(
     by_source["look"][:, 3:, 3:] += focus_m[:, :, None] * focus_m[:, None]
     # A carried camera looks from another posture than the robot then has; before one that is fixed
     # the posture is the same, and the noise of a whole chain is already in it.
-    fixed = 0.0 if whole else _noise_covariance(level)
-    pick_noise = np.where(carried, _noise_covariance(pick_level), fixed)
+    fixed = 0.0 if whole else _diagonal(level)
+    pick_noise = np.where(carried, _diagonal(pick_level), fixed)
     by_source["pick"] = _flange_covariance(problem, robot, in_base, pick_noise)
     if as_noise is not None and not as_noise.of_links:
         by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
@@ -317,7 +319,7 @@ def _uncorrected(
     return replace(picks, parts=parts, offsets=offsets[looks] - offsets[goes])
 
 
-def _noise_covariance(level: FloatArray) -> FloatArray:
+def _diagonal(level: FloatArray) -> FloatArray:
     """(6, 6) covariance of a flange's noise, from levels (2,) of rotation and position."""
     return np.diag(np.repeat(level, 3) ** 2)
 
@@ -351,25 +353,34 @@ def _base_from_targets(problem: Problem, state: State, base: str) -> FloatArray:
     return np.asarray(base_from_camera @ problem.measured(state))
 
 
+def _with_sensors(
+    fitted: PickInputs, change: Callable[[FloatArray, Mask], FloatArray]
+) -> tuple[Effect, ...]:
+    """Effects whose (n, 6, k) actions on measured poses are changed; the mask is of boards."""
+    effects = []
+    for effect in fitted.problem.effects:
+        columns = fitted.problem.effect_columns[effect.name]
+        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
+        by_sensor = effect.by_sensor
+        by_sensor = None if by_sensor is None else change(by_sensor, of_boards)
+        effects.append(replace(effect, by_sensor=by_sensor))
+    return tuple(effects)
+
+
 def _as_seen_by_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
     """The observations converted to ones of the base, through what they saw."""
     # The lens's effect on the measured poses of targets then moves the base instead.
-    problem = fitted.problem
-    carry, effects = adjoint(in_base), []
-    for effect in problem.effects:
-        columns = problem.effect_columns[effect.name]
-        not_boards = ~np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
-        by_sensor = None if effect.by_sensor is None else carry @ effect.by_sensor * not_boards
-        effects.append(replace(effect, by_sensor=by_sensor))
+    problem, carry = fitted.problem, adjoint(in_base)
+    observations = replace(
+        problem.observations,
+        observed=(base,) * len(problem),
+        measured=problem.measured(fitted.fit.state) @ invert(in_base),
+        has_rotation=np.ones(len(problem), dtype=bool),
+    )
     return replace(
         problem,
-        observations=replace(
-            problem.observations,
-            observed=(base,) * len(problem),
-            measured=problem.measured(fitted.fit.state) @ invert(in_base),
-            has_rotation=np.ones(len(problem), dtype=bool),
-        ),
-        effects=tuple(effects),
+        observations=observations,
+        effects=_with_sensors(fitted, lambda array, boards: carry @ array * ~boards),
         points=frozenset(),
         with_repeats=False,
     )
@@ -379,19 +390,17 @@ def _as_things(fitted: PickInputs) -> Problem:
     """The observations converted to ones of things at the boards' middles."""
     # A board of another size was measured at another distance, and a thing is not: a board's shape
     # then only moves its middle.
-    problem, effects = fitted.problem, []
-    unmoved, frames = np.zeros((3, len(fitted.board_columns))), problem.observations.observed
-    jacobian = np.array(
-        [fitted.centre_jacobians.get(frame.partition("@")[0], unmoved) for frame in frames]
-    )
-    for effect in problem.effects:
-        columns, by_sensor = problem.effect_columns[effect.name], effect.by_sensor
-        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
-        if by_sensor is not None and of_boards.any():
-            by_sensor = by_sensor.copy()
-            by_sensor[:, :3, of_boards], by_sensor[:, 3:, of_boards] = 0.0, -jacobian
-        effects.append(replace(effect, by_sensor=by_sensor))
-    return replace(problem, effects=tuple(effects))
+    problem, unmoved = fitted.problem, np.zeros((3, len(fitted.board_columns)))
+    frames = (frame.partition("@")[0] for frame in problem.observations.observed)
+    jacobian = np.array([fitted.centre_jacobians.get(frame, unmoved) for frame in frames])
+
+    def moved(array: FloatArray, boards: Mask) -> FloatArray:
+        array = array * ~boards
+        if boards.any():
+            array[:, 3:, boards] = -jacobian
+        return array
+
+    return replace(problem, effects=_with_sensors(fitted, moved))
 
 
 def _board_part(covariance: FloatArray, columns: IntArray) -> FloatArray:
@@ -442,13 +451,6 @@ def _lasting_sigma(errors: ArmErrors) -> FloatArray:
     change = errors.sigma * errors.basis[used][:, :, errors.is_time_correlated]
     squares = np.sum((change - change.mean(axis=0)) ** 2, axis=2).reshape(-1, 2, 3)
     return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
-
-
-def _arm_covariance(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
-    """(n, 6, 6) covariance from posture-dependent errors, as a twist of the base."""
-    stops = problem.observations.stops
-    jacobian = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
-    return np.asarray(jacobian @ np.swapaxes(jacobian, 1, 2))
 
 
 def _excess_covariance(fitted: PickInputs) -> FloatArray:

@@ -25,9 +25,6 @@ _LIMITS = CalibrationLimits()
 _ROUNDING = 1e-6
 # Views, and sources of a budget, that are named.
 _LISTED = 3
-# Ratio of the outlier limit of measured poses to that of views with corners: sound poses of a board
-# that is seen squarely are off by 8 times the median now and then.
-_UNEVEN = 1.5
 # Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
 # a small board far away.
 _OF_NOISE = 1.5
@@ -50,7 +47,6 @@ def collect_findings(judged: Findings) -> list[Finding]:
     return [
         *scatter,
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
-        *_standing_out(judged),
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair, judged)),
         *([] if is_wild else [*_sigmas(judged), *_place(judged), *_workspace(judged)]),
         *_few_stops(judged),
@@ -137,8 +133,8 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
         )
 
 
-def _residual(view: ViewResult, between: str = ", ") -> str:
-    turned = "" if view.residual_deg is None else f"{between}{figure(view.residual_deg)} deg"
+def _residual(view: ViewResult) -> str:
+    turned = "" if view.residual_deg is None else f", {figure(view.residual_deg)} deg"
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
@@ -176,31 +172,6 @@ def _run(views: Sequence[int], compared: Sequence[int]) -> str:
     if end == len(compared):
         return f"from view {views[0]} on"
     return f"from view {views[0]} to view {views[-1]}" if first else f"before view {compared[end]}"
-
-
-def _standing_out(judged: Findings) -> Iterator[Finding]:
-    """Findings on single views with outstanding residuals."""
-    # Where corners give the noise of each view, the outlier search has judged views better.
-    if any(arm.noise_mm is not None for arm in judged.arms):
-        return
-    for pair in judged.pairs:
-        used = [view for view in pair.views if view.used]
-        sizes = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
-        typical = np.maximum(np.median(sizes.reshape(-1, 2), axis=0), _ROUNDING) if used else 1.0
-        for view, ratio in zip(used, (sizes / typical).reshape(-1, 2).max(axis=1), strict=True):
-            if ratio > _LIMITS.outlier * (1.0 if view.rms_px is not None else _UNEVEN):
-                yield Finding(
-                    "wrong_views",
-                    f"View {view.view} stands out: it places the target {_residual(view, ' and ')} "
-                    f"from the others, {ratio:.0f} times what is typical. It is in the fit and "
-                    "pulls at it.",
-                    Remedy(
-                        "Look at its image and its pose, and take it out of views.csv if one is "
-                        "wrong.",
-                        look_at(view.view),
-                    ),
-                    (view.view,),
-                ).of(pair.name)
 
 
 def _holdout(pair: JudgedPair, judged: Findings) -> Iterator[Finding]:
@@ -252,8 +223,7 @@ def remedy_for_uncertainty(judged: Findings) -> Remedy | None:
 
 
 def _more_views(judged: Findings, words: str, purpose: str = "") -> Remedy:
-    options = f"{purpose}{judged.of_camera}"
-    return add_views_remedy(words, modelled=judged.plannable, purpose=options)
+    return add_views_remedy(words, modelled=judged.plannable, purpose=purpose)
 
 
 def _tilted(judged: Findings) -> Remedy:

@@ -9,7 +9,6 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms, rms_of
-from visioncal.session.frames import object_name
 
 
 @dataclass(frozen=True)
@@ -117,20 +116,6 @@ class Findings:
         """Whether views can be planned: for cameras, by arms with known models."""
         has_images = any(sensor.pixel_px is not None for sensor in self.sensors)
         return has_images and all(arm.modelled for arm in self.arms)
-
-    @property
-    def of_camera(self) -> str:
-        """Command option for the least accurate of several cameras; empty for one."""
-        cameras = dict.fromkeys(pick.camera for pick in self.picks)
-        if len({sensor.name for sensor in self.sensors}) < 2 or not cameras:
-            return ""
-
-        def weakest_m(camera: str) -> float:
-            offsets = (part for part in self.worst if not part.is_rotation)
-            mine = (part.sigma for part in offsets if part.words.startswith(f"{camera}'s "))
-            return max(mine, default=0.0)
-
-        return f" --camera {object_name(max(cameras, key=weakest_m), 'camera')}"
 
     @property
     def views(self) -> tuple[ViewResult, ...]:
