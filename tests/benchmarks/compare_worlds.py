@@ -360,7 +360,7 @@ def _later_of(folder: Path, *, knocked: bool) -> Command:
 
 def repeated(seed: int, folder: Path) -> Command:
     """Five stops of an arm without joints, off by its posture, stood at again; half are knocked."""
-    wrong = {"dh_sigma_m": 1e-4, "dh_sigma_rad": 1e-4, "branches": True, "roll_rad": np.pi}
+    wrong = {"dh_sigma_m": 6e-5, "dh_sigma_rad": 6e-5, "branches": True, "roll_rad": np.pi}
     options = CellOptions(seed=seed, mount=MOUNTS[seed // 2 % 2], views=25, **wrong)
     cell, rng, knocked = simulate(options), np.random.default_rng(seed), bool(seed % 2)
     knock = later.knock(rng, 0.3 * knocked, 0.0)

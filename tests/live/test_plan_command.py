@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
+from scipy.spatial.distance import pdist
 from support.commands import Done, visioncal
 from support.drawn import column
 from support.marks import slow
 
 from visioncal.cli.show import find_recording
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
 from visioncal.present.recording import paths
 from visioncal.results import Calibration
 from visioncal.robot import has_ur_axes, load_robot
@@ -359,3 +361,25 @@ def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_
 def test_a_folder_without_any_recording_is_refused_by_review(tmp_path):
     with pytest.raises(DataError, match=r"recording\.rrd"):
         find_recording(tmp_path)
+
+
+def test_calibrated_stops_that_a_check_repeats_are_far_apart(tmp_path):
+    session = write_session(
+        simulate(CellOptions(views=14, seed=8)), tmp_path / "cell", images=False
+    )
+    assert visioncal("calibrate", session, "-o", tmp_path / "out").status == 0
+    done = visioncal("plan", tmp_path / "out", "--verify", "-o", tmp_path / "plan")
+    assert done.status == 0
+    assert f"visioncal verify monday --against {tmp_path / 'out'}" in done.out
+    # Measured poses do not say which board they are of: the stops are told, and no way to them.
+    assert {file.name for file in (tmp_path / "plan").iterdir()} == {"stops.csv"}
+    rows = (tmp_path / "plan" / "stops.csv").read_text().splitlines()[1:]
+    stops = Calibration.load(tmp_path / "out").joint_fit.stops
+    chosen = [int(row.partition(",")[0]) for row in rows]
+    assert len(set(chosen)) == 5
+    poses = exp(stops.poses)[:, :3].reshape(len(stops.views), 12)
+    apart = pdist(poses[[stops.views.index(view) for view in chosen]])
+    assert apart.min() > 2.0 * pdist(poses).min()
+    refused = visioncal("plan", session, "--verify", "-o", tmp_path / "plan")
+    assert refused.status == 2
+    assert "is no calibration" in refused.err

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,12 +19,13 @@ from visioncal.cli.session_options import (
     StopOptions,
 )
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import some_of
+from visioncal.core.limits import CheckLimits
+from visioncal.core.number_format import listed, some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Need, Progress
 from visioncal.estimation.problem_parts import Noise
 from visioncal.interchange.formats.intrinsics import read_intrinsics, target_named
-from visioncal.interchange.outputs import CALIBRATION, write_plan
+from visioncal.interchange.outputs import CALIBRATION, write_plan, write_stops
 from visioncal.interchange.result_files import content_of, load_calibration, load_stored
 from visioncal.live.planning.cell import (
     TYPICAL_NOISE,
@@ -44,13 +45,16 @@ from visioncal.live.planning.recorded import (
     calibrate_partially,
     start_from_session,
 )
+from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.results import Calibration
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import Robot, has_ur_axes, load_robot
 from visioncal.session import Session
 from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, select
 from visioncal.vision.targets import target_from_document
 
 _SHOWN = 12
+# Candidates for a stop to be repeated: not all have a free way to each other.
+_CHOICE = 4
 # Cosine between the z axes of board and base above which only a camera below would see the board.
 _FACE_DOWN = 0.7
 _SESSION = "session.toml"
@@ -83,6 +87,9 @@ def plan_command(options: PlanOptions) -> None:
     boxes = boxes_of(kept)
     purpose_of(options.wanted.purpose, "--for")
     start, words = chosen_part(find_source(options.source), options.words)
+    if options.wanted.to_verify:
+        _plan_to_verify(options, start, words, (limits, boxes))
+        return
     with shown_progress(quiet=options.as_json) as progress:
         cell, begun = _begin(start, words, (limits, boxes), options.wanted, progress)
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
@@ -98,6 +105,55 @@ def plan_command(options: PlanOptions) -> None:
         print_json(document)
     else:
         _report(plan)
+    report_written(written, quiet=options.as_json)
+
+
+def _plan_to_verify(
+    options: PlanOptions, start: Source, words: PlanCellOptions, kept: Kept
+) -> None:
+    """Plans to stand again at stops of a calibration; their table alone if no way is known."""
+    calibration = start.calibration
+    if calibration is None:
+        raise DataError(
+            f"--verify: {start.words} is no calibration, whose stops could be repeated.",
+            culprits=["--verify"],
+            next_step="Name an output folder of calibrate.",
+        )
+    count = options.wanted.stops or CheckLimits.stops
+    spread = stops_to_repeat(calibration, start.session, count)
+    fit, robot, plan = calibration.joint_fit, calibration.robot, None
+    targets = {} if fit is None else fit.targets
+    if spread.q is not None and robot is not None and (words.target or "" in targets):
+        more = stops_to_repeat(calibration, start.session, _CHOICE * count)
+        with shown_progress(quiet=options.as_json) as progress:
+            try:
+                cell = cell_of(start, words, kept)
+                request = replace(_request(options.wanted, cell), count=count)
+                plan = make_plan(cell, request, postures=more.q, progress=progress)
+            except DataError as error:
+                warn(f"the way between calibrated stops is not planned: {error.message}")
+    if plan is None:
+        record = f"--arm manual --target {words.target or 'BOARD'}"
+        document: dict[str, Any] = {"views": spread.views, "poses": spread.poses.tolist()}
+        written = write_stops(options.out, spread.table())
+    else:
+        arm = "ur:HOST" if has_ur_axes(plan.cell.robot) else "manual"
+        record = f"--arm {arm} --plan {options.out}"
+        document = plan_document(plan, {"kind": start.words})
+        written = write_plan(options.out, plan, document)
+    if options.as_json:
+        print_json(document)
+    else:
+        views = listed([str(view) for view in spread.views])
+        answer(
+            f"{count} stops at postures of {calibration.session_name}"
+            + (f", of views {views}:" if plan is None else ":")
+        )
+        for command in (
+            f"visioncal record {record} --camera uvc:0 -o monday",
+            f"visioncal verify monday --against {options.source}",
+        ):
+            answer(f"  {command}")
     report_written(written, quiet=options.as_json)
 
 

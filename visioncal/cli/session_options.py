@@ -237,6 +237,11 @@ class StopOptions:
     add: int | None = _what(
         "How many stops to add to a recorded session, which counts.", min=1, max=500
     )
+    to_verify: bool = flag(
+        "Calibrated stops with the widest spread, five by default, to be repeated for visioncal "
+        "verify.",
+        "--verify",
+    )
     purpose: str = _what(
         "What they are for.", "--for", default="hand-eye", metavar="|".join(PURPOSES)
     )

@@ -36,6 +36,9 @@ SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
 TURN_PER_M = 4.0
 # Shares of the noise's variance that are new at a repeated posture: sigmas are halved in each step.
 _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
+# Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-normal
+# prior of what is new.
+_REPEATABILITY_M, _FACTOR = 3e-5, 2.0
 # Steps of a cause converge after two or three, to far below any arm's repeatability.
 _ROUNDS, _CONVERGED = 6, 1e-7
 # Least sigma [rad and m]: exact data would otherwise be compared with rounding.
@@ -103,18 +106,25 @@ def evidence_of(
     """
     cause = cause or ChangeHypothesis("nothing", np.zeros(0))
     shares = (1.0,) if belief.repeated is None else _NEW_SHARES
+    new_m = max(belief.noise.robots[0, 1], _LEAST_SIGMA) * np.sqrt(shares)
+    log_priors = -0.5 * (np.log(new_m / _REPEATABILITY_M) / np.log(_FACTOR)) ** 2
+    log_priors -= np.logaddexp.reduce(log_priors) + np.log(len(cause.noise_factors))
+    prior_of = dict(zip(shares, log_priors.tolist(), strict=True))
     sizes_m, widest = SIZES_M if len(cause.units) else SIZES_M[:1], SIZES_M[-1] * cause.units
     values = np.zeros(len(cause.units)) if cause.start is None else cause.start
     for _ in range(_ROUNDS):
         stops = _linearised(problem, belief, cause, values)
         variants = {trial: stops.whitened(*trial) for trial in product(cause.noise_factors, shares)}
-        likeliest = max(variants, key=lambda trial: variants[trial].score(widest, belief.freedom))
+        likeliest = max(
+            variants,
+            key=lambda trial: variants[trial].score(widest, belief.freedom) + prior_of[trial[1]],
+        )
         before, values = values, variants[likeliest].posterior(widest)[0]
         if np.abs(values - before).max(initial=0.0) < _CONVERGED:
             break
     scores = [
-        variant.score(size_m * cause.units, belief.freedom)
-        for variant, size_m in product(variants.values(), sizes_m)
+        variant.score(size_m * cause.units, belief.freedom) + prior_of[share]
+        for ((_, share), variant), size_m in product(variants.items(), sizes_m)
     ]
     # With the widest prior on the change's size, which hardly shrinks it.
     mean, covariance = variants[likeliest].posterior(widest)
@@ -122,7 +132,7 @@ def evidence_of(
     remaining = white.residuals + white.jacobian @ mean
     misfit = float(remaining @ remaining)
     return HypothesisEvidence(
-        float(np.logaddexp.reduce(scores) - np.log(len(scores))),
+        float(np.logaddexp.reduce(scores) - np.log(len(sizes_m))),
         mean,
         covariance,
         *likeliest,

@@ -211,15 +211,21 @@ def left_out_clusters(
 
 
 def posture_clusters(poses: FloatArray) -> IntArray:
-    """(s,) cluster of each of (s, 4, 4) postures: the nearest of five that are far apart.
+    """(s,) cluster of each of (s, 4, 4) postures: the nearest of five that are far apart."""
+    distance_sq = _squared_distances(poses)
+    return np.asarray(np.argmin(distance_sq[spread_postures(poses, _CLUSTERS)], axis=0))
 
-    These are chosen by farthest-point clustering (Gonzalez 1985).
+
+def spread_postures(poses: FloatArray, count: int) -> IntArray:
+    """(k,) indices of some of (s, 4, 4) postures, which are far apart.
+
+    They are chosen by farthest-point clustering (Gonzalez 1985).
     """
     distance_sq = _squared_distances(poses)
-    seeds = [int(np.argmax(distance_sq.sum(axis=1)))]
-    for _ in range(_CLUSTERS - 1):
-        seeds.append(int(np.argmax(distance_sq[seeds].min(axis=0))))
-    return np.asarray(np.argmin(distance_sq[seeds], axis=0))
+    chosen = [int(np.argmax(distance_sq.sum(axis=1)))]
+    for _ in range(min(count, len(poses)) - 1):
+        chosen.append(int(np.argmax(distance_sq[chosen].min(axis=0))))
+    return np.array(chosen)
 
 
 def _scatter(count: int, white: FloatArray) -> _Model:

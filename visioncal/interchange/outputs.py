@@ -157,6 +157,11 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
 
 
+def write_stops(folder: Path, table: str) -> Written:
+    """Writes the table of a plan without a model of its robot; see `write_plan`."""
+    return _write(folder, {STOPS: _text(table)}, {}, (PLAN, PROGRAM, PREVIEW))
+
+
 def write_motions(
     folder: Path, plan: "MotionPlan", rate_hz: float, document: Mapping[str, Any]
 ) -> Written:

@@ -107,6 +107,7 @@ def make_plan(
     request: PlanRequest,
     *,
     begun: SessionStart | None = None,
+    postures: FloatArray | None = None,
     progress: Progress | None = None,
 ) -> Plan:
     """Chooses stops, orders them, and states what each contributes.
@@ -115,6 +116,7 @@ def make_plan(
         cell: The cell, as guessed.
         request: The request.
         begun: Session to which the stops are added; its cell is `cell`.
+        postures: (k, n) joint angles of the only candidates [rad]; None to draw candidates.
         progress: Called during long work.
 
     Raises:
@@ -125,7 +127,10 @@ def make_plan(
         check_need(request.need, request.purpose.judged)
     # A recorded cell may allow few stops, such as one with a fixed camera; these are added.
     least = None if begun is None else min(request.count, request.candidates)
-    stops = candidates(cell, request.candidates, request.seed, progress, least=least)
+    if postures is None:
+        stops = candidates(cell, request.candidates, request.seed, progress, least=least)
+    else:
+        stops = Candidates(postures, cell.cam_from_target(postures), np.ones(len(postures)), {})
     progress("information", 0, 1)
     cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
     worlds = predict_worlds(

@@ -1,0 +1,74 @@
+"""Stops of a calibration that a later verification repeats: the robot has stood there."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
+from visioncal.core.types import FloatArray
+from visioncal.estimation.pose_errors import spread_postures
+from visioncal.results import Calibration
+from visioncal.session import Session
+from visioncal.session.columns import POSE, pose_row
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedStops:
+    """Some stops of a calibration."""
+
+    views: tuple[int, ...]  # (k,) their first views.
+    poses: FloatArray  # (k, 4, 4) `base_from_flange` [m].
+    q: FloatArray | None  # (k, n) joint angles [rad]; None where not all were recorded.
+
+    def table(self) -> str:
+        """The stops as a table of poses and joint angles, by the views of the calibration."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        angles = np.zeros((len(self.views), 0)) if self.q is None else self.q
+        joints = [f"q{index + 1}_rad" for index in range(angles.shape[1])]
+        writer.writerow(["view", *joints, *POSE])
+        for view, q, pose in zip(self.views, angles, self.poses, strict=True):
+            numbers = [*q.tolist(), *pose_row(pose).values()]
+            writer.writerow([view, *(f"{number:.9f}" for number in numbers)])
+        return text.getvalue()
+
+
+def stops_to_repeat(
+    calibration: Calibration, session: Session | None, count: int
+) -> CalibratedStops:
+    """Chooses the calibrated stops with the widest spread of postures.
+
+    Args:
+        calibration: The calibration.
+        session: Its session, which has the joint angles; None where it is not there.
+        count: How many.
+
+    Raises:
+        DataError: The calibration does not say where its stops were.
+    """
+    stops = None if calibration.joint_fit is None else calibration.joint_fit.stops
+    if stops is None:
+        raise DataError(
+            f"calibration {calibration.session_name!r} does not hold its stops "
+            "(joint_fit.stops): it is of a whole cell, something moved, or an older version made "
+            "it.",
+            culprits=["--verify"],
+            next_step="Calibrate its session again, or verify with new stops: visioncal plan.",
+        )
+    poses = exp(stops.poses)
+    # Of several boards at one stop, the first.
+    first = np.unique(stops.poses, axis=0, return_index=True)[1]
+    rows = first[spread_postures(poses[first], count)].tolist()
+    views = tuple(stops.views[row] for row in rows)
+    return CalibratedStops(views, poses[rows], _joints(session, views))
+
+
+def _joints(session: Session | None, views: Sequence[int]) -> FloatArray | None:
+    recorded = {} if session is None else {view.number: view for view in session.views}
+    angles = [recorded[view].joints_rad for view in views if view in recorded]
+    known = [q for q in angles if q is not None]
+    return np.array(known) if len(known) == len(views) else None
