@@ -58,7 +58,7 @@ from visioncal.results.sections import (
 from visioncal.results.views import rms_of
 from visioncal.robot import Robot
 from visioncal.session import frame_name
-from visioncal.session.frames import object_name
+from visioncal.session.frames import CELL, object_name
 from visioncal.vision.targets import first_corners, target_document
 
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
@@ -107,28 +107,26 @@ def result_of(run: RunState) -> Calibration:
         dense=_dense(run),
         need=need_met(findings.need, findings.judged_picks, whole=cell is not None),
     )
-    return (
-        replace(calibration, **_sections_of_pair(run, names, boards, rigs))
-        if is_pair
-        else (calibration)
-    )
+    sections = _sections_of_pair(run, names, boards, rigs) if is_pair else {}
+    return replace(calibration, **sections)
 
 
 def _edge_names(run: RunState) -> dict[str, str]:
     """The names of the edges by their child frames; of a pair, the camera's first."""
     answer = run.assessment
-    if run.mount is None:
-        branches = answer.problem.tree.branches
-        return {
-            version.name: f"{branches[key].parent}_from_{version.name}"
-            for key, version in answer.versions.items()
-        }
-    frames, names = answer.problem.unknown, edge_names(run.session.mount)
     if run.mount == "instrument":
         # Of the points that an instrument read, the first is the probe.
-        return dict(zip(frames, names, strict=False))
-    parents = [name.partition("_from_")[0] for name in names]
-    return {frame: f"{parents[min(at, 1)]}_from_{frame}" for at, frame in enumerate(frames)}
+        return dict(zip(answer.problem.unknown, edge_names(run.mount), strict=False))
+    parents = {
+        version.name: answer.problem.tree.branches[key].parent
+        for key, version in answer.versions.items()
+    }
+    # The root of a pair's frames is the robot's base.
+    root = CELL if run.mount is None else "base"
+    return {
+        frame: f"{root if parent == CELL else parent}_from_{frame}"
+        for frame, parent in parents.items()
+    }
 
 
 def _sections_of_pair(

@@ -131,11 +131,9 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         view: Corners(view, at.ids, at.px, at.width_px, typical_px / at.sigma_px)
         for view, at in found.items()
     }
-    worst = max(found, key=lambda view: found[view].width_px)
     note = (
         f"The corners of view {listed(tuple(found))} are by all pixels of their images (--dense), "
-        f"as these are blurred: most in view {worst}, by edges of {found[worst].width_px:.1f} px "
-        f"and a motion of {float(np.hypot(*found[worst].motion_px)):.1f} px."
+        "as these are blurred."
     )
     dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
     return dense_seen, replace(

@@ -134,18 +134,15 @@ def _no_size(session: Session, found: Mapping[int, Searched]) -> DataError:
         for view, searched in found.items()
         if isinstance(searched.found, Rejection)
     ]
-    if not reasons:
-        return DataError(
-            f"session {session.name!r}: the camera's resolution is missing, and no image that is "
-            "searched shows it.",
-            culprits=["session.toml: camera.resolution"],
-            next_step="Add resolution = [width, height] to [camera]: the size of the images in "
-            "which the corners were found.",
-        )
+    name = f"session {session.name!r}"
+    if reasons:
+        words, step = f"none of its {len(found)} images can be read.", f"First: {reasons[0]}."
+        return DataError(f"{name}: {words}", culprits=reasons, next_step=step)
     return DataError(
-        f"session {session.name!r}: none of its {len(found)} images can be read.",
-        culprits=reasons,
-        next_step=f"First: {reasons[0]}.",
+        f"{name}: the camera's resolution is missing, and no image that is searched shows it.",
+        culprits=["session.toml: camera.resolution"],
+        next_step="Add resolution = [width, height] to [camera]: the size of the images in which "
+        "the corners were found.",
     )
 
 
