@@ -149,13 +149,12 @@ class ArmModel:
 
     def columns_of(self, name: str) -> slice:
         """Slice of a block among all values; empty where the arm lacks the block."""
-        at = 0
-        for block in self.weights:
-            size = self.size_of(block)
-            if block == name:
-                return slice(at, at + size)
-            at += size
-        return slice(at, at)
+        return self._slices.get(name, slice(0, 0))
+
+    @cached_property
+    def _slices(self) -> dict[str, slice]:
+        ends = np.cumsum([self.size_of(name) for name in self.weights], dtype=int).tolist()
+        return dict(zip(self.weights, map(slice, [0, *ends], ends), strict=True))
 
     @property
     def harmonics(self) -> FloatArray | None:
@@ -211,12 +210,10 @@ class ArmModel:
 
     def changes(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Changes by (p,) values: twists (n + 1, 6) of the placements, and functions (n, 4)."""
-        count, at = self.nominal.joint_count, 0
+        count = self.nominal.joint_count
         placements, functions = np.zeros((count + 1, 6)), np.zeros((count, 4))
         for name, weight in self.weights.items():
-            size = self.size_of(name)
-            block = weight * values[at : at + size]
-            at += size
+            block = weight * values[self.columns_of(name)]
             if name == "links":
                 placements[1:] += block.reshape(-1, 6) * TWIST_UNITS
             elif name in _FUNCTIONS:
@@ -254,14 +251,13 @@ class ArmModel:
 
     def basis(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Jacobian (m, 6, p) of the reported frame by all values, under the loads of each stop."""
-        return np.concatenate(
-            [weight * self.columns(name, q, loads) for name, weight in self.weights.items()], axis=2
-        )
+        weights = self.weights.items()
+        columns = [weight * self.columns(name, q, loads) for name, weight in weights]
+        return np.concatenate(columns, axis=2)
 
     def basis_without_harmonics(self, q: FloatArray) -> FloatArray:
         """The columns of `basis` other than harmonics."""
-        rest = (item for item in self.weights.items() if item[0] != HARMONICS)
-        return np.concatenate([weight * self.columns(name, q) for name, weight in rest], axis=2)
+        return self.basis(q)[:, :, self.is_kept]
 
 
 def _is_noise(twists: FloatArray) -> bool:

@@ -407,27 +407,21 @@ class RobotArm:
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """Size of the errors, as a section of a calibration."""
-    units = np.array([np.rad2deg(1.0), 1e3])
-    if errors.fit_sigmas is None or errors.white is None:
-        deg, mm = (errors.sigma * units * [1.0, LEVER_M]).tolist()
-        return ArmErrorsResult(
-            sigma_mm=mm,
-            sigma_deg=deg,
-            likelihood_ratio=errors.gain,
-            estimated=errors.is_estimated,
-        )
-    sigmas = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
+    units, sigmas = np.array([np.rad2deg(1.0), 1e3]), errors.sigma * np.array([1.0, LEVER_M])
+    is_of_flange = errors.fit_sigmas is not None and errors.white is not None
+    if errors.fit_sigmas is not None and errors.white is not None:
+        sigmas = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
     deg, mm = (sigmas * units).tolist()
     result = ArmErrorsResult(
         sigma_mm=mm,
         sigma_deg=deg,
         likelihood_ratio=errors.gain,
-        estimated=False,
-        of="flange",
+        estimated=errors.is_estimated,
+        of="flange" if is_of_flange else None,
     )
-    if errors.far_posture_errors is None:
+    if not is_of_flange or errors.far_posture_errors is None:
         return result
-    (deg, mm), (predicted_deg, predicted_mm) = (errors.far_posture_errors * units).tolist()
+    deg, mm, predicted_deg, predicted_mm = (errors.far_posture_errors * units).ravel().tolist()
     return replace(
         result,
         away_mm=mm,

@@ -135,18 +135,16 @@ class HeatedStops:
         rise = float(np.ptp(links, axis=0).max())
         hours = float(np.ptp(self.stamps_s)) / 3600.0
         during = f"in the {figure(hours)} h of the {len(self.stamps_s)} used stops"
-        if inputs.kind == "temperatures" and rise < _LEAST_RISE_K:
-            return (
-                f"the joints' temperatures change by at most {figure(rise)} K {during}, and "
-                f"{_LEAST_RISE_K:g} K are needed"
-            )
-        share = rise / _RISE_K
-        if inputs.kind == "currents" and share < _LEAST_SHARE:
-            return (
-                f"by their currents the joints warm up by at most {figure(100.0 * share)} % of the "
-                f"way {during}, and {100.0 * _LEAST_SHARE:g} % are needed"
-            )
-        return ""
+        words, of_way, least, unit = "the joints' temperatures change", "", _LEAST_RISE_K, "K"
+        if inputs.kind == "currents":
+            words, of_way = "by their currents the joints warm up", " of the way"
+            rise, least, unit = 100.0 * rise / _RISE_K, 100.0 * _LEAST_SHARE, "%"
+        return (
+            f"{words} by at most {figure(rise)} {unit}{of_way} {during}, and {least:g} {unit} are "
+            "needed"
+            if rise < least
+            else ""
+        )
 
 
 def missing_error(
