@@ -1,6 +1,7 @@
 """Parts with known places: points of a drawing and touches of features, with noise as asked for."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import expm
@@ -83,8 +84,9 @@ def some_touches(rng: np.random.Generator, frame: FloatArray, kinds: Sequence[st
     }
     local = np.array([rng.uniform(*ranges[kind]) for kind in kinds])
     names = tuple(str(at) for at in range(len(kinds)))
-    noise = np.zeros((len(kinds), 3, 3))
-    return PointPairs.of_features(names, tuple(kinds), placed(frame, local), noise)
+    return replace(
+        pairs_of(np.zeros_like(local), placed(frame, local)), labels=names, kinds=tuple(kinds)
+    )
 
 
 def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:

@@ -12,7 +12,7 @@ left-handed drawing are found before the fit: no selection of points would corre
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal, Self, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -39,8 +39,6 @@ from visioncal.estimation.robust import small_sets
 
 # Share of sound sets that are called mirrored, or of another scale.
 _FALSE_ALARM = 1e-3
-# Ratio of extents below which points are nearly collinear.
-_SLENDER = 0.1
 
 # Ratio of squared extents below which points are collinear.
 _LEAST_RATIO = 1e-8
@@ -79,19 +77,6 @@ class PointPairs:
     spare_labels: tuple[str, ...] = ()  # (k,) names of drawn points that were not measured.
     spare: FloatArray | None = None  # (k, 3) their coordinates in the fixture's frame [m].
     kinds: tuple[FeatureKind, ...] = ()  # (n,) the touched features; empty for drawn points.
-
-    @classmethod
-    def of_features(
-        cls,
-        labels: tuple[str, ...],
-        kinds: tuple[FeatureKind, ...],
-        measured: FloatArray,
-        covariances: FloatArray,
-    ) -> Self:
-        """Touches of a fixture's features."""
-        count = len(labels)
-        zeros = np.zeros((count, 3)), np.zeros(count)
-        return cls(labels, measured, covariances, *zeros, kinds=kinds)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -163,7 +148,10 @@ def _check_pairs(pairs: PointPairs) -> None:
         if extents[1] ** 2 > max(_LEAST_RATIO * extents[0] ** 2, LEAST_NOISE_M**2):
             continue
         frame = "fixture" if whose == "drawn" else "base"
-        of, words = f" about the {frame}'s {axis_words(axes[0])}", _line_words(points, whose)
+        centred = points - points.mean(axis=0)
+        aside = np.linalg.norm(centred - np.outer(centred @ axes[0], axes[0]), axis=1).max()
+        of = f" about the {frame}'s {axis_words(axes[0])}"
+        words = f"the {whose} points lie within {figure(1e3 * aside)} mm of a line"
         if extents[0] <= LEAST_NOISE_M:
             of, words = "", f"the {whose} points are all in one place"
         raise DegenerateError(
@@ -236,14 +224,6 @@ def _check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None
         next_step="Look for a coordinate of the wrong sign or two exchanged axes, in the drawing's "
         "table or in the measured one: a robot's frames are right-handed.",
     )
-
-
-def _line_words(points: FloatArray, whose: str) -> str:
-    """Words for near collinearity of (n, 3): `the drawn points lie within 0.2 mm of a line`."""
-    centred = points - points.mean(axis=0)
-    axis = spreads(points)[1][0]
-    aside = np.linalg.norm(centred - np.outer(centred @ axis, axis), axis=1).max()
-    return f"the {whose} points lie within {figure(1e3 * aside)} mm of a line"
 
 
 @dataclass(frozen=True)
@@ -341,7 +321,7 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     """Fits a fixture's frame to touches of its features.
 
     Args:
-        touches: At least one of each kind; see `PointPairs.of_features`.
+        touches: At least one of each kind; see `FEATURE_KINDS`.
         expected_noise_m: Expected noise of a touch per axis, beyond its stated one [m]; None where
             unknown. One of each kind leaves no residual to estimate it from, and is taken for
             careful then.
@@ -439,12 +419,15 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.mask)}
     )
     fit, agrees = agreement.fit, agreement.mask
+    extents = spreads(pairs.nominal[agrees])[0]
+    level_m = float(np.hypot(fit.sigma, pairs.known_noise_m))
     _refuse_poor(
         pairs,
         fit,
         pairs.nominal[agrees].mean(axis=0),
         _no_fit(pairs, fit, scale),
-        _cause(pairs, fit),
+        f"the points reach {figure(1e3 * extents[0])} mm from their centre (rms) and "
+        f"{figure(1e3 * extents[1])} mm across, at a noise of {figure(1e3 * level_m)} mm",
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
     )
     as_drawn, flipped, limit = _hands(pairs.measured[agrees], pairs.nominal[agrees], noise)
@@ -537,13 +520,3 @@ def _refuse_poor(
     without = f"without {some_of(lost)}, which {verb} not agree with the others, " if lost else ""
     words = f"{without}{cause}"
     refuse_poor("fixture", fit, worst, lambda _: (words, next_step), pairs.labels, wild)
-
-
-def _cause(pairs: PointPairs, fit: GroupFit[Placement]) -> str:
-    noise = f"at a noise of {figure(1e3 * float(np.hypot(fit.sigma, pairs.known_noise_m)))} mm"
-    for points, whose in ((pairs.nominal, "drawn"), (pairs.measured, "measured")):
-        extents = spreads(points[fit.used])[0]
-        if extents[1] < _SLENDER * extents[0]:
-            return f"{_line_words(points[fit.used], whose)}, {noise}"
-    reach = 1e3 * spreads(pairs.nominal[fit.used])[0][0]
-    return f"the points reach {reach:.3g} mm from their centre (rms), {noise}"

@@ -309,11 +309,13 @@ def touched_fixture(
 
 def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: FitSettings) -> Frame:
     """Fits the fixture to touches of its origin, x axis and xy plane."""
-    touches = PointPairs.of_features(
+    touches = PointPairs(
         measured.labels,
-        cast("tuple[FeatureKind, ...]", tuple(kinds)),
         measured.points,
         measured.scattered,
+        np.zeros_like(measured.points),
+        np.zeros(len(measured)),
+        kinds=cast("tuple[FeatureKind, ...]", tuple(kinds)),
     )
     fit = fit_features(touches, setting.touch_noise_m)
     matrix = fit.base_from_fixture
