@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated, showing
+from support.cells import calibrated, reporting, showing
 from support.sound_findings import SOUND, changed, directions
 
 from visioncal.calibration.pipeline.judging import findings_of
@@ -104,6 +104,23 @@ def without_arm_errors(known: RunState) -> RunState:
     covariance = answer.covariance - answer.covariance_by_source["arm"]
     changed = replace(answer, covariance=covariance)
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
+
+
+def test_an_arm_that_vibrates_now_and_then_does_so_at_picks() -> None:
+    cell, rng = simulate(CellOptions(views=25)), np.random.default_rng(1)
+    poses, away = cell.robot.base_from_flange.copy(), np.zeros((25, 6))
+    # At four stops the flange is 0.6 mm off, which is twice as much as is needed.
+    away[[3, 9, 14, 20], 3:] = 6e-4 * rng.permuted(np.eye(3)[[0, 1, 2, 0]], axis=1)
+    sound, shaken = (
+        calibrated(reporting(cell, base_from_flange=poses @ exp(errors)), joints=False)
+        for errors in (0.0 * away, away)
+    )
+    assert sum(not view.used for view in shaken.assessment.views) == 4
+    need = Need(mm=0.3)
+    before, after = (known.findings.picks[0].probability(need) for known in (sound, shaken))
+    # The look and the pick are eight of 21 + 8 chances, and the others stay as they were.
+    assert after == pytest.approx(before * 21 / 29, abs=0.05)
+    assert before > 0.95
 
 
 def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick() -> None:

@@ -38,7 +38,7 @@ from visioncal.core.finding_kinds import MOVED_FRAME, NOTE
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
-from visioncal.core.types import Rejection
+from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
@@ -101,7 +101,7 @@ def findings_of(run: RunState) -> Findings:
         ),
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
-        predict_picks(_pick_inputs(run), run.session.need),
+        predict_picks(_pick_inputs(run, explained), run.session.need),
         None if run.mount else _tie(solved.cell, answer.last_edges),
         run.session.corrects_targets,
         _use(run),
@@ -142,7 +142,7 @@ def _with_alternative(finding: Finding, run: RunState) -> Finding:
     return replace(finding, words=f"{finding.words} {same} would look the same.")
 
 
-def _pick_inputs(run: RunState) -> PickInputs:
+def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     """Input of the prediction of picks."""
     answer, solved = run.assessment, run.cell_fit
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
@@ -158,7 +158,22 @@ def _pick_inputs(run: RunState) -> PickInputs:
         middle_jacobians(solved),
         answer.problem,
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
+        _strays(answer, explained),
     )
+
+
+def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, FloatArray]:
+    """(m, 2) turn [rad] and shift [m] of rejected views without a reason, by camera.
+
+    Larger errors than views of a sound cell have are mistakes of the session.
+    """
+    limits, strays = CalibrationLimits(), dict[str, list[tuple[float, float]]]()
+    for view in answer.views:
+        mm, deg = view.residual_mm or 0.0, view.residual_deg or 0.0
+        is_small = mm < limits.scatter_mm[0] and deg < limits.scatter_deg[0]
+        if _is_outlier(view) and view.view not in explained and is_small:
+            strays.setdefault(view.seer, []).append((float(np.deg2rad(deg)), 1e-3 * mm))
+    return {seer: np.array(errors) for seer, errors in strays.items()}
 
 
 def _unconnected(run: RunState) -> Iterator[Finding]:

@@ -14,6 +14,9 @@ The error of the robot relative to the thing has these sources:
                   where it looked from another; a tool's length adds to it
     left out      the excess of held-out residuals over their prediction, beyond chance
 
+Views that were rejected, by errors that an arm may have and for no reason that is known, count as
+so many picks of their errors.
+
 No camera finds a thing without noise; that is the task's own error, and not among them. Where the
 arm has posture-dependent errors, calibrated or not, the position is compared with the one by the
 whole chain: the errors of its first and last link are the same in all views, are absorbed by the
@@ -27,7 +30,7 @@ another.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -69,17 +72,33 @@ class Picks:
     offsets: FloatArray | None = None
     # The same picks by the controller's own poses; None where the arm is nominal.
     uncorrected: "Picks | None" = None
+    # (m, 2) turn [rad] and shift [m] of rejected views, as may happen to m of k + m picks.
+    strays: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @property
     def covariances(self) -> FloatArray:
         """(k, 6, 6) total covariance."""
         return np.asarray(np.sum(list(self.parts.values()), axis=0))
 
+    @cached_property
+    def _with_strays(self) -> tuple[FloatArray, FloatArray | None]:
+        """(k + m, 6, 6) covariances and (k + m, 6) known errors of picks, stray ones included."""
+        covariances, count = self.covariances, len(self.strays)
+        if not count:
+            return covariances, self.offsets
+        known = np.zeros((len(covariances), 6)) if self.offsets is None else self.offsets
+        # Of a stray the size is known, and its direction is any.
+        off = np.zeros((count, 6))
+        off[:, [2, 3]] = self.strays
+        mean = np.tile(covariances.mean(axis=0), (count, 1, 1))
+        return np.concatenate([covariances, mean]), np.concatenate([known, off])
+
     def probability(self, need: Need) -> float:
         """The probability that a pick at one of the positions is within a need."""
         turn_rad = np.inf if need.deg is None else float(np.deg2rad(need.deg))
         shift_m = np.inf if need.mm is None else 1e-3 * need.mm
-        return chance_within(self.covariances, turn_rad, shift_m, self.freedom, self.offsets)
+        covariances, offsets = self._with_strays
+        return chance_within(covariances, turn_rad, shift_m, self.freedom, offsets)
 
     def without(self, source: str) -> "Picks":
         """Picks without the error of one source."""
@@ -91,15 +110,15 @@ class Picks:
     @cached_property
     def good_for_mm(self) -> float:
         """The least need of position alone that would be met [mm]."""
-        return 1e3 * radius_within(
-            self.covariances, NeedLimits.probability[0], self.freedom, self.offsets
-        )
+        covariances, offsets = self._with_strays
+        return 1e3 * radius_within(covariances, NeedLimits.probability[0], self.freedom, offsets)
 
     @cached_property
     def good_for_deg(self) -> float:
         """The least need of rotation alone that would be met [deg]."""
-        turned = np.roll(self.covariances, 3, axis=(1, 2))
-        offsets = None if self.offsets is None else np.roll(self.offsets, 3, axis=1)
+        covariances, known = self._with_strays
+        turned = np.roll(covariances, 3, axis=(1, 2))
+        offsets = None if known is None else np.roll(known, 3, axis=1)
         share = NeedLimits.probability[0]
         return float(np.rad2deg(radius_within(turned, share, self.freedom, offsets)))
 
@@ -165,6 +184,8 @@ class PickInputs:
     full_problem: Problem
     # Relative change of the focal length of each camera from image to image.
     jitters: Mapping[str, float]
+    # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.
+    strays: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 def predict_picks(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
@@ -275,6 +296,8 @@ def _picks(
         {name: array for name, array in by_source.items() if array.any()},
         fitted.freedom.get(robot, np.inf),
         float(np.linalg.norm(in_camera, axis=1).mean()),
+        # Who carries the camera errs at the look and at the pick.
+        strays=np.tile(fitted.strays.get(camera, np.zeros((0, 2))), (1 + bool(carries.any()), 1)),
     )
     return replace(picks, uncorrected=_uncorrected(picks, fitted, in_base, at_m, whole=whole))
 
@@ -316,7 +339,8 @@ def _uncorrected(
     turn[:, :3, :3] = turn[:, 3:, 3:] = in_base[:, :3, :3] if whole else np.eye(3)
     offsets = (turn @ offsets[:, :, None])[:, :, 0]
     parts = {name: (turn @ part @ turn.mT)[looks] for name, part in picks.parts.items()}
-    return replace(picks, parts=parts, offsets=offsets[looks] - offsets[goes])
+    strays = np.tile(picks.strays, (len(after), 1))
+    return replace(picks, parts=parts, offsets=offsets[looks] - offsets[goes], strays=strays)
 
 
 def _diagonal(level: FloatArray) -> FloatArray:
