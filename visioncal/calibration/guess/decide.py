@@ -134,8 +134,7 @@ def _check(recording: Recording) -> None:
     if common < FEWEST_ROWS:
         raise DegenerateError(
             f"guess: {counted(common, 'row', ('has', 'have'))} a pose of the robot and one of the "
-            f"camera; "
-            f"{FEWEST_ROWS} or more are needed to distinguish readings.",
+            f"camera; {FEWEST_ROWS} or more are needed to distinguish readings.",
             next_step="Add views, tilted about different axes.",
         )
 
@@ -187,7 +186,7 @@ def _plausibility(candidate: Candidate) -> float:
     """Log odds of the cell that a reading gives, beside readings that close the chain alike."""
     if not candidate.fit.is_readable:
         return -np.inf
-    camera = candidate.hypothesis.camera.poses(candidate.recording.camera.rows(candidate.of_rows))
+    _, (camera,) = chains(candidate.recording, [candidate.hypothesis], candidate.of_rows)
     in_front = IMPOSSIBLE * bool(np.median(camera[:, 2, 3]) > 0.0)
     on_flange_m, at_base_m = np.log(np.maximum(_flange_and_cell_m(candidate), 1e-6))
     by_length = _BY_LENGTH * (at_base_m - on_flange_m)
@@ -296,16 +295,8 @@ def _guess(tried: list[Candidate], best: Candidate, *, is_mount_given: bool) -> 
     ranked = sorted(tried, key=lambda item: (item is not best, -item.log_posterior))[:_LISTED]
     if declared not in ranked:
         ranked[-1] = declared
-    notes = [*_notes(best)]
-    if not is_mount_given and best.fit.closes:
-        on_flange_m, at_base_m = _flange_and_cell_m(best)
-        notes.insert(
-            0,
-            f"The mount was not given and is taken for {best.hypothesis.mount}: what sits on the "
-            f"flange then is {1e3 * on_flange_m:.0f} mm from it, and what stands at the base "
-            f"{1e3 * at_base_m:.0f} mm. --mount says another.",
-        )
-    return Guess(declared, tuple(ranked), best, _sentence(declared, best, ranked), tuple(notes))
+    notes = tuple(_notes(best, is_mount_given=is_mount_given))
+    return Guess(declared, tuple(ranked), best, _sentence(declared, best, ranked), notes)
 
 
 def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate]) -> str:
@@ -337,10 +328,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
 def _best_sentence(declared: Candidate, best: Candidate) -> str:
     closes = f"With {best.words}, the chain closes to {_figures(best)}"
     if best.hypothesis.robot.half_turned:
-        return (
-            f"{closes}, and the poses are those of the joint angles; as declared, the chain closes "
-            f"to {_figures(declared)}."
-        )
+        closes += ", and the poses are those of the joint angles,"
     if best.hypothesis.swap and len(best.differences) == 1:
         return f"{closes}; as declared, {declared.fit.agreeing} of {declared.rows} views agree."
     return f"{closes} instead of {_figures(declared)}."
@@ -351,8 +339,15 @@ def _figures(candidate: Candidate) -> str:
     return f"{candidate.fit.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
 
 
-def _notes(best: Candidate) -> Iterator[str]:
+def _notes(best: Candidate, *, is_mount_given: bool) -> Iterator[str]:
     """States what residuals cannot show here."""
+    if not is_mount_given and best.fit.closes:
+        on_flange_mm, at_base_mm = (1e3 * length_m for length_m in _flange_and_cell_m(best))
+        yield (
+            f"The mount was not given and is taken for {best.hypothesis.mount}: what sits on the "
+            f"flange then is {on_flange_mm:.0f} mm from it, and what stands at the base "
+            f"{at_base_mm:.0f} mm. --mount says another."
+        )
     # Other units for both sides only scale the cell.
     reading, unit = best.hypothesis, best.hypothesis.robot.unit
     labels = (label for label in best.labels if label != reading and label.robot.unit == unit)

@@ -33,12 +33,13 @@ _STANDS_OUT = 3.0
 # chosen. Equally simple ones within the second ratio are rivals.
 _EQUIVALENT, _RIVALS = 2.0, 1.5
 # Rows of the first screening, readings refined, and the share of the declared score below which.
-_SCREENED, _REFINED, _REFINED_SHARE = 16, 6, 0.6
+_SCREENED, _REFINED, _REFINED_SHARE = 10, 6, 0.6
 # The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its minimum.
 # Where most of it is gone as recorded, the zero is nearer than that. A shift of 180 degrees is left
 # out: it looks like an opposite sign of the joint before or behind it. From the fourth step on, a
-# zero that is right is seen; the last is the finest.
+# zero that is right is seen, and with a larger score than the last at once; then the finest step.
 _STEP_RAD, _NEAR_RAD, _FARTHEST_RAD, _CLEAR_RAD, _FINEST_RAD = 0.25, 0.5, 2.75, 0.02, 1e-6
+_FAR_SCORE = 0.5
 # Outliers have residuals beyond this many scores.
 _OUTLIER = 5.0
 
@@ -242,7 +243,7 @@ def _with_zeros(
         fits = _fitted(tried, q, poses, rows)
         of_joints = (fits[at : at + len(grid)] for at in range(0, len(fits), len(grid)))
         best = [min(of_joint, key=lambda item: item.fit.score) for of_joint in of_joints]
-        if step < _CLEAR_RAD:
+        if step < _CLEAR_RAD or start.score > _FAR_SCORE:
             best = [item for item in best if item.score < _REFINED_SHARE * start.score]
         zeros = {item.reading.columns[0]: float(item.reading.zeros.sum()) for item in best}
         step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0

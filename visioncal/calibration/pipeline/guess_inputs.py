@@ -64,15 +64,9 @@ def guess_from_camera_poses(
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
-    """Computes (n, 4, 4) `base_from_flange` of every view through the robot's model.
+    """(n, 4, 4) `base_from_flange` of every view [m], through a model or the one that is stated.
 
-    Args:
-        session: The session.
-        robot: The model; the one that the session names where None.
-
-    Returns:
-        The poses, NaN where there are no joint angles; None where the session names no known
-        robot, or no view has as many angles as it has joints.
+    NaN where there are no joint angles; None without a known robot, or angles for its joints.
     """
     if robot is None and session.robot_document is not None:
         robot = Robot.from_document(session.robot_document)

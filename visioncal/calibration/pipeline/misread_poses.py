@@ -7,12 +7,7 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import CLOSING_SCORE, distances, robust_fit
 from visioncal.calibration.guess.readings import SHIFTS, Hypothesis, changes
-from visioncal.calibration.guess.search import (
-    FEWEST_ROWS,
-    Recording,
-    chains,
-    closes,
-)
+from visioncal.calibration.guess.search import FEWEST_ROWS, Recording, chains, closes
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_numbers,
@@ -305,14 +300,13 @@ def _misread_in_pair(run: RunState, robot: str, pair: CameraTargetPair) -> Findi
 def _closes_in_cell(run: RunState, robot: str, pair: CameraTargetPair) -> bool:
     """Whether the chain of a pair closes as declared."""
     reported = run.robots[robot].base_from_flange
-    views = [pose for pose in pair.poses if pose in reported]
-    places = tuple(f"view {view}" for view in views)
-
-    def numbers(poses: list[FloatArray]) -> PoseNumbers:
-        return PoseNumbers.of_poses(np.array(poses).reshape(-1, 4, 4), places)
-
-    of_robot = numbers([reported[view] for view in views])
-    of_camera = numbers([pair.poses[view].cam_from_target[0] for view in views])
+    both = [
+        (reported[view], poses.cam_from_target[0])
+        for view, poses in pair.poses.items()
+        if view in reported
+    ]
+    sides = np.array(both).reshape(-1, 2, 4, 4)
+    of_robot, of_camera = (PoseNumbers.of_poses(sides[:, at], [""] * len(both)) for at in (0, 1))
     return closes(Recording(of_robot, of_camera, pair.mount, is_measured=True))
 
 
