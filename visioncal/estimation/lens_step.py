@@ -5,7 +5,6 @@ tested at each view (Rao's score test), beside the lens common to all.
 """
 
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 
@@ -17,13 +16,10 @@ from visioncal.estimation.linalg import covariance_from
 # Least number of views on either side.
 _FEWEST = 3
 _FALSE_ALARM = 1e-4
-# Permutation test: an autofocus, or errors that depend on the corners' positions, would show as
-# large a step in a random order of the views. Number of orders tried, and the share that may show
-# more.
-_ORDERS, _RARELY = 300, 0.01
-# Residual errors of the lens model are alike in successive views: some cyclic part of the session
-# with another start then differs as much. Starts within this many views of the step are the same.
-_SAME_WITHIN = 2
+# With an autofocus, or residual errors of the lens model, which are alike in successive views, some
+# cyclic part of the session with another start differs as much. Starts within this many views of
+# the step are the same; most starts tried.
+_SAME_WITHIN, _MOST_STARTS = 2, 300
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ def lens_step(
     beyond: FloatArray,
     order: IntArray,
 ) -> LensStep | None:
-    """The most significant step of a lens; None if it is explained by noise or view order.
+    """The most significant step of a lens; None if noise or other parts of the session show more.
 
     Args:
         stack: The corners of v views.
@@ -76,13 +72,7 @@ def lens_step(
     if freedom <= 3 or gain < limit * noise:
         return None
     first = index + _FEWEST
-    rng = np.random.default_rng(0)
-    orders = np.array([rng.permutation(count) for _ in range(_ORDERS)])
-    others = _tested(products[orders], steps)[0].max(axis=1)
-    # Orders with the same views before the step show the same.
-    if np.mean(others > (1.0 + 1e-6) * gain) + 2.0 / comb(count, first) > _RARELY:
-        return None
-    starts = np.unique(np.linspace(0, count - 1, min(count, _ORDERS)).round().astype(int))
+    starts = np.unique(np.linspace(0, count - 1, min(count, _MOST_STARTS)).round().astype(int))
     distance = np.abs((starts[:, None] - [0, first] + count // 2) % count - count // 2).min(axis=1)
     rotations = (np.arange(count) + starts[distance > _SAME_WITHIN, None]) % count
     if len(rotations) and _tested(products[rotations], steps)[0].max() > gain:

@@ -188,7 +188,7 @@ def find_steps(
         for candidate in candidates
     ]
     ends = np.cumsum([0, *map(len, columns)])
-    best: dict[int, Step] = {}
+    best, squares = dict[int, Step](), dict[int, float]()
     freedom = _residual_freedom(problem, fit)
     tried = Counter[str]()
     for candidate in candidates:
@@ -215,11 +215,10 @@ def find_steps(
             limit = count * float(
                 f_limit(FALSE_MOVE / tried[candidate.kind], count, max(0.5 * many, 6.0))
             )
-            if _as_f_test(square, many, count) < limit:
+            if _as_f_test(square, many, count) < limit or square <= squares.get(at, 0.0):
                 continue
+            squares[at] = square
             gain = -freedom * float(np.log1p(-min(square / freedom, _MOST_EXPLAINED)))
-            if at in best and best[at].gain >= gain:
-                continue
             before = following[:size, mine] @ value
             after = before.copy()
             if candidate.effect is None:

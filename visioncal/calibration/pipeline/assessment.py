@@ -18,9 +18,8 @@ from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.fault_messages import (
     PoseFault,
     Version,
+    explained_outliers,
     movements,
-    pose_faults,
-    reasons,
     versions,
 )
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
@@ -187,7 +186,7 @@ def assess_fit(
     beside = covariance_from_other_sources(part, fit, solved.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     held_out = left_out(solved, is_misread=observed.is_misread)
-    faults, middles = pose_faults(solved), middles_of(solved.cell)
+    (faults, reasons), middles = explained_outliers(solved), middles_of(solved.cell)
     # The first view of each stop.
     first = {row.station: row.view for row in reversed(solved.cell.rows)}
     return FitAssessment(
@@ -204,7 +203,7 @@ def assess_fit(
         held_out,
         movements(solved),
         faults,
-        _views(observed, cell, solved, held_out, faults),
+        _views(observed, cell, solved, held_out, reasons),
         _sigmas(solved),
     )
 
@@ -287,10 +286,10 @@ def _views(
     cell: Cell,
     solved: CellFit,
     held_out: HeldOutResiduals,
-    faults: Sequence[PoseFault],
+    reasons: Mapping[int, str],
 ) -> tuple[ViewResult, ...]:
     """Result of each observation, in the order of the session's rows."""
-    used, why = solved.inlier_fit.used, reasons(solved, faults)
+    used = solved.inlier_fit.used
     left_out = np.full((len(used), 3), np.nan)
     left_out[used] = np.stack(
         [1e3 * held_out.residual_m, np.rad2deg(held_out.residual_rad), held_out.rms_px], axis=1
@@ -304,7 +303,7 @@ def _views(
             results[row.view] = ViewResult(
                 row.view,
                 not is_held and bool(used[at]),
-                HELD_BACK if is_held else why.get(row.view, ""),
+                HELD_BACK if is_held else reasons.get(row.view, ""),
                 None if corners is None else len(corners.ids),
                 px,
                 mm,

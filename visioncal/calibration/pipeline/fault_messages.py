@@ -123,20 +123,31 @@ def moved_finding(moved: Moved) -> Finding:
     )
 
 
-def pose_faults(solved: CellFit) -> tuple[PoseFault, ...]:
-    """Turned images, exchanged or wrong poses, and what moved, that explain outliers."""
-    outliers = np.flatnonzero(~solved.inlier_fit.used)
+def explained_outliers(solved: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
+    """What explains outliers, and why each is left out, by view.
+
+    Turned images, exchanged or wrong poses, and what moved; else the stops that a view fits instead
+    of its own.
+    """
+    outliers, agreed = np.flatnonzero(~solved.inlier_fit.used), solved.inlier_fit
     if not len(outliers):
-        return ()
-    faults = [*_turned_images(solved)]
-    mutual = exchanged(solved.inlier_fit.problem, _fitting_stations(solved, outliers))
+        return (), {}
+    turns = {
+        frame_name("target", name): rotation_transforms(target)
+        for name, target in solved.cell.session.boards.items()
+    }
+    fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
+    mutual, faults = exchanged(agreed.problem, fitting), [*_turned_images(solved)]
     if solved.cell.mount is not None:
         faults += _exchanged_views(solved, mutual, set())
-        return tuple(faults or _moved_run(solved))
-    faults += [*_pushed_bases(solved), *_exchanged_poses(solved, mutual)]
-    faults += _exchanged_views(solved, mutual, {row for fault in faults for row in fault.rows})
-    faults += _wrong_poses(solved, {row for fault in faults for row in fault.rows})
-    return tuple(faults)
+        faults = faults or [*_moved_run(solved)]
+    else:
+        faults += [*_pushed_bases(solved), *_exchanged_poses(solved, mutual)]
+        faults += _exchanged_views(solved, mutual, {row for fault in faults for row in fault.rows})
+        faults += _wrong_poses(solved, {row for fault in faults for row in fault.rows})
+    clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
+    causes = {at: _cause(solved, at, fitting, mutual) for at in outliers.tolist()} | clauses
+    return tuple(faults), _reasons(solved, causes)
 
 
 def _fault(
@@ -335,92 +346,60 @@ def _wrong_poses(solved: CellFit, explained: Collection[int]) -> Iterator[PoseFa
                 yield _fault(solved, "wrong_pose", rows.tolist(), words, do, short)
 
 
-def reasons(solved: CellFit, faults: Sequence[PoseFault]) -> dict[int, str]:
-    """Why outliers are left out, by view, with the stops that they fit instead."""
-    inliers, rows, problem = solved.inlier_fit, solved.cell.rows, solved.inlier_fit.problem
-    outliers = np.flatnonzero(~inliers.used)
-    if not len(outliers):
-        return {}
-    residuals_mm_deg, distances_sq = residuals(solved)[outliers], inliers.distances
-    directions = np.maximum(distances_sq.directions, 1)
-    distance = np.sqrt(distances_sq.squares / directions)
-    limit = np.sqrt(distances_sq.limit / directions)
-    fitting = _fitting_stations(solved, outliers)
-    mutual = exchanged(problem, fitting)
-    clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
-    rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
-    reasons_by_view = {}
-    for at, (mm, deg) in zip(outliers.tolist(), residuals_mm_deg.tolist(), strict=True):
-        turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
-        cause = _cause(solved, at)
-        if at in clauses:
-            cause = clauses[at]
-        elif at in mutual:
-            other = rows[mutual[at]]
-            cause = (
-                f"it fits stop {_stop(solved, mutual[at])}, and view {other.view} fits stop "
-                f"{_stop(solved, at)}: these two rows are exchanged"
-            )
-        elif at in fitting:
-            stops = [str(solved.cell.stops[index]) for index in fitting[at][:_NAMED]]
-            one = "stop" if len(stops) == 1 else "another stop, as"
-            cause = f"its image is of {one} {', '.join(stops)}; {cause}"
+def _reasons(solved: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
+    """Why outliers are left out, by view, given the likely cause of each."""
+    inliers, alone = solved.inlier_fit, solved.cell.mount is not None
+    directions = np.maximum(inliers.distances.directions, 1)
+    distance = np.sqrt(inliers.distances.squares / directions)
+    limit = np.sqrt(inliers.distances.limit / directions)
+    off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
+    rest, reasons = "the other views" if alone else "the rest of the cell", dict[int, str]()
+    for at, cause in causes.items():
+        row, mm = solved.cell.rows[at], 1e3 * float(off_m[at])
+        turned = ""
+        if inliers.problem.observations.has_rotation[at]:
+            turned = f" and {figure(float(np.rad2deg(off_rad[at])))} deg"
         # What is far away is rejected even where the prediction is uncertain.
-        beyond = (
-            f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
-            if distance[at] > limit[at]
-            else "many times as far as most"
-        )
-        target = _target_words(solved, rows[at].seen)
-        reasons_by_view[rows[at].view] = (
+        beyond = "many times as far as most"
+        if distance[at] > limit[at]:
+            beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
+        target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
+        if alone and row.seen.startswith("point") and row.seen not in inliers.problem.points:
+            target = "the probe"
+        reasons[row.view] = (
             f"disagrees with {rest}: it places {target} {figure(mm)} mm{turned} away, {beyond}; "
             f"{cause}"
         )
-    return reasons_by_view
+    return reasons
 
 
-def _target_words(solved: CellFit, frame: str) -> str:
-    """Name of a target or point in words."""
-    if solved.cell.mount is None:
-        return frame.partition("@")[0]
-    is_probe = frame.startswith("point") and frame not in solved.inlier_fit.problem.points
-    return "the probe" if is_probe else f"the {frame.partition('_')[0]}"
-
-
-def _cause(solved: CellFit, at: int) -> str:
-    """Likely cause of an outlier, by the inliers of its stop and of its target."""
-    rows, used, problem = solved.cell.rows, solved.inlier_fit.used, solved.inlier_fit.problem
-    seen = np.array(problem.observations.observed)
-    of_its_target = np.flatnonzero((seen == seen[at]) & used)
-    reading = "reading" if rows[at].seer.startswith("instrument") else "image"
-    if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
-        other = rows[of_its_target[0]].view
-        return f"it and view {other} alone show this target, and either may be wrong"
-    stops = problem.observations.stops
-    mates = np.flatnonzero((stops == stops[at]) & used)
-    if len(mates):
+def _cause(
+    solved: CellFit, at: int, fitting: Mapping[int, Sequence[int]], mutual: Mapping[int, int]
+) -> str:
+    """Likely cause of an outlier, by stops that it fits and by inliers of its stop and target."""
+    rows, used, stops = solved.cell.rows, solved.inlier_fit.used, solved.cell.stops
+    seen = np.array(solved.inlier_fit.problem.observations.observed)
+    if at in mutual:
+        own, other = rows[at], rows[mutual[at]]
         return (
+            f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
+            f"{stops[own.station]}: these two rows are exchanged"
+        )
+    reading = "reading" if rows[at].seer.startswith("instrument") else "image"
+    cause = f"its pose or its {reading} is wrong, or something had moved"
+    of_its_target = np.flatnonzero((seen == seen[at]) & used)
+    of_stop = solved.inlier_fit.problem.observations.stops
+    mates = np.flatnonzero((of_stop == of_stop[at]) & used)
+    if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
+        other = rows[of_its_target[0]]
+        cause = f"it and view {other.view} alone show this target, and either may be wrong"
+    elif len(mates):
+        cause = (
             f"view {rows[mates[0]].view} of the same stop agrees: the {reading} is wrong, or "
             "something moved in between"
         )
-    return f"its pose or its {reading} is wrong, or something had moved"
-
-
-def _stop(solved: CellFit, row: int) -> int:
-    return solved.cell.stops[solved.cell.rows[row].station]
-
-
-def residuals(solved: CellFit) -> FloatArray:
-    """Residuals (n, 2) of the observations, translation and rotation [mm], [deg]."""
-    metres, radians = pose_residuals(solved.inlier_fit.problem, solved.inlier_fit.fit.state)
-    return np.stack([1e3 * metres, np.rad2deg(radians)], axis=1)
-
-
-def _fitting_stations(solved: CellFit, outliers: IntArray) -> dict[int, list[int]]:
-    """The other stations that outliers fit; see `other_stops`."""
-    agreed = solved.inlier_fit
-    turns = {
-        frame_name("target", name): rotation_transforms(target)
-        for name, target in solved.cell.session.boards.items()
-    }
-    return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
+    if at in fitting:
+        fits = [str(stops[index]) for index in fitting[at][:_NAMED]]
+        one = "stop" if len(fits) == 1 else "another stop, as"
+        cause = f"its image is of {one} {', '.join(fits)}; {cause}"
+    return cause
