@@ -20,7 +20,6 @@ from visioncal.calibration.suspects.judged import PointAccuracy
 from visioncal.calibration.suspects.ranking import (
     MEASURE_BOARD,
     NO_JOINTS,
-    REFINE_LENS,
     explained_by,
 )
 from visioncal.core.codec import read, write
@@ -179,15 +178,10 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     (arm,) = found.arms
     known = judge(replace(found, arms=(replace(arm, modelled=True),)))
     assert known.causes[1].do.command == PLAN
-    # No view tells how large a board is that limits the rest, nor what a lens is that is held.
+    # No view tells how large a board is that limits the rest.
     budget = {"pixels": 0.05, "board": 0.02, "held values": 0.1, "total": 0.12}
     of_board = replace(found, places=(PointAccuracy("A point", budget, 0.2),))
     assert judge(of_board).causes[1].do is MEASURE_BOARD
-    of_lens = replace(
-        changed(of_board, holds_lens=True, has_lens_sigma=True),
-        places=(PointAccuracy("A point", {**budget, "intrinsics": 0.05}, 0.2),),
-    )
-    assert judge(of_lens).causes[1].do is REFINE_LENS
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
     assert ids(judge(met)) == ["moved_slowly"]

@@ -318,11 +318,11 @@ def _is_outlier(view: ViewResult) -> bool:
 def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     seers = dict.fromkeys(view.seer for view in views)
     not_needed = run.spared.keys() | run.held_back
-    seen, sensors = run.cell_fit.linearised_corners, []
+    sensors = []
     for seer in seers:
         mine = [view for view in views if view.seer == seer]
         unused = [view for view in mine if not view.used and view.view not in not_needed]
-        levels, scene = run.assessment.sigmas.get(seer, {}), run.scenes.get(seer)
+        levels = run.assessment.sigmas.get(seer, {})
         sensors.append(
             Sensor(
                 used=sum(view.used for view in mine),
@@ -332,8 +332,6 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
                 level=levels.get("level", 1.0),
                 spared=sum(view.view in run.spared for view in mine),
                 name=seer if len(seers) > 1 else "",
-                holds_lens=seen is not None and seen.holds_lens(seer),
-                has_lens_sigma=scene is not None and scene.matrix_sigma_px is not None,
             )
         )
     return sensors
@@ -402,25 +400,21 @@ def _words_of(run: RunState) -> CellWords:
     is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
 
     def words(frame: str, culprit: str = "") -> tuple[str, str]:
+        tie = sole_static_view(cell, frame) if is_tilted else None
+        if tie is not None:
+            return tie.words, str(tie.do)
         seen = part.observations_through(frame)
-        count = int(outliers.observations_through(frame).sum())
-        if is_tilted and (tie := sole_static_view(cell, frame)) is not None:
-            why, advice = tie.words, str(tie.do)
-        elif not seen.any() and len(outliers):
-            why = "observations of it are too few or too poor"
-            advice = (
+        if not seen.any() and (count := int(outliers.observations_through(frame).sum())):
+            return (
+                f"all {count} observations of it disagree with the rest of the cell",
                 "Look whether the board that ties it has the stated size, and whether images and "
-                "poses belong together."
+                "poses belong together.",
             )
-        else:
-            why, advice = _motion(cell, part, frame), _frame_advice(cell, frame)
-            flanges = part.tree.flanges.values()
-            between = [name for name in flanges if part.observations_through(name)[seen].any()]
-            if between and "offset along" in culprit:
-                advice = f"{advice} {measuring_advice(cell, between[0])}".rstrip()
-        if not seen.any() and count:
-            why = f"all {count} observations of it disagree with the rest of the cell"
-        return why, advice
+        advice, flanges = _frame_advice(cell, frame), part.tree.flanges.values()
+        between = [name for name in flanges if part.observations_through(name)[seen].any()]
+        if between and "offset along" in culprit:
+            advice = f"{advice} {measuring_advice(cell, between[0])}".rstrip()
+        return _motion(cell, part, frame), advice
 
     return CellWords(
         "cell",

@@ -10,7 +10,6 @@ from visioncal.calibration.suspects.ranking import (
     LEAST_RUN,
     MEASURE_BOARD,
     NO_JOINTS,
-    REFINE_LENS,
     add_views_remedy,
     run_evidence,
 )
@@ -202,21 +201,17 @@ def _variance(judged: Findings, *sources: str) -> float:
     return part / total if total else 0.0
 
 
-def _better_stated(judged: Findings) -> Remedy | None:
-    """Remedy for a held board or lens that causes most uncertainty; None for other causes."""
+def _is_of_board(judged: Findings) -> bool:
+    """Whether most uncertainty comes from boards' stated sizes, which no view reduces."""
     # Held values are lenses rather than boards where the budget has more of these.
     board, lens, held = (_variance(judged, at) for at in ("board", "intrinsics", "held values"))
-    is_lens = lens > board and any(sensor.holds_lens for sensor in judged.sensors)
-    if board + held * (not is_lens) > 0.5:
-        return MEASURE_BOARD
-    is_stated = any(sensor.holds_lens and sensor.has_lens_sigma for sensor in judged.sensors)
-    return REFINE_LENS if is_lens and is_stated and lens + held > 0.5 else None
+    return board + held * (lens <= board) > 0.5
 
 
 def remedy_for_uncertainty(judged: Findings) -> Remedy | None:
     """Remedy that makes a result less uncertain; None where a finding on the arm has it."""
-    if stated := _better_stated(judged):
-        return stated
+    if _is_of_board(judged):
+        return MEASURE_BOARD
     if any(warning.do == NO_JOINTS for warning in judged.warnings):
         return None
     return _more_views(judged, "Add views from other poses of the robot.")
@@ -253,22 +248,20 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     least = f"{_LIMITS.sigma_mm[0]:g} mm and {_LIMITS.sigma_deg[0]:g} deg"
     known = f"known to {named} (sigma; doubt begins at {least}): most of that"
     words = f"Weakly determined by the motion, with their sigmas: {named}; doubt begins at {least}."
-    step = _better_stated(judged)
+    step = _tilted(judged)
     has_no_joints = any(warning.do == NO_JOINTS for warning in judged.warnings)
     if has_no_joints and _variance(judged, "arm", "robot", "poses") > 0.5:
         words = f"As mounts, {known} is the arm's, and is the same in every recording."
         step = NO_JOINTS
-    elif step == MEASURE_BOARD:
+    elif _is_of_board(judged):
+        step = MEASURE_BOARD
         words = f"Frames are {known} is the board's, as well as its size is stated."
-    elif step is not None:
-        words = f"Frames are {known} is the lens's, which is held and known too little."
     elif judged.tie is not None:
         words = (
             f"Weakly determined, with their sigmas: {named}; doubt begins at {least}. The cause: "
             f"{judged.tie.words}."
         )
-        step = judged.tie.do
-    step = step or _tilted(judged)
+        step = judged.tie.do or step
     yield Finding("weak_motion", words, step, is_fatal=is_fatal, until_mm=0.0)
 
 
@@ -295,7 +288,7 @@ def _place(judged: Findings) -> Iterator[Finding]:
     if others:
         named = (f"{place.words} ({figure(place.budget_mm['total'])} mm)" for place in others)
         words += f" Over {check:g} mm are also {', '.join(named)}."
-    step = _better_stated(judged)
+    step = MEASURE_BOARD if _is_of_board(judged) else None
     yield Finding("place", words, step, is_fatal=total[1] > bad, until_mm=0.0)
 
 

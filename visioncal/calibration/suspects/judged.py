@@ -46,8 +46,6 @@ class Sensor:
     level: float = 1.0  # Ratio of the scatter of its poses to their predicted noise.
     spared: int = 0  # Number of redundant views that were not needed.
     name: str = ""  # Its frame; empty for a single sensor.
-    holds_lens: bool = False  # Whether its lens is held and counts in the covariance.
-    has_lens_sigma: bool = False  # Whether the session states how well its matrix is known.
 
 
 @dataclass(frozen=True)

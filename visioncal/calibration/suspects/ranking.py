@@ -59,11 +59,6 @@ MEASURE_BOARD = Remedy(
     "square (of a marker size_m, its side), and square_sigma_m, how well it is known, of the "
     "target: more views tell neither."
 )
-# Remedy for a given lens that is held and not known better.
-REFINE_LENS = Remedy(
-    'In [camera], set intrinsics = "refine", best with more views and a board of many corners, or '
-    "state a smaller matrix_sigma_px where fx, fy, cx, cy are known better."
-)
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
@@ -180,7 +175,7 @@ def rank_causes(
                 continue
             found.append(source)
             # An uncertain calibration is due to weak motion, if more views make it better.
-            adds = more is not None and more not in (MEASURE_BOARD, REFINE_LENS)
+            adds = more is not None and more != MEASURE_BOARD
             if source.kind == "calibration" and source.probability >= _LIKELIER and adds:
                 weak = [finding for finding in found if finding.kind == "weak_motion"]
                 for finding in weak[:1]:
