@@ -181,20 +181,28 @@ def board_changes(problem: Problem, state: State) -> FloatArray:
 
 
 def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
-    """Takes over the calibration's arm."""
+    """Takes over the calibration's arm, with its errors as unknowns of known covariance.
+
+    Raises:
+        DataError: They are of joints that the session lacks.
+    """
     observed = replace(observed, calibrated=replace(observed.robot_arm, model=prior.model))
-    if prior.arm in ("none", "poses"):
+    arm, session = observed.robot_arm, observed.session
+    if prior.arm == "none":
         return observed
-    if observed.robot_arm.joints_rad is None:
-        missing = [view.number for view in observed.session.views if view.joints_rad is None]
+    if prior.arm == "poses":
+        arm = replace(arm, joints_rad=None)
+    elif arm.joints_rad is None:
+        missing = [view.number for view in session.views if view.joints_rad is None]
         without = f"{counted(len(missing), 'view', ('has', 'have'))} no joint angles."
         raise DataError(
-            f"session {observed.session.name!r}: the calibration is of an arm by its joints, and "
+            f"session {session.name!r}: the calibration is of an arm by its joints, and "
             + (without if missing else "its joints differ."),
             culprits=[f"views.csv: view {index}" for index in missing],
             next_step="Record q1_rad ... with every view.",
         )
-    return observed
+    errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
+    return replace(observed, calibrated=replace(arm, errors=errors))
 
 
 def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
@@ -223,17 +231,7 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
     observed = replace(observed, frames=observed.framed(prior.state.edges)).posed(chosen)
     if observed.free is not None and all(view.corners is not None for view in chosen):
         observed = observed.with_noise(_noise_px(observed)).posed(chosen)
-    return _with_errors(observed, prior)
-
-
-def _with_errors(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
-    """Adds the arm's errors as unknowns, which the calibration's covariance includes."""
-    if prior.arm == "none":
-        return observed
-    arm = observed.robot_arm
-    arm = replace(arm, joints_rad=None) if prior.arm == "poses" else arm
-    errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
-    return replace(observed, calibrated=replace(arm, errors=errors))
+    return observed
 
 
 def _noise_px(observed: ObservedPoses) -> float:
@@ -255,43 +253,39 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
     Raises:
         DataError: They are others, or it is not known which of several is shown.
     """
-    calibrated, shown = prior.targets, session.boards
+    calibrated, shown, label = prior.targets, session.boards, f"session {session.name!r}"
     if not calibrated and any(view.image or view.has_corners for view in session.views):
         raise _other_target(
-            f"session {session.name!r} has images; calibration "
-            f"{prior.calibration.session_name!r} was made from measured poses, and does not say of "
-            "which target.",
+            f"{label} has images; calibration {prior.calibration.session_name!r} was made from "
+            "measured poses, and does not say of which target.",
             "Give the target's poses (cft_x_m ...) as when it was calibrated.",
         )
+    names = ", ".join(name or "one without a name" for name in calibrated)
     # A session's only target has no name: of several calibrated ones, it is that with an equal
     # print.
-    alike = [
-        name for name in calibrated if "" in shown and not _differences(prior, name, shown[""])
-    ]
+    only = shown.get("")
+    alike = [name for name in calibrated if only and not _differences(prior, name, only)]
     name = alike[0] if len(alike) == 1 else ""
     for shown_name, target in shown.items() if calibrated and not name else ():
-        label = f"session {session.name!r}: target {shown_name or target.name!r}"
+        other = f"{label}: target {shown_name or target.name!r}"
         if shown_name not in calibrated:
-            names = ", ".join(other or "one without a name" for other in calibrated)
             raise _other_target(
-                f"{label} is none of those that were calibrated with ({names}).",
-                "Verify with views of that target alone."
-                if "" in calibrated
-                else "Name the targets as in the calibration's session.",
+                f"{other} is none of those that were calibrated with ({names}).",
+                "Name it as in the calibration's session, or verify with views of that target "
+                "alone.",
             )
         if differences := _differences(prior, shown_name, target):
             raise _other_target(
-                f"{label} was calibrated with other values: it has {listed(differences)}.",
+                f"{other} was calibrated with other values: it has {listed(differences)}.",
                 "Verify with the target that was calibrated with, as it was described then.",
             )
     if len(calibrated) < 2 and len(shown) < 2:
         return session
     if not shown:
         raise _other_target(
-            f"session {session.name!r} does not say which of the targets that were calibrated with "
-            f"({', '.join(calibrated)}) its rows show.",
-            "Declare them as in the calibration's session, and name one in each row's column "
-            "target.",
+            f"{label} does not say which of the targets that were calibrated with ({names}) its "
+            "rows show.",
+            "Declare them, and name one in each row's column target.",
         )
     views = session.views
     if name:
