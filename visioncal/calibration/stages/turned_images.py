@@ -7,6 +7,7 @@ corners, turned back, are where the robot and the board predict them.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from visioncal.core.types import FloatArray
 
@@ -55,8 +56,12 @@ def find_image_turn(
         The turn; None where the corners are as predicted, or no turn explains them.
     """
     predicted = predicted_px[np.isfinite(predicted_px).all(axis=1)]
-    limit_px = min(_AGREEMENT * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(predicted))
-    if not len(predicted) or _rms_px(px, predicted) < limit_px:
+    if not len(predicted):
+        return None
+    # Median distance of a corner from its nearest neighbour; infinite for one.
+    spacing_px = float(np.median(cKDTree(predicted).query(predicted, k=2)[0][:, 1]))
+    limit_px = min(_AGREEMENT * max(typical_px, _LEAST_PX), _OF_SPACING * spacing_px)
+    if _rms_px(px, predicted) < limit_px:
         return None
     middle = (np.array(size) - 1.0) / 2.0
     rms_px, turn = min(
@@ -67,16 +72,6 @@ def find_image_turn(
     return turn if rms_px < limit_px else None
 
 
-def _spacing_px(places: FloatArray) -> float:
-    """Median distance of points from their nearest neighbour [px]; infinite for one."""
-    if len(places) < 2:
-        return np.inf
-    squares = np.sum((places[:, None] - places) ** 2, axis=2)
-    np.fill_diagonal(squares, np.inf)
-    return float(np.sqrt(np.median(squares.min(axis=1))))
-
-
 def _rms_px(px: FloatArray, places: FloatArray) -> float:
     """RMS distance of points from the nearest of others [px]."""
-    squares = np.sum((px[:, None] - places) ** 2, axis=2).min(axis=1)
-    return float(np.sqrt(squares.mean()))
+    return float(np.sqrt(np.mean(cKDTree(places).query(px)[0] ** 2)))
