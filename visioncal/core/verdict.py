@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
-from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, NOTE, Kind
+from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, Kind
 from visioncal.core.number_format import percent, ranges
 from visioncal.core.summaries import html_card
 
@@ -150,10 +150,6 @@ class Verdict:
             return cls("good", (praise,))
         status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
         return cls(status, tuple(sorted(doubts, key=lambda doubt: not doubt.is_fatal)))
-
-    def noting(self, sentences: Iterable[str]) -> Self:
-        """The same verdict with notes."""
-        return replace(self, findings=(*self.findings, *remarks(sentences, NOTE)))
 
     def __repr__(self) -> str:
         return "\n  ".join([f"Verdict: {self.status}", *self.top])

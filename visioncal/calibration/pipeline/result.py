@@ -21,8 +21,7 @@ from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects
-from visioncal.calibration.stages.validate import predict_corners
-from visioncal.core.transforms import adjoint, invert, log
+from visioncal.core.transforms import adjoint, apply, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimation.arm import misfit_jacobian
@@ -59,6 +58,7 @@ from visioncal.results.views import rms_of
 from visioncal.robot import Robot
 from visioncal.session import frame_name
 from visioncal.session.frames import CELL, object_name
+from visioncal.vision.camera import project
 from visioncal.vision.targets import first_corners, target_document
 
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
@@ -492,7 +492,7 @@ def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
             px = None
             if view.corners is not None and optics is not None and row.seer in optics.problems:
                 points = optics.points[view.corners.ids]
-                px = predict_corners(optics.camera(row.seer), predicted, points)
+                px = project(optics.camera(row.seer), apply(predicted, points))
             evidence[row.view] = (view.corners, px, measured)
     observations = {observation.view.number: observation for observation in run.timed.observations}
     views = []

@@ -27,9 +27,9 @@ from visioncal.calibration.stages.priors import with_loose_positions, without_mo
 from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
 from visioncal.calibration.stages.refine import refine_jointly, with_sizes
 from visioncal.calibration.stages.turned_images import ImageTurn, find_image_turn
-from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
+from visioncal.core.transforms import apply
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
@@ -56,6 +56,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.session.frames import frame_name
+from visioncal.vision.camera import project
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
@@ -263,7 +264,7 @@ def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
         if view.corners is None or seer not in optics.problems:
             continue
         camera = optics.camera(seer)
-        predicted_px = predict_corners(camera, predicted[row], optics.corners[view.board])
+        predicted_px = project(camera, apply(predicted[row], optics.corners[view.board]))
         how = find_image_turn(view.corners.px, predicted_px, camera.resolution, typical_px)
         if how is not None:
             turns[view.view] = how

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply, apply_each, distances
+from visioncal.core.transforms import apply_each, distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
@@ -124,10 +124,3 @@ def chain_rms_px(
         squares = np.bincount(view_of, np.sum(residuals**2, axis=1), minlength=len(poses))
         rms[rows] = np.sqrt(squares[rows] / counts)
     return rms
-
-
-def predict_corners(
-    camera: Camera, cam_from_target: FloatArray, positions: FloatArray
-) -> FloatArray:
-    """Projects a target's (n, 3) corners [m] at a pose, to (n, 2) [px]."""
-    return project(camera, apply(cam_from_target, positions))
