@@ -7,7 +7,6 @@ import pytest
 from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
 from visioncal.calibration.stages.init_frames import init_network
-from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
@@ -36,25 +35,16 @@ def problem_of(seed, stops=20, seen=0.7, **more):
     return cell, observed(cell, rng, **more)
 
 
-def sighted(problem, **turned):
-    seen = problem.observations
-    count = len(seen)
-    return Sighted(
-        seen.observers,
-        seen.observed,
-        seen.stops,
-        Candidates(
-            seen.measured[:, None],
-            np.zeros((count, 1), dtype=np.int64),
-            np.ones((count, 1), dtype=bool),
-        ),
-        turned,
-        ~seen.has_rotation,
-    )
+def network(problem, **turned):
+    """The frames that the observations connect, each by its only pose."""
+    shape = (len(problem.observations), 1)
+    poses = problem.observations.measured[:, None]
+    candidates = Candidates(poses, np.zeros(shape, dtype=np.int64), np.ones(shape, dtype=bool))
+    return init_network(problem, candidates, turned)
 
 
 def started(problem):
-    tied = init_network(problem.tree, problem.poses, sighted(problem))
+    tied = network(problem)
     assert not tied.untied
     return State(np.array([tied.edges[index] for index in problem.unknown]), np.zeros(0))
 

@@ -31,7 +31,6 @@ from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.pose_ambiguity import choose_nearest, with_candidate
 from visioncal.calibration.stages.residual_findings import likely_steps
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
 from visioncal.core.choices import Convention
@@ -269,10 +268,10 @@ def held_back(solved: CellFit, observed: Observed) -> SeenRows | None:
         return None
     solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
     views = [observed.poses[row.view] for row in rows]
-    first = _problem(solved, observed, [with_candidate(view, 0, None) for view in views])
+    first = _problem(solved, observed, [view.chosen(0, None) for view in views])
     optics, targets = solved.camera_parameters, targets_of(cell)
     for at, (row, pose) in enumerate(zip(rows, first.predicted(state), strict=True)):
-        view = choose_nearest(views[at], pose, targets.get(row.seen))
+        view = views[at].nearest(pose, targets.get(row.seen))
         if optics is not None and view.corners is not None and row.seer in optics.problems:
             stack = CornerStack.of({row.view: view.corners}, optics.points)
             poses = fit_poses(stack, optics.camera(row.seer), view.cam_from_target)

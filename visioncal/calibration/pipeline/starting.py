@@ -10,11 +10,9 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pairwise import AGREE_M
-from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.pnp import ViewPoses, distances_m
 from visioncal.core.errors import DegenerateError
-from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import Target
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
@@ -84,8 +82,8 @@ def agreeing_views(cell: Cell, observed: Observed) -> frozenset[int]:
         DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
     start = find_start(cell, observed)
-    residual = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
-    distance = np.linalg.norm(residual[:, :3, 3], axis=1) + LEVER_M * rotation_angle(residual)
+    problem = start.problem
+    distance = distances_m(problem.observations.measured, problem.predicted(start.state))
     is_near = (distance < AGREE_M).tolist()
     return frozenset(pose.view for pose, agrees in zip(start.poses, is_near, strict=True) if agrees)
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
+from visioncal.calibration.stages.init_frames import CLEAR_RATIO
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray

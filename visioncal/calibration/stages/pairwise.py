@@ -6,9 +6,9 @@ from itertools import product
 
 import numpy as np
 
-from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.transforms import invert, mean_transform, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount
+from visioncal.calibration.stages.pnp import ViewPoses, distances_m
+from visioncal.core.transforms import invert, mean_transform
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
@@ -27,8 +27,9 @@ _NULL_RATIO, _WORST_M = 1e-8, 0.1
 # Largest mean distance of views that agree, rotations on a lever [m].
 AGREE_M = 0.02
 # Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
-_NOISE = Noise(np.full((1, 2), 5e-4), np.zeros(0))
-_CAMERA_SIGMA = 1e-6
+_NOISE, _CAMERA_SIGMA = Noise(np.full((1, 2), 5e-4), np.zeros(0)), 1e-6
+# Rounds in which each view's candidate follows both edges.
+_ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +46,12 @@ class Candidates:
     @staticmethod
     def of(views: Sequence[ViewPoses]) -> "Candidates":
         """Collects the candidates of views."""
-        most = max(len(view.cam_from_target) for view in views)
-        counts = [len(view.cam_from_target) for view in views]
-        indices = [np.minimum(np.arange(most), count - 1) for count in counts]
-        padded = list(zip(views, indices, strict=True))
-        poses = np.array([view.cam_from_target[rows] for view, rows in padded])
-        turns = np.array([np.array(view.turns)[rows] for view, rows in padded])
-        return Candidates(poses, turns, np.array([np.arange(most) < count for count in counts]))
+        counts = np.array([len(view.cam_from_target) for view in views])
+        valid = np.arange(counts.max()) < counts[:, None]
+        at = np.minimum(np.arange(counts.max()), counts[:, None] - 1)
+        poses = [view.cam_from_target[rows] for view, rows in zip(views, at, strict=True)]
+        turns = [np.array(view.turns)[rows] for view, rows in zip(views, at, strict=True)]
+        return Candidates(np.array(poses), np.array(turns), valid)
 
     def take(self, rows: IntArray) -> "Candidates":
         """Returns the candidates of some views."""
@@ -63,9 +63,7 @@ class Candidates:
 
     def distances(self, predicted: FloatArray) -> FloatArray:
         """Distances (..., m, k) [m] from (..., m or 1, 4, 4) predictions, rotations on a lever."""
-        between = invert(predicted)[..., None, :, :] @ self.poses
-        distances = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
-        return np.asarray(np.where(self.valid, distances, np.inf))
+        return np.where(self.valid, distances_m(self.poses, predicted[..., None, :, :]), np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,66 +80,69 @@ class HandEyeEdges:
         return np.asarray(self.residuals.argmin(axis=1))
 
 
-def solve_edges(
-    robot: FloatArray,
-    candidates: Candidates,
-    rows: IntArray,
-    picks: IntArray,
-    solver: Solver = SOLVERS["park"],
+def _solve_edges(
+    robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray, solver: Solver
 ) -> HandEyeEdges:
-    """Solves for both edges by one candidate (`picks`) each of some views (`rows`).
-
-    `robot` is (m, 4, 4), the robot's part of the chain.
-    """
+    """Solves for both edges by (..., t) views with one candidate each, for (...,) sets at once."""
     edges = solver(robot[rows], candidates.poses[rows, picks])
-    return HandEyeEdges(edges.x, edges.z, candidates.distances(invert(robot @ edges.x) @ edges.z))
+    predicted = invert(robot @ edges.x[..., None, :, :]) @ edges.z[..., None, :, :]
+    return HandEyeEdges(edges.x, edges.z, candidates.distances(predicted))
 
 
-def _solve_edges_of_sets(
-    robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray
-) -> list[HandEyeEdges]:
-    """The result of `solve_edges` for each of s sets of (s, t) views and picks, in one batch."""
-    edges = SOLVERS["park"](robot[rows], candidates.poses[rows, picks])
-    residuals = candidates.distances(invert(robot @ edges.x[:, None]) @ edges.z[:, None])
-    return [HandEyeEdges(*item) for item in zip(edges.x, edges.z, residuals, strict=True)]
+def settled_distances(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
+    """Solves for both edges from all views and updates each view's candidate until none changes.
 
-
-def trimmed_edges(
-    robot: FloatArray, candidates: Candidates, solver: Solver = SOLVERS["park"]
-) -> tuple[Mask, HandEyeEdges]:
-    """Solves for both edges by the better half of the views, with any of their candidates.
-
-    `robot` is (m, 4, 4), the robot's part of the chain.
+    `robot` is (m, 4, 4), the robot's part of the chain, `picks` (m,) the initial choice.
 
     Returns:
-        (m,) mask of that half, and the edges.
+        (m, k) distances of the candidates from the predictions [m].
+    """
+    rows = np.arange(len(robot))
+    for _ in range(_ROUNDS):
+        edges = _solve_edges(robot, candidates, rows, picks, SOLVERS["park"])
+        if np.array_equal(edges.picks, picks):
+            break
+        picks = edges.picks
+    return edges.residuals
+
+
+def _trimmed_edges(
+    robot: FloatArray, candidates: Candidates, solver: Solver
+) -> tuple[Mask, HandEyeEdges, float]:
+    """Solves for both edges by the better half of the views, with any of their candidates.
+
+    Returns:
+        (m,) mask of that half, the edges, and the half's mean distance [m].
     """
 
     def solve(mask: Mask, edges: HandEyeEdges) -> HandEyeEdges:
         rows = np.flatnonzero(mask)
-        return solve_edges(robot, candidates, rows, edges.picks[rows], solver)
+        return _solve_edges(robot, candidates, rows, edges.picks[rows], solver)
 
     every, *sets = _starts(candidates)
-    starts = [solve_edges(robot, candidates, *every, solver)]
+    starts = [_solve_edges(robot, candidates, *every, solver)]
     if sets and solver is SOLVERS["park"]:
-        starts += _solve_edges_of_sets(robot, candidates, *map(np.array, zip(*sets, strict=True)))
+        rows, picks = (np.array(part) for part in zip(*sets, strict=True))
+        many = _solve_edges(robot, candidates, rows, picks, solver)
+        starts += map(HandEyeEdges, many.x, many.z, many.residuals)
     else:
-        starts += [solve_edges(robot, candidates, *item, solver) for item in sets]
-    return trimmed_start(
+        starts += [_solve_edges(robot, candidates, *item, solver) for item in sets]
+    half, edges = trimmed_start(
         starts,
         lambda item: np.asarray(item.residuals.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),
     )
+    return half, edges, float(edges.residuals.min(axis=1)[half].mean())
 
 
-def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float, float]:
+def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float]:
     """Finds the transform that most views agree on.
 
     With `turn`, the target is turned by it relative to the view that agrees best.
 
     Returns:
-        (4, 4), the mean distance of these views from it, and its sigma [m].
+        (4, 4), and its sigma [m].
     """
     half, least_sum, best = len(candidates) // 2 + 1, np.inf, (0, 0)
     for view, pose in np.argwhere(candidates.valid & (candidates.turns == 0)).tolist():
@@ -152,54 +153,59 @@ def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray,
     distances = candidates.distances(candidates.poses[best[0], best[1] + turn][None])
     rows = np.flatnonzero(nearest(distances.min(axis=1), half))
     picked = candidates.poses[rows, distances[rows].argmin(axis=1)]
-    return mean_transform(picked), least_sum / half, least_sum / half / np.sqrt(half)
+    return mean_transform(picked), least_sum / half**1.5
 
 
-def hand_eye(
-    robot: FloatArray, candidates: Candidates, mount: Mount
-) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
+@dataclass(frozen=True, eq=False)
+class PairEdges:
+    """Both edges of `robot * x * camera = z` by a consensus of views."""
+
+    x: FloatArray  # (4, 4).
+    z: FloatArray  # (4, 4).
+    sigmas_m: tuple[float, float]  # Of each, rotations on a lever [m]; infinite where undetermined.
+
+
+def hand_eye(robot: FloatArray, candidates: Candidates, *, is_up: bool) -> PairEdges | None:
     """Solves for both edges of `robot * x * camera = z` by a consensus of m views.
 
-    `robot` is (m, 4, 4), the robot's part of the chain; its noise is modelled for the mount.
+    Args:
+        robot: (m, 4, 4) the robot's part of the chain.
+        candidates: The views.
+        is_up: Whether that is `base_from_flange`, which has the robot's noise at its end.
 
     Returns:
-        (4, 4) x and z, and the sigma of each, rotations on a lever [m]; None where the motion
-        leaves a direction undetermined, or no half of the views agrees.
+        The edges; None where the motion leaves a direction undetermined, or no half of the views
+        agrees.
     """
-    half, edges = trimmed_edges(robot, candidates)
-    typical = float(edges.residuals.min(axis=1)[half].mean())
-    if typical > AGREE_M:
+    half, edges, typical_m = _trimmed_edges(robot, candidates, SOLVERS["park"])
+    if typical_m > AGREE_M:
         return None
     picked = candidates.poses[half, edges.picks[half]]
     exact = np.tile(_CAMERA_SIGMA**2 * np.eye(6), (len(picked), 1, 1))
-    poses = robot[half] if mount == "eye-in-hand" else invert(robot[half])
-    problem = chain(mount, poses, picked, exact)
+    poses = robot[half] if is_up else invert(robot[half])
+    problem = chain("eye-in-hand" if is_up else "eye-to-hand", poses, picked, exact)
     state = State(np.stack([edges.x, edges.z]), np.zeros(0))
     information = fisher_information(problem, state, _NOISE)
     if spectrum(information).ratio < _NULL_RATIO:
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
-    x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
     # Views that agree poorly determine less than their motion would.
-    excess = max(typical / _NOISE.robots[0, 1], 1.0)
-    sigmas = excess * float(x), excess * float(z)
-    return None if max(x, z) > _WORST_M else ((edges.x, edges.z), sigmas)
+    excess = max(typical_m / _NOISE.robots[0, 1], 1.0)
+    x, z = (np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])).tolist()
+    if max(x, z) > _WORST_M:
+        return None
+    return PairEdges(edges.x, edges.z, (excess * x, excess * z))
 
 
-def partial_hand_eye(
-    robot: FloatArray, candidates: Candidates
-) -> tuple[FloatArray, FloatArray, float]:
-    """Solves for both edges of `robot * x * camera = z` as far as the motion determines them.
+def partial_hand_eye(robot: FloatArray, candidates: Candidates) -> tuple[PairEdges, float]:
+    """Solves for both edges as far as the motion determines them.
 
     Returns:
-        (4, 4) x and z, and the mean distance of the better half of the views [m].
+        The edges, and the mean distance of the better half of the views [m].
     """
-    solutions = []
-    for solver in (SOLVERS["park"], lone_axis):
-        half, edges = trimmed_edges(robot, candidates, solver)
-        solutions.append((float(edges.residuals.min(axis=1)[half].mean()), edges))
-    typical, edges = min(solutions, key=lambda pair: pair[0])
-    return edges.x, edges.z, typical
+    found = [_trimmed_edges(robot, candidates, item) for item in (SOLVERS["park"], lone_axis)]
+    _, edges, typical_m = min(found, key=lambda item: item[2])
+    return PairEdges(edges.x, edges.z, (np.inf, np.inf)), typical_m
 
 
 def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:

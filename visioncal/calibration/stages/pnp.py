@@ -1,14 +1,15 @@
 """Pose of the target in each view, with covariance and rival poses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import adjoint, invert
+from visioncal.core.transforms import adjoint, invert, rotation_angle
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Rejection, Target
+from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.corners import (
     CornerStack,
     floored_sigma_px,
@@ -19,7 +20,12 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
 from visioncal.session import Session
-from visioncal.vision.targets import first_corners, numbered_positions, rotation_transforms
+from visioncal.vision.targets import (
+    first_corners,
+    numbered_positions,
+    rotation_transforms,
+    rotations,
+)
 
 # The mirrored pose of a planar target stays a candidate while its rms is within this ratio of the
 # better one's: systematic errors of lens and board can change the order up to there.
@@ -50,6 +56,36 @@ class ViewPoses:
     shared_jacobian: FloatArray
     board: int = 0  # Index of the target.
     first: int = 0  # The number of the target's first corner, where several are numbered through.
+
+    def chosen(self, pick: int, target: Target | None) -> "ViewPoses":
+        """Reduces the view to one candidate, and renumbers its corners accordingly."""
+        corners, turn = self.corners, self.turns[pick]
+        if corners is not None and target is not None and turn:
+            # Turned, corner i is where corner rotations[i] was: what was detected as that one is i.
+            turned = np.argsort(rotations(target)[turn])[corners.ids - self.first] + self.first
+            corners = replace(corners, ids=turned).take(np.argsort(turned))
+        only = slice(pick, pick + 1)
+        return replace(
+            self,
+            corners=corners,
+            cam_from_target=self.cam_from_target[only],
+            turns=(turn,),
+            covariance=self.covariance[only],
+            shared_jacobian=self.shared_jacobian[only],
+        )
+
+    def nearest(self, predicted: FloatArray, target: Target | None) -> "ViewPoses":
+        """Chooses the candidate that is nearest to a predicted `cam_from_target` (4, 4)."""
+        pick = int(distances_m(self.cam_from_target, predicted).argmin())
+        return self.chosen(pick, target)
+
+
+def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
+    between = invert(predicted) @ poses
+    return np.asarray(
+        np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
+    )
 
 
 @dataclass(frozen=True, eq=False)

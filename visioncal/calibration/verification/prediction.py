@@ -10,7 +10,6 @@ from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.observed import CameraObservations
-from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, listed, mm_and_deg
@@ -220,7 +219,7 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
         robot = robot_part(observed.arm_at([view]).poses, mount)[0]
         predicted = invert(robot @ x) @ boards[order[poses.board]]
         views.append(view)
-        chosen.append(choose_nearest(poses, predicted, targets[poses.board] if targets else None))
+        chosen.append(poses.nearest(predicted, targets[poses.board] if targets else None))
     if not views:
         raise DataError(
             f"session {observed.session.name!r}: no view shows the target from a known pose of the "

@@ -10,7 +10,6 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.frame_model import CellFrameModel
-from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
@@ -271,7 +270,7 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
     target = tuple(run.session.boards.values())[board]
     poses = [
-        choose_nearest(run.poses[index], pose, target)
+        run.poses[index].nearest(pose, target)
         for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
     ((frame, scene),) = run.scenes.items()
