@@ -281,6 +281,12 @@ def test_an_image_that_is_no_picture_shows_no_board(charuco, checkerboard):
             assert isinstance(find_target(np.zeros(shape, np.uint8), cell.options.target), NotFound)
 
 
+def test_squares_of_a_small_charuco_board_are_too_few_to_be_looked_for():
+    small = replace(BOARDS["charuco"], columns=3, rows=4)
+    kind = kind_of(BOARDS["checkerboard"])
+    assert isinstance(kind.search(np.zeros((240, 320), np.uint8), kind.inside(small)), NotFound)
+
+
 def test_blur_is_measured_in_pixels(charuco):
     cell, images = charuco
     corners = cell.exact_corners[0].px

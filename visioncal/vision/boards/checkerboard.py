@@ -22,6 +22,8 @@ from visioncal.vision.boards.template import Print
 
 # OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
+# Fewest inner corners a side that it finds; the squares of a small ChArUco board have two.
+_LEAST_SIDE = 3
 # Its searches: a quick one, and two that are tried one after the other.
 _FLAGS = (
     0,
@@ -96,6 +98,8 @@ class Checkerboard(Board):
         twice the size, which takes four times as long.
         """
         height, width = image.shape
+        if min(target.columns, target.rows) < _LEAST_SIDE:
+            return NotFound("no board: so few inner corners are not looked for")
         if min(image.shape) < 2 or height + width > _MOST_SIDES or height * width > _MOST_PIXELS:
             return NotFound(
                 f"no board: in an image of {width} x {height} px no checkerboard is looked for "
