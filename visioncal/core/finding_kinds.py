@@ -91,6 +91,13 @@ _KINDS = (
     Kind("other_arm", 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     *map(Kind, ("exchanged_joints", "contradicting_joints", "base_link", "tool_frame")),
     *map(Kind, ("level", "load", "clock")),
+    # The remainder of a clock's jump looks like motion.
+    Kind(
+        "clock_changed",
+        1e-4,
+        CHAIN,
+        hides=("moved_slowly", *_STEPS, ARM_ERRORS),
+    ),
     # Views.
     Kind(EXCHANGED, 1e-6, leaves_out=True, order=-1),
     Kind("turned_images", 1e-6, leaves_out=True),

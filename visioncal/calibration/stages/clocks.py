@@ -17,6 +17,7 @@ from visioncal.calibration.stages.clock_offset import (
     LEAST_CORRELATION,
     ClockedViews,
     ClockPair,
+    change_doubt,
     motion_notes,
     offset_doubts,
     speed_words,
@@ -38,7 +39,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.clock import ClockFit, clear_fit, fit_offset, fit_readout
+from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects.clock import clock_effect
@@ -191,8 +192,8 @@ class _Sweep:
         return self.frames(clear if 2 * len(clear) > len(free) else free)
 
 
-def _clocked(sweep: _Sweep) -> ClockedViews:
-    """Gives views their poses at the best available offset."""
+def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
+    """Gives views their poses at the best available offset; `change` is what was corrected."""
     flange, stated_s, views = sweep.motion.flange, sweep.stated_s, sweep.waiting
     frames = sweep.fitted_frames(views)
     matches = turning_matches(flange, frames, stated_s or 0.0)
@@ -202,6 +203,20 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
     starts = [match.offset_s for match in sound] + ([] if stated_s is None else [stated_s])
     fits = fit_offset(flange, frames, starts) if sound else ()
     fit = clear_fit(fits, stated_s)
+    changed = None if fit is None or change else clock_change(flange, frames, fit)
+    if changed is not None:
+        stamped = tuple(
+            view
+            if view.stamp_s is None
+            else replace(
+                view,
+                numbers={
+                    **view.numbers, "stamp_s": changed.corrected(np.array([view.stamp_s])).item()
+                },
+            )
+            for view in sweep.views
+        )  # fmt: skip
+        return _clocked(replace(sweep, views=stamped), change_doubt(changed, views))
     correlation = max((match.correlation for match in matches), default=None)
     clock = ClockResult(
         camera_minus_robot_s=stated_s or 0.0,
@@ -209,6 +224,7 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
         stated_s=stated_s,
         correlation=correlation,
     )
+    warnings = () if change is None else (change,)
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         delayed = fit_readout(flange, frames, sweep.camera, fit)
         shutter = None if delayed is None else delayed.shutter
@@ -226,7 +242,7 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
             shutter=shutter,
         )
         notes = tuple(motion_notes(clock, sweep.motion.name))
-        clocked = _at_offset(sweep, clock, tuple(offset_doubts(clock, views)), notes)
+        clocked = _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings), notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
     if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
         # By rotation alone, where the chain of frames does not close.
@@ -238,7 +254,7 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
             method="turning",
             correlation=match.correlation,
         )
-        return _at_offset(sweep, clock, tuple(offset_doubts(clock, views)))
+        return _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings))
     return _undetermined(sweep, clock, why_undetermined(fits, matches))
 
 
