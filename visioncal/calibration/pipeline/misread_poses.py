@@ -29,7 +29,14 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, Finding, Remedy
+from visioncal.core.verdict import (
+    CALIBRATE,
+    GUESS_AND_CALIBRATE,
+    READ_AGAIN,
+    Finding,
+    Remedy,
+    exchanging,
+)
 from visioncal.estimation.chain import robot_part
 from visioncal.session import Session
 
@@ -88,6 +95,9 @@ def misread_pose_finding(run: RunState) -> Finding | None:
     best, step = guess.best, READ_AGAIN
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(run.session.views[row].number for row in swap)
+    if len(exchanged) == 2:
+        words = "Write a copy of the session in which their images are exchanged, and calibrate it."
+        step = Remedy(words, exchanging(*exchanged))
     if best.hypothesis.robot.mirrored:
         step = _MIRRORED_CORNERS if session_is_mirrored(run.session) else _MIRRORED
     return Finding(_MISREAD, guess.sentence, step, exchanged)

@@ -28,6 +28,8 @@ _APART_PX = 0.01
 # Images of one stop that are enough for a mean, and the greatest distance of half of the corners of
 # one of them from that of most [px]: beyond, the arm did not stand still.
 _MANY, _STANDING_PX = 4, 0.5
+# Fewest stops of a camera whose images are averaged: those of fewer are too few views then.
+_FEWEST_STOPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +108,13 @@ def with_stop_means(seen: T) -> T:
     joined = dict[int, int]()
     for frame, look in seen.cameras.items():
         corners = dict(look.corners)
-        for (seer, *_), views in groups.items():
-            own = [look.corners[view] for view in views if view in look.corners]
-            if seer == frame and len(own) >= _MANY:
+        shown = [
+            [look.corners[view] for view in views if view in look.corners]
+            for (seer, *_), views in groups.items()
+            if seer == frame
+        ]
+        for own in shown if sum(map(bool, shown)) >= _FEWEST_STOPS else ():
+            if len(own) >= _MANY:
                 mean, others = _mean_of(own)
                 corners[mean.view] = mean
                 joined |= dict.fromkeys(others, mean.view)
