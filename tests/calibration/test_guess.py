@@ -369,7 +369,7 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monk
 def test_a_refused_calibration_says_so_too():
     turning = CellOptions(views=14, motion="one_axis", pixel_sigma_px=0.1, seed=4)
     planted = MISTAKES["two rows exchanged"](seen_in(simulate(turning)), np.random.default_rng(0))
-    with pytest.raises(DegenerateError, match=r"view 8 and view 11 exchanged.*--guess"):
+    with pytest.raises(DegenerateError, match=r"view 8 and view 11 exchanged.*--exchange 8,11"):
         visioncal.calibrate(pairs_session(planted))
 
 
