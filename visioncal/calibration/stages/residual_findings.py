@@ -85,8 +85,10 @@ def likely_steps(
             gain += (beside.gain if beside else 0.0) - arm.gain
         likely.append(replace(step, gain=gain - penalty))
     likely.sort(key=lambda step: -step.gain)
-    if likely and likely[0].gain > _CLEARLY:
-        least = max(_CLEARLY, likely[0].gain - _CLEARLY)
+    # Which errors of an arm there are is known less well than that there are some.
+    needed = 2.0 * _CLEARLY if any(arm.is_significant for arm in errors.values()) else _CLEARLY
+    if likely and likely[0].gain > needed:
+        least = max(needed, likely[0].gain - _CLEARLY)
         return tuple(step for step in likely if step.gain > least)
     if drift is None or (drift.of in errors and drift.gain < errors[drift.of].gain):
         return ()
