@@ -83,6 +83,8 @@ def test_rows_in_millimetres_beside_others_in_metres_are_named():
     assert all(
         "divide its x_m, y_m, z_m by 1000" in rejection.reason for rejection in reported.rejections
     )
+    # They do not contradict the joint angles that are matched with the others.
+    assert not reported_poses(session(poses, CELL.robot.joints), ROBOT).warnings
     # Where all are, it is a reading of the poses.
     poses[:, :3, 3] *= 1e3
     assert not reported_poses(session(poses), None).rejections

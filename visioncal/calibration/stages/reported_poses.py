@@ -78,11 +78,12 @@ def reported_poses(session: Session, robot: Robot | None) -> RobotReport:
         DataError: There are only joints, and they are not as many as the robot's; or rows of one
             declared stop have different poses.
     """
-    matched = None if robot is None else match_joints(session.views, robot)
-    rejections = []
-    poses: dict[int, FloatArray] = {}
     reported = reported_matrices(session.views)
     in_mm = _in_millimetres(reported)
+    sound = [view for view in session.views if view.number not in in_mm]
+    matched = None if robot is None else match_joints(sound, robot)
+    rejections = []
+    poses: dict[int, FloatArray] = {}
     for view in session.views:
         joints = view.joints_rad
         if view.number in in_mm:
