@@ -88,7 +88,8 @@ _KINDS = (
     Kind("misread_poses", 1e-3, CHAIN, hides=_BY_CHAIN),
     Kind("exchanged_names", 1e-6, hides=_BY_CHAIN),
     Kind("misread_joints", 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
-    Kind("other_arm", 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
+    # The frames are by the poses, which a wrong model does not change.
+    Kind("other_arm", REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     *map(Kind, ("exchanged_joints", "contradicting_joints", "base_link", "tool_frame")),
     *map(Kind, ("level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.
