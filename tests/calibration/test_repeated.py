@@ -131,6 +131,29 @@ def test_images_of_a_stop_share_the_robots_error(stops, trembling_m):
     assert misfit(edge.matrix, edge.covariance, cell.transforms[name]) < 22.5
 
 
+def test_pictures_that_were_stored_anew_are_copies():
+    _, session = of_one_camera(1, stops=True)
+    shown = session.corner_table
+    pairs = shown.views < 6
+    # Views 6 to 11 are the pictures of views 0 to 5 at their poses, stored by another program.
+    px = shown.px.copy()
+    again = replace(
+        shown,
+        views=np.concatenate([shown.views[pairs], shown.views[pairs] + 6]),
+        points=np.tile(shown.points[pairs], 2),
+        px=np.concatenate([px[pairs], px[pairs] + 2e-3]),
+        targets=("",) * (2 * int(pairs.sum())),
+    )
+    views = tuple(
+        replace(view, numbers=session.views[at % 6].numbers)
+        for at, view in enumerate(session.views)
+    )
+    found = calibrate(replace(session, views=views, corner_table=again))
+    (finding,) = (one for one in found.verdict.findings if one.kind == "repeated_views")
+    assert finding.views == tuple(range(6, 12))
+    assert finding.words.startswith("Views 6 to 11 repeat 0 to 5: ")
+
+
 def test_a_film_of_a_few_stops_is_so_many_views():
     _, session = of_one_camera(8, stops=True)
     shown = session.corner_table

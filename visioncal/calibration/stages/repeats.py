@@ -74,15 +74,20 @@ def without_repeats(seen: T) -> T:
     # Readings that differ may be of another time that is not stated, and some of them are equal by
     # the instrument's resolution.
     kind = "repeated_views" if 2 * copies > len(repeated) else REPEATED_READINGS
-    copied, originals = listed([*repeated]), listed([*dict.fromkeys(repeated.values())])
+    originals = listed([*dict.fromkeys(repeated.values())])
+    views, repeat, rows, their = (
+        ("View", "repeats", "row", "its")
+        if len(repeated) == 1
+        else ("Views", "repeat", "rows", "their")
+    )
     finding = Finding(
         kind,
-        f"View {copied} repeats {originals}: what was read is the same, or differs by less than "
-        f"{APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without a time or a stop of "
-        "its own. It counts once.",
+        f"{views} {listed([*repeated])} {repeat} {originals}: what was read is the same, or "
+        f"differs by less than {APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without "
+        "a time or a stop of its own. They count once.",
         Remedy(
-            f"In views.csv, delete the rows of view {copied}; or, if they were read anew, write "
-            "their times into stamp_s, or their stops into stop."
+            f"In views.csv, delete the {rows} of {views.lower()} {listed([*repeated])}; or, if "
+            f"they were read anew, write {their} times into stamp_s, or {their} stops into stop."
         ),
         tuple(repeated),
         until_mm=LEAST_NEED_MM,
@@ -161,7 +166,7 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
 
 
 def _repeats(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int, int], int]:
-    """The earlier view by repeated one, and how many of these are exactly the same."""
+    """The earlier view by repeated one, and how many of these are copies of a picture or number."""
     groups = defaultdict(list)
     for row in _rows(session, corners):
         groups[row.alike].append(row)
@@ -174,7 +179,7 @@ def _repeats(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int
             is_new = not {row.view, other.view} & repeated.keys()
             if is_new and row.is_repeated_by(other):
                 repeated[other.view] = row.view
-                copies += np.array_equal(row.reading, other.reading)
+                copies += row.is_image or np.array_equal(row.reading, other.reading)
     return {view: repeated[view] for view in sorted(repeated)}, copies
 
 
