@@ -144,13 +144,14 @@ def _left_out(pair: JudgedPair) -> Iterator[Finding]:
     views, reason = tuple(rejection.view for rejection in pair.outliers), pair.outliers[0].reason
     compared = [view.view for view in pair.views if view.used or view.view in views]
     kind, evidence, run = "wrong_views", 0.0, _run(views, compared)
-    listed, more = ", ".join(map(str, views)), "s" * (len(views) > 1)
+    listed = ", ".join(map(str, views))
+    more, them = ("s", "them") if len(views) > 1 else ("", "it")
     words = f"View {views[0]} was left out. It {reason}."
     if more:
         words = f"Views {listed} were left out. View {views[0]} {reason}."
     step = Remedy(
-        f"Compare image and pose of view{more} {listed}: record them again, or in views.csv, "
-        f"delete the row{more} of view {listed}.",
+        f"Compare image and pose of view{more} {listed}: record {them} again, or in views.csv, "
+        f"delete the row{more} of view{more} {listed}.",
         look_at(views[0]),
     )
     if run:
