@@ -149,20 +149,21 @@ def solve_problem(
     return levenberg_marquardt(state, linearise, settled, damping, most)
 
 
-def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
+def solve_without(problem: Problem, fit: Solution, kept: Mask, *, is_linear: bool = False) -> State:
     """Solves for the unknowns without some observations, by one step from the converged fit of all.
 
     Args:
         problem: The n observations.
         fit: Their converged fit.
         kept: (n,) mask of the observations that remain.
+        is_linear: Whether a long step, too, is taken to first order.
     """
     linear, moving = problem.linear(fit.state), problem.moving
     whitening = Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
     information, gradient, _ = whitening.equations(problem, fit.state, linear)
     step = np.zeros(len(moving))
     step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
-    if np.abs(step[: 6 * len(problem.unknown)]).max() > _LINEAR:
+    if not is_linear and np.abs(step[: 6 * len(problem.unknown)]).max() > _LINEAR:
         return solve_problem(problem.subset(kept), fit.state, fit.noise, is_near=True)[0]
     return fit.state.moved(step)
 

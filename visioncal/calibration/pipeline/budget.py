@@ -27,7 +27,7 @@ _SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 
 def left_out(solved: CellFit, *, is_misread: bool) -> HeldOutResiduals:
-    """Residuals of the inliers, each by a fit without its stop; by that of all if misread."""
+    """Residuals of the inliers, each by a fit without its stop; to first order if misread."""
     fit, used, mount = (
         solved.inlier_fit.fit,
         np.flatnonzero(solved.inlier_fit.used),
@@ -36,10 +36,9 @@ def left_out(solved: CellFit, *, is_misread: bool) -> HeldOutResiduals:
     part = solved.inlier_problem
 
     def refit(kept: Mask) -> State:
-        if is_misread:
-            return fit.state
         if solved.solver == "joint" or mount is None:
-            return solve_without(part, fit, kept)
+            # Of poses that do not belong together, the fit of each part would be another.
+            return solve_without(part, fit, kept, is_linear=is_misread)
         return closed_form_state(part.subset(kept), solved.solver, fit.state, mount)
 
     def pixels(rows: IntArray, predicted: FloatArray, state: State) -> FloatArray:
