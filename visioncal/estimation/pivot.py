@@ -318,8 +318,9 @@ def _check_doubt(touches: Touches, problem: PointProblem, inliers: GroupInliers[
 
 def _check_sides(touches: Touches, problem: PointProblem, inliers: GroupInliers[Placement]) -> None:
     local = problem.local(inliers.fit.state)
-    for kind, coordinates in (("z", local[:, 2]), ("xz", local[:, 0])):
-        used = inliers.mask & np.array([name == kind for name in touches.kinds])
+    sides: Sequence[tuple[TouchKind, FloatArray]] = (("z", local[:, 2]), ("xz", local[:, 0]))
+    for kind, coordinates in sides:
+        used = inliers.mask & touches.are(kind)
         behind = [touches.labels[index] for index in np.flatnonzero(used & (coordinates < 0.0))]
         before = [touches.labels[index] for index in np.flatnonzero(used & (coordinates > 0.0))]
         if behind:
