@@ -211,9 +211,9 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     """
     chosen, own_s, weights = _own_offsets(robot, frames, fit)
     change = _tested_change(frames.stamps_s[chosen], own_s, weights)
-    for _ in range(_REFINING if change else 0):
-        if change is None:
-            break
+    if change is None:
+        return None
+    for _ in range(_REFINING):
         corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
         fits = fit_offset(robot, corrected, [fit.offset_s])
         if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
