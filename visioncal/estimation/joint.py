@@ -22,7 +22,7 @@ from visioncal.estimation.linalg import covariance_among, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
@@ -325,10 +325,8 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
     """
     # A target that was moved has a frame for each of its locations, named with a suffix.
     observed = np.array([name.partition("@")[0] for name in problem.observations.observed])
-    poses = problem.observations.measured
-    jacobian = np.zeros((len(observed), 6, len(frames)))
-    jacobian[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
-    jacobian *= (observed[:, None] == np.array(frames))[:, None]
+    of_frames = (observed[:, None] == np.array(frames))[:, None]
+    jacobian = by_size(problem.observations.measured)[:, :, None] * of_frames
     prior = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
     return Effect.free("sizes of targets", prior, jacobian)
 

@@ -42,13 +42,6 @@ def spectrum(information: FloatArray) -> Spectrum:
     return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
 
 
-def scaled_values(information: FloatArray) -> FloatArray:
-    """Computes the eigenvalues (..., n) of `spectrum` for (..., n, n) information matrices."""
-    scale = _scale(information)
-    values = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :])
-    return np.asarray(np.maximum(values, 0.0))
-
-
 def covariance_from(information: FloatArray) -> FloatArray:
     """Inverts (..., n, n) information matrices after scaling them to a unit diagonal.
 

@@ -74,6 +74,12 @@ class Observations:
         return np.array([frame in pair for pair in pairs], dtype=bool)
 
 
+def by_size(poses: FloatArray) -> FloatArray:
+    """(n, 6) right perturbations of measured (n, 4, 4) poses by the relative size of a target."""
+    shift = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    return np.concatenate([np.zeros((len(poses), 3)), shift[:, :, 0]], axis=1)
+
+
 @dataclass(frozen=True, eq=False)
 class Effect:
     """A vector of k unknowns that acts on many observations together."""

@@ -122,10 +122,6 @@ class CornerProblem:
         stack = replace(self.stack, zooms=zoomed if levels.jitter > 0.0 else None)
         return replace(self, stack=stack, levels=levels)
 
-    def without_levels(self) -> "CornerProblem":
-        """Returns the problem without lens errors beyond the model."""
-        return replace(self, stack=replace(self.stack, zooms=None), levels=None)
-
     @cached_property
     def covariance(self) -> FloatArray:
         """(k + s, k + s) prior covariance of lens and boards; zero where it is flat."""

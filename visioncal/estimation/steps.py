@@ -28,7 +28,7 @@ from visioncal.estimation.moves import (
     twin_name,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     RepeatErrors,
@@ -155,10 +155,7 @@ def _between(problem: Problem, rows: Mask) -> IntArray:
 def _size_effect(problem: Problem, fit: Solution, board: str) -> Effect:
     """A board's size as an effect: in proportion to its distance."""
     rows = np.array([frame == board for frame in problem.observations.observed])
-    measured = problem.measured(fit.state)
-    jacobian = np.zeros((len(problem), 6, 1))
-    positions = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
-    jacobian[:, 3:] = np.where(rows[:, None, None], positions, 0.0)
+    jacobian = np.where(rows[:, None], by_size(problem.measured(fit.state)), 0.0)[:, :, None]
     return Effect.free(f"size of {board}", PriorInformation.flat(1), jacobian)
 
 

@@ -62,7 +62,7 @@ def without_repeats(seen: T) -> T:
     The corners are of all cameras, and no pose is known yet.
     """
     try:
-        repeated, copies = _repeats(seen.timed, seen.corners)
+        repeated, copies = repeated_rows(seen.timed, seen.corners)
     except DataError:
         # Where the robot is cannot be told yet, and whether it is where it was neither.
         return seen
@@ -160,13 +160,11 @@ def _mean_of(images: Sequence[Corners]) -> tuple[Corners, list[int]]:
     return mean, [images[at].view for at in standing[1:].tolist()]
 
 
-def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int, int]:
-    """The earlier view that each repeated one is a copy of, by view, with all cameras' corners."""
-    return _repeats(session, corners)[0]
+def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int, int], int]:
+    """The earlier view by repeated one, and how many of these are copies of a picture or number.
 
-
-def _repeats(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int, int], int]:
-    """The earlier view by repeated one, and how many of these are copies of a picture or number."""
+    `corners` are those of all cameras, by view.
+    """
     groups = defaultdict(list)
     for row in _rows(session, corners):
         groups[row.alike].append(row)
