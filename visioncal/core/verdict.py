@@ -61,10 +61,13 @@ def look_at(view: int) -> str:
     return f"{REVIEW} --view {view}"
 
 
-def exchanging(first: int, second: int) -> str:
-    """The command that calibrates with the images of two views exchanged."""
+def exchanging(first: int, second: int) -> Remedy:
+    """Advice to exchange the images of two views, with the command that calibrates so."""
     fixed = CALIBRATE.replace("SESSION", "FIXED")
-    return f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}"
+    return Remedy(
+        "Write a copy of the session in which their images are exchanged, and calibrate it.",
+        f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}",
+    )
 
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:

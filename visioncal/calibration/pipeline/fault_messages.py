@@ -257,10 +257,7 @@ def _exchanged_views(
                 f"Views {first} and {second} are exchanged: the image of each fits the pose in "
                 "the other's row. They were left out."
             )
-            do = (
-                "Write a copy of the session in which their images are exchanged, and calibrate it."
-            )
-            yield _fault(solved, EXCHANGED, pair, words, Remedy(do, exchanging(first, second)))
+            yield _fault(solved, EXCHANGED, pair, words, exchanging(first, second))
 
 
 def _pushed_bases(solved: CellFit) -> Iterator[PoseFault]:

@@ -96,8 +96,7 @@ def misread_pose_finding(run: RunState) -> Finding | None:
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
     exchanged = tuple(run.session.views[row].number for row in swap)
     if len(exchanged) == 2:
-        words = "Write a copy of the session in which their images are exchanged, and calibrate it."
-        step = Remedy(words, exchanging(*exchanged))
+        step = exchanging(*exchanged)
     if best.hypothesis.robot.mirrored:
         step = _MIRRORED_CORNERS if session_is_mirrored(run.session) else _MIRRORED
     return Finding(_MISREAD, guess.sentence, step, exchanged)
