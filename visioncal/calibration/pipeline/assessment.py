@@ -162,54 +162,60 @@ class FitAssessment:
 
 
 def assess_fit(
-    cell: Cell, observed: Observed, solved: CellFit, convention: Convention | None
+    cell: Cell, observed: Observed, cell_fit: CellFit, convention: Convention | None
 ) -> FitAssessment:
     """Examines a fit.
 
     Args:
         cell: The cell as it was read.
         observed: The observations in it.
-        solved: The fit of its connected part.
+        cell_fit: The fit of its connected part.
         convention: Joint table convention of calibrated arms' parameters.
     """
-    part, fit = solved.inlier_problem, solved.inlier_fit.fit
+    part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     # A closed form is no minimum, which would pass for a misfit.
-    is_fit = solved.solver == "joint"
+    is_fit = cell_fit.solver == "joint"
     converged = fit if is_fit else fit_problem(part, fit.state)
     errors = {
-        name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
+        name: arm.errors
+        for name, arm in cell_fit.arms.items()
+        if not arm.is_modelled and arm.errors
     }
-    steps = likely_steps(part, converged, errors, joint_offsets(solved.arms))
+    steps = likely_steps(part, converged, errors, joint_offsets(cell_fit.arms))
     if not observed.is_misread:
-        solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, steps))
-    beside = covariance_from_other_sources(part, fit, solved.arms, steps, is_fit=is_fit)
+        cell_fit = replace(cell_fit, arms=with_errors_beside_step(cell_fit.arms, part, fit, steps))
+    beside = covariance_from_other_sources(part, fit, cell_fit.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
-    held_out = left_out(solved, is_misread=observed.is_misread)
-    (faults, reasons), middles = explained_outliers(solved), middles_of(solved.cell)
+    held_out = left_out(cell_fit, is_misread=observed.is_misread)
+    (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     # The first view of each stop.
-    first = {row.station: row.view for row in reversed(solved.cell.rows)}
+    first = {row.station: row.view for row in reversed(cell_fit.cell.rows)}
     return FitAssessment(
-        solved,
+        cell_fit,
         part,
         covariance,
         beside,
-        lens_errors(solved),
+        lens_errors(cell_fit),
         steps,
         {
             name: arm.report(part, fit, covariance, middles, first, convention)
-            for name, arm in solved.arms.items()
+            for name, arm in cell_fit.arms.items()
         },
         held_out,
-        movements(solved),
+        movements(cell_fit),
         faults,
-        _views(observed, cell, solved, held_out, reasons),
-        _sigmas(solved),
+        _views(observed, cell, cell_fit, held_out, reasons),
+        _sigmas(cell_fit),
     )
 
 
-def _sigmas(solved: CellFit) -> dict[str, dict[str, float]]:
+def _sigmas(cell_fit: CellFit) -> dict[str, dict[str, float]]:
     """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
-    fit, problem, seen = solved.inlier_fit.fit, solved.inlier_fit.problem, solved.linearised_corners
+    fit, problem, seen = (
+        cell_fit.inlier_fit.fit,
+        cell_fit.inlier_fit.problem,
+        cell_fit.linearised_corners,
+    )
     results = {
         robot: {"translation_mm": 1e3 * sigma_m, "rotation_deg": float(np.rad2deg(sigma_rad))}
         for robot, (sigma_rad, sigma_m) in zip(
@@ -220,7 +226,7 @@ def _sigmas(solved: CellFit) -> dict[str, dict[str, float]]:
         pairs = zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True)
         results |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
     sensors = dict.fromkeys(
-        (*sensors_of(solved.cell, solved.poses), *(row.seer for row in solved.cell.rows))
+        (*sensors_of(cell_fit.cell, cell_fit.poses), *(row.seer for row in cell_fit.cell.rows))
     )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
         results[frame] = {**results.get(frame, {}), "level": level}
@@ -235,41 +241,45 @@ class SeenRows:
     views: tuple[ViewPoses, ...]  # Their poses.
     problem: Problem  # Their problem, with the unknowns of the fit.
 
-    def residuals(self, solved: CellFit) -> FloatArray:
+    def residuals(self, cell_fit: CellFit) -> FloatArray:
         """(n, 3) residuals from what the fit predicts, NaN for none [mm], [deg], [px].
 
         Those of one camera and one robot are the distances of the target, as each view places it,
         from its mean over the inliers.
         """
-        problem, part, state = self.problem, solved.inlier_problem, solved.inlier_fit.fit.state
+        problem, part, state = self.problem, cell_fit.inlier_problem, cell_fit.inlier_fit.fit.state
         predicted = problem.predicted(state)
         away_m, away_rad = pose_residuals(problem, state, predicted)
-        if solved.cell.mount is not None:
+        if cell_fit.cell.mount is not None:
             fitted = np.isin(problem.observations.observed, part.observations.observed)
             mean_m, mean_rad = scatter(problem.subset(fitted), part, state)
             away_m[fitted] = mean_m
             away_rad[fitted] = np.where(np.isnan(away_rad[fitted]), np.nan, mean_rad)
-        px = solved.pixels(self.rows, self.views, predicted, state)
+        px = cell_fit.pixels(self.rows, self.views, predicted, state)
         return np.stack([1e3 * away_m, np.rad2deg(away_rad), px], axis=1)
 
 
-def fitted_rows(solved: CellFit) -> SeenRows:
+def fitted_rows(cell_fit: CellFit) -> SeenRows:
     """The observations of a fit, with its outliers."""
-    return SeenRows(solved.cell.rows, solved.poses, solved.inlier_fit.problem)
+    return SeenRows(cell_fit.cell.rows, cell_fit.poses, cell_fit.inlier_fit.problem)
 
 
-def held_back(solved: CellFit, observed: Observed) -> SeenRows | None:
+def held_back(cell_fit: CellFit, observed: Observed) -> SeenRows | None:
     """Held-back observations that can be compared with the fit; None for none."""
-    cell, state, frames = solved.cell, solved.inlier_fit.fit.state, solved.cell.tree.branches.keys()
+    cell, state, frames = (
+        cell_fit.cell,
+        cell_fit.inlier_fit.fit.state,
+        cell_fit.cell.tree.branches.keys(),
+    )
     rows = [
         row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
     ]
     if not rows:
         return None
-    solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
+    cell_fit = replace(cell_fit, cell=replace(cell, rows=tuple(rows)))
     views = [observed.poses[row.view] for row in rows]
-    first = _problem(solved, observed, [view.chosen(0, None) for view in views])
-    optics, targets = solved.camera_parameters, targets_of(cell)
+    first = _problem(cell_fit, observed, [view.chosen(0, None) for view in views])
+    optics, targets = cell_fit.camera_parameters, targets_of(cell)
     for at, (row, pose) in enumerate(zip(rows, first.predicted(state), strict=True)):
         view = views[at].nearest(pose, targets.get(row.seen))
         if optics is not None and view.corners is not None and row.seer in optics.problems:
@@ -277,27 +287,27 @@ def held_back(solved: CellFit, observed: Observed) -> SeenRows | None:
             poses = fit_poses(stack, optics.camera(row.seer), view.cam_from_target)
             view = replace(view, cam_from_target=poses.cam_from_target)
         views[at] = view
-    return SeenRows(tuple(rows), tuple(views), _problem(solved, observed, views))
+    return SeenRows(tuple(rows), tuple(views), _problem(cell_fit, observed, views))
 
 
 def _views(
     observed: Observed,
     cell: Cell,
-    solved: CellFit,
+    cell_fit: CellFit,
     held_out: HeldOutResiduals,
     reasons: Mapping[int, str],
 ) -> tuple[ViewResult, ...]:
     """Result of each observation, in the order of the session's rows."""
-    used = solved.inlier_fit.used
+    used = cell_fit.inlier_fit.used
     left_out = np.full((len(used), 3), np.nan)
     left_out[used] = np.stack(
         [1e3 * held_out.residual_m, np.rad2deg(held_out.residual_rad), held_out.rms_px], axis=1
     )
     results: dict[int, ViewResult] = {}
-    held = held_back(solved, observed)
-    for seen in (fitted_rows(solved), *([] if held is None else [held])):
+    held = held_back(cell_fit, observed)
+    for seen in (fitted_rows(cell_fit), *([] if held is None else [held])):
         is_held = seen is held
-        for at, (mm, deg, px) in enumerate(map(_finite_or_none, seen.residuals(solved))):
+        for at, (mm, deg, px) in enumerate(map(_finite_or_none, seen.residuals(cell_fit))):
             row, corners = seen.rows[at], seen.views[at].corners
             results[row.view] = ViewResult(
                 row.view,
@@ -309,7 +319,7 @@ def _views(
                 deg,
                 row.seer,
                 row.seen,
-                solved.cell.stops[row.station],
+                cell_fit.cell.stops[row.station],
                 *_finite_or_none(left_out[at] if not is_held else np.full(3, np.nan)),
             )
     for observation in cell.session.observations:
@@ -318,7 +328,7 @@ def _views(
             results[number] = ViewResult(
                 number,
                 used=False,
-                reason=solved.cell.reasons.get(number, ""),
+                reason=cell_fit.cell.reasons.get(number, ""),
                 seer=observation.seer,
                 seen=observation.seen,
                 stop=cell.stops[station] if station < len(cell.stops) else number,
@@ -330,9 +340,9 @@ def _finite_or_none(figures: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in figures.tolist()]
 
 
-def held_back_by_arm(solved: CellFit, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
+def held_back_by_arm(cell_fit: CellFit, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
     """Residuals of held-back views by the nominal arm with its own fit, and by the calibrated."""
-    arm, held = solved.arms[robot], held_back(solved, observed)
+    arm, held = cell_fit.arms[robot], held_back(cell_fit, observed)
     if held is None or arm.kinematics is None:
         return ()
     nominal = arm.without_errors(held.problem)
@@ -341,7 +351,7 @@ def held_back_by_arm(solved: CellFit, observed: Observed, robot: str) -> tuple[U
         np.stack(pose_residuals(problem, _state_in(problem, state))[::-1], axis=1)
         for problem, state in (
             (nominal, arm.kinematics.nominal.fit.state),
-            (held.problem, solved.inlier_fit.fit.state),
+            (held.problem, cell_fit.inlier_fit.fit.state),
         )
     )
     views = [row.view for row in held.rows]
@@ -358,15 +368,15 @@ def _state_in(problem: Problem, state: State) -> State:
     return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 
-def _problem(solved: CellFit, observed: Observed, views: Sequence[ViewPoses]) -> Problem:
+def _problem(cell_fit: CellFit, observed: Observed, views: Sequence[ViewPoses]) -> Problem:
     """The problem of a cell's rows, with the unknowns of the fit."""
-    fitted = solved.inlier_fit.problem
-    problem = replace(problem_of(solved.cell, views), tree=fitted.tree, poses=fitted.poses)
+    fitted = cell_fit.inlier_fit.problem
+    problem = replace(problem_of(cell_fit.cell, views), tree=fitted.tree, poses=fitted.poses)
     observations, none = problem.observations, np.zeros(len(problem), dtype=bool)
-    for move in solved.inlier_fit.moves:
+    for move in cell_fit.inlier_fit.moves:
         later = observations.stops >= move.stop
         observations = observations.renamed(move.frame, move.twin, later)
-    clock_errors = {effect.name: effect for effect in clock_effects(solved.cell, observed.clocks)}
+    clock_errors = {effect.name: effect for effect in clock_effects(cell_fit.cell, observed.clocks)}
     effects = [
         clock_errors.get(effect.name)
         or replace(

@@ -26,36 +26,36 @@ from visioncal.vision.targets import corner_positions
 _SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 
-def left_out(solved: CellFit, *, is_misread: bool) -> HeldOutResiduals:
+def left_out(cell_fit: CellFit, *, is_misread: bool) -> HeldOutResiduals:
     """Residuals of the inliers, each by a fit without its stop; to first order if misread."""
     fit, used, mount = (
-        solved.inlier_fit.fit,
-        np.flatnonzero(solved.inlier_fit.used),
-        solved.cell.mount,
+        cell_fit.inlier_fit.fit,
+        np.flatnonzero(cell_fit.inlier_fit.used),
+        cell_fit.cell.mount,
     )
-    part = solved.inlier_problem
+    part = cell_fit.inlier_problem
 
     def refit(kept: Mask) -> State:
-        if solved.solver == "joint" or mount is None:
+        if cell_fit.solver == "joint" or mount is None:
             # Of poses that do not belong together, the fit of each part would be another.
             return solve_without(part, fit, kept, is_linear=is_misread)
-        return closed_form_state(part.subset(kept), solved.solver, fit.state, mount)
+        return closed_form_state(part.subset(kept), cell_fit.solver, fit.state, mount)
 
     def pixels(rows: IntArray, predicted: FloatArray, state: State) -> FloatArray:
         mine = used[rows].tolist()
-        seen = [solved.cell.rows[at] for at in mine], [solved.poses[at] for at in mine]
-        return solved.pixels(*seen, predicted, state)
+        seen = [cell_fit.cell.rows[at] for at in mine], [cell_fit.poses[at] for at in mine]
+        return cell_fit.pixels(*seen, predicted, state)
 
     of = {None: "", "instrument": ", of the whole fit"}.get(mount, ", of the hand-eye fit")
     return cross_validate(part, refit, pixels, of)
 
 
 def _covariances_of_edges(
-    solved: CellFit, beside: Mapping[str, FloatArray]
+    cell_fit: CellFit, beside: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
     """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`."""
-    fit, part = solved.inlier_fit.fit, solved.inlier_problem
-    parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
+    fit, part = cell_fit.inlier_fit.fit, cell_fit.inlier_problem
+    parts = covariance_by_source(part, fit.state, fit.noise, _sources(cell_fit))
     size = 6 * len(part.unknown)
     parts |= {name: array[:size, :size] for name, array in beside.items()}
     return parts | {"total": sum(parts.values(), np.zeros((size, size)))}
@@ -66,9 +66,9 @@ def _sigma_mm(covariance: FloatArray) -> float:
     return 1e3 * float(max(np.trace(covariance), 0.0) ** 0.5)
 
 
-def budget_mm(solved: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+def budget_mm(cell_fit: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
     """Standard deviations of unknown frames' positions in their parents, by source, in all [mm]."""
-    parts, part = _covariances_of_edges(solved, beside), solved.inlier_problem
+    parts, part = _covariances_of_edges(cell_fit, beside), cell_fit.inlier_problem
     firsts = {key: part.edge_columns(key).start + 3 for key in part.unknown}
     return {
         key: {name: _sigma_mm(array[at : at + 3, at : at + 3]) for name, array in parts.items()}
@@ -77,26 +77,26 @@ def budget_mm(solved: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, di
 
 
 def uncertainty_of(
-    solved: CellFit, beside: Mapping[str, FloatArray], covariance: FloatArray
+    cell_fit: CellFit, beside: Mapping[str, FloatArray], covariance: FloatArray
 ) -> UncertaintyResult:
     """Uncertainty of a target's middle that one camera and one robot locate, by all views' mean.
 
     Args:
-        solved: The fit.
+        cell_fit: The fit.
         beside: (p, p) covariances from sources other than noise, by source.
         covariance: (p, p) of its unknowns, from all sources.
 
     Returns:
         The section of the result, without intervals of the noise.
     """
-    part, state = solved.inlier_problem, solved.inlier_fit.fit.state
-    middles = middles_of(solved.cell)
+    part, state = cell_fit.inlier_problem, cell_fit.inlier_fit.fit.state
+    middles = middles_of(cell_fit.cell)
     points = np.array([middles.get(name, np.zeros(3)) for name in part.observations.observed])
     points_cam = apply_each(part.measured(state), points)
     distances_m, point_cam = np.linalg.norm(points_cam, axis=1), points_cam.mean(axis=0)
     covariances = {
         name: point_covariance(state.edges[0], edge[:6, :6], point_cam)
-        for name, edge in _covariances_of_edges(solved, beside).items()
+        for name, edge in _covariances_of_edges(cell_fit, beside).items()
     }
     limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limits, limits))
@@ -118,16 +118,20 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
     }
 
 
-def _sources(solved: CellFit) -> Sources:
+def _sources(cell_fit: CellFit) -> Sources:
     """Sources of uncertainty by camera, robot and board; without names for a single pair."""
-    problem, optics, mount = solved.inlier_fit.problem, solved.camera_parameters, solved.cell.mount
+    problem, optics, mount = (
+        cell_fit.inlier_fit.problem,
+        cell_fit.camera_parameters,
+        cell_fit.cell.mount,
+    )
     columns = defaultdict[str, list[int]](list)
     for name, column in problem.effect_columns.items():
         if name != LENSES:
             kind = name.partition(" of ")[0]
             source = name if mount is None else kind if kind in _SOURCES else "clock"
             columns[source] += range(column.start, column.stop)
-    for name, indices in {"lens_field": solved.field_columns, **_shape_columns(solved)}.items():
+    for name, indices in {"lens_field": cell_fit.field_columns, **_shape_columns(cell_fit)}.items():
         columns[name if mount is None else name.partition(" ")[0]] += indices.tolist()
     by_source = {name: np.array(indices) for name, indices in columns.items() if indices}
     observers = problem.observations.observers
@@ -150,30 +154,30 @@ def _sources(solved: CellFit) -> Sources:
     )
 
 
-def _shape_columns(solved: CellFit) -> dict[str, IntArray]:
+def _shape_columns(cell_fit: CellFit) -> dict[str, IntArray]:
     """The problem's columns of the free values of each lens and board."""
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     if seen is None or optics is None:
         return {}
-    boards = solved.cell.session.boards
+    boards = cell_fit.cell.session.boards
     slices = {f"intrinsics of {name}": lens for name, lens in optics.lenses.items()}
     shapes = shape_slices(tuple(boards.values()), optics.boards.start)
     slices |= {f"board {name}".strip(): at for name, at in zip(boards, shapes, strict=True)}
-    return {name: solved.columns_of(within(seen.free, at)) for name, at in slices.items()}
+    return {name: cell_fit.columns_of(within(seen.free, at)) for name, at in slices.items()}
 
 
-def columns_of_boards(solved: CellFit) -> IntArray:
+def columns_of_boards(cell_fit: CellFit) -> IntArray:
     """The problem's columns of the free values of boards' shapes."""
-    columns = (at for name, at in _shape_columns(solved).items() if name.startswith("board"))
+    columns = (at for name, at in _shape_columns(cell_fit).items() if name.startswith("board"))
     return np.concatenate([np.zeros(0, dtype=np.int64), *columns])
 
 
-def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
+def middle_jacobians(cell_fit: CellFit) -> dict[str, FloatArray]:
     """(3, b) Jacobians of targets' middles with respect to `columns_of_boards` [m], by frame."""
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     if seen is None or optics is None:
         return {}
-    plates, boards = solved.cell.session.plates, optics.boards
+    plates, boards = cell_fit.cell.session.plates, optics.boards
     free, jacobians = within(seen.free, boards), {}
     slices = shape_slices(tuple(plates.values()), boards.start)
     for (name, target), values in zip(plates.items(), slices, strict=True):

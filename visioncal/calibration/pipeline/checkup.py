@@ -1,4 +1,4 @@
-"""Checks a session for mistakes before anything is solved, for `visioncal doctor`."""
+"""Checks a session for mistakes before anything is fitted, for `visioncal doctor`."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -59,35 +59,35 @@ class Version:
         return self.name == self.frame
 
 
-def versions(solved: CellFit) -> dict[str, Version]:
+def versions(cell_fit: CellFit) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
-    starts = {move.twin: move.stop for move in solved.inlier_fit.moves}
+    starts = {move.twin: move.stop for move in cell_fit.inlier_fit.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
-    for key in solved.inlier_fit.problem.unknown:
+    for key in cell_fit.inlier_fit.problem.unknown:
         parts[key.partition("@")[0]].append((starts.get(key, -1), key))
     versions_by_key = {}
     for frame, keys in parts.items():
         *earlier, (start, last) = sorted(keys)
         for before, key in earlier:
-            name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
+            name = f"{frame}_until_stop_{_stops_of(cell_fit, key)[-1]}"
             versions_by_key[key] = Version(key, frame, name, before)
         versions_by_key[last] = Version(last, frame, frame, start)
     return versions_by_key
 
 
-def _stops_of(solved: CellFit, key: str) -> list[int]:
+def _stops_of(cell_fit: CellFit, key: str) -> list[int]:
     """The stops of a frame's inliers, in order of time; of all its observations if it has none."""
-    observations = solved.inlier_fit.problem.observations
+    observations = cell_fit.inlier_fit.problem.observations
     rows = observations.involves(key)
-    used = rows & solved.inlier_fit.used
+    used = rows & cell_fit.inlier_fit.used
     stations = observations.stops[used if used.any() else rows]
-    return [solved.cell.stops[station] for station in np.unique(stations).tolist()]
+    return [cell_fit.cell.stops[station] for station in np.unique(stations).tolist()]
 
 
-def movements(solved: CellFit) -> tuple[Moved, ...]:
+def movements(cell_fit: CellFit) -> tuple[Moved, ...]:
     """The frames that moved, in the order of time."""
-    moved, versions_by_key, edges = [], versions(solved), solved.frames
-    for move in sorted(solved.inlier_fit.moves, key=lambda value: value.stop):
+    moved, versions_by_key, edges = [], versions(cell_fit), cell_fit.frames
+    for move in sorted(cell_fit.inlier_fit.moves, key=lambda value: value.stop):
         after = versions_by_key[move.twin]
         same_frame = (item for item in versions_by_key.values() if item.frame == after.frame)
         earlier = [item for item in same_frame if item.start < after.start]
@@ -98,8 +98,8 @@ def movements(solved: CellFit) -> tuple[Moved, ...]:
             Moved(
                 after.frame,
                 before.name,
-                _stops_of(solved, before.key)[-1],
-                _stops_of(solved, move.twin)[0],
+                _stops_of(cell_fit, before.key)[-1],
+                _stops_of(cell_fit, move.twin)[0],
                 mm,
                 deg,
                 tuple(rival for rival in rivals if rival != after.frame),
@@ -123,66 +123,68 @@ def moved_finding(moved: Moved) -> Finding:
     )
 
 
-def explained_outliers(solved: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
+def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
     """What explains outliers, and why each is left out, by view.
 
     Turned images, exchanged or wrong poses, and what moved; else the stops that a view fits instead
     of its own.
     """
-    outliers, agreed = np.flatnonzero(~solved.inlier_fit.used), solved.inlier_fit
+    outliers, agreed = np.flatnonzero(~cell_fit.inlier_fit.used), cell_fit.inlier_fit
     if not len(outliers):
         return (), {}
     turns = {
         frame_name("target", name): rotation_transforms(target)
-        for name, target in solved.cell.session.boards.items()
+        for name, target in cell_fit.cell.session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
-    mutual, faults = exchanged(agreed.problem, fitting), [*_turned_images(solved)]
-    if solved.cell.mount is not None:
-        faults += _exchanged_views(solved, mutual, set())
-        faults = faults or [*_moved_run(solved)]
+    mutual, faults = exchanged(agreed.problem, fitting), [*_turned_images(cell_fit)]
+    if cell_fit.cell.mount is not None:
+        faults += _exchanged_views(cell_fit, mutual, set())
+        faults = faults or [*_moved_run(cell_fit)]
     else:
-        faults += [*_pushed_bases(solved), *_exchanged_poses(solved, mutual)]
-        faults += _exchanged_views(solved, mutual, {row for fault in faults for row in fault.rows})
-        faults += _wrong_poses(solved, {row for fault in faults for row in fault.rows})
+        faults += [*_pushed_bases(cell_fit), *_exchanged_poses(cell_fit, mutual)]
+        faults += _exchanged_views(
+            cell_fit, mutual, {row for fault in faults for row in fault.rows}
+        )
+        faults += _wrong_poses(cell_fit, {row for fault in faults for row in fault.rows})
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
-    causes = {at: _cause(solved, at, fitting, mutual) for at in outliers.tolist()} | clauses
-    return tuple(faults), _reasons(solved, causes)
+    causes = {at: _cause(cell_fit, at, fitting, mutual) for at in outliers.tolist()} | clauses
+    return tuple(faults), _reasons(cell_fit, causes)
 
 
 def _fault(
-    solved: CellFit, kind: str, rows: Sequence[int], words: str, do: Remedy, short: str = ""
+    cell_fit: CellFit, kind: str, rows: Sequence[int], words: str, do: Remedy, short: str = ""
 ) -> PoseFault:
     """A fault of some observations, in words in which {views} are theirs."""
-    views = tuple(solved.cell.rows[row].view for row in rows)
+    views = tuple(cell_fit.cell.rows[row].view for row in rows)
     words = words.format(views=f"views {some_of([*map(str, views)], _LISTED)}")
     found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
     return PoseFault(found, tuple(rows), short)
 
 
-def _turned_images(solved: CellFit) -> Iterator[PoseFault]:
+def _turned_images(cell_fit: CellFit) -> Iterator[PoseFault]:
     """Turned or mirrored images, which agree with the others once they are turned back."""
     rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
-    for at, row in enumerate(solved.cell.rows):
-        if row.view in solved.turned and not solved.inlier_fit.used[at]:
-            rows_by_turn[solved.turned[row.view]].append(at)
-    images = {view.number: view.image for view in solved.cell.session.views}
+    for at, row in enumerate(cell_fit.cell.rows):
+        if row.view in cell_fit.turned and not cell_fit.inlier_fit.used[at]:
+            rows_by_turn[cell_fit.turned[row.view]].append(at)
+    images = {view.number: view.image for view in cell_fit.cell.session.views}
     for how, rows in rows_by_turn.items():
-        files = [images[solved.cell.rows[row].view] for row in rows]
+        files = [images[cell_fit.cell.rows[row].view] for row in rows]
         step = Remedy("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
         if all(files):
             named = " ".join(f"SESSION/{shlex.quote(file)}" for file in files)
             turn = f"mogrify {how.option} {named}"
             step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
         words = f"images of {{views}} are {how.words}: turned back, they agree. They were left out."
-        yield _fault(solved, "turned_images", rows, words, step, f"its image is {how.words}")
+        yield _fault(cell_fit, "turned_images", rows, words, step, f"its image is {how.words}")
 
 
-def _moved_run(solved: CellFit) -> Iterator[PoseFault]:
+def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     """Outliers at one end of the session that one step of a frame, or of a board, explains."""
     # Another active tool frame in the controller looks like a step of what is on the flange, and
     # another base frame like one of what is fixed in the cell.
-    inliers, rows = solved.inlier_fit, solved.cell.rows
+    inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
     problem, fit = inliers.problem, inliers.fit
     order = np.argsort(problem.observations.stops, kind="stable")
     used = np.flatnonzero(inliers.used[order])
@@ -199,7 +201,7 @@ def _moved_run(solved: CellFit) -> Iterator[PoseFault]:
         if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
             steps.append((scatter_m, frame, change))
     if steps:
-        what, advice = _moved_words(solved, sorted(steps, key=lambda step: step[0]))
+        what, advice = _moved_words(cell_fit, sorted(steps, key=lambda step: step[0]))
     elif (size := agreed_size(problem, fit, some)) is not None and size[1].all():
         share = f"{figure(100.0 * abs(size[0]))} % {'larger' if size[0] > 0.0 else 'smaller'}"
         what = f"the target is another one, {share} than that of the other views"
@@ -215,16 +217,16 @@ def _moved_run(solved: CellFit) -> Iterator[PoseFault]:
     views = tuple(rows[row].view for row in outliers)
     do = or_alone(f"{advice}; or calibrate the views before and after it apart.", views)
     words = f"{{views}} were left out: {when}, as they agree, {what}."
-    fault = _fault(solved, "something_moved", outliers, words, do, f"{when}, something had moved")
+    fault = _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
     evidence = run_evidence(len(run), len(rows))
     yield replace(fault, found=replace(fault.found, mahalanobis_sq=evidence))
 
 
 def _moved_words(
-    solved: CellFit, steps: Sequence[tuple[float, str, FloatArray]]
+    cell_fit: CellFit, steps: Sequence[tuple[float, str, FloatArray]]
 ) -> tuple[str, str]:
     """What stood elsewhere, by steps of frames, the likeliest first; and advice."""
-    inliers, (_, frame, change) = solved.inlier_fit, steps[0]
+    inliers, (_, frame, change) = cell_fit.inlier_fit, steps[0]
     problem = inliers.problem
     stood = [
         f"the {name.partition('_')[0].replace('cam', 'camera')} stood "
@@ -247,24 +249,24 @@ def _moved_words(
 
 
 def _exchanged_views(
-    solved: CellFit, mutual: Mapping[int, int], explained: Collection[int]
+    cell_fit: CellFit, mutual: Mapping[int, int], explained: Collection[int]
 ) -> Iterator[PoseFault]:
     """Pairs of views of one camera, each of which fits the other's pose."""
     for pair in sorted(mutual.items()):
         if pair[0] < pair[1] and not {*pair} & {*explained}:
-            first, second = (solved.cell.rows[row].view for row in pair)
+            first, second = (cell_fit.cell.rows[row].view for row in pair)
             words = (
                 f"Views {first} and {second} are exchanged: the image of each fits the pose in "
                 "the other's row. They were left out."
             )
-            yield _fault(solved, EXCHANGED, pair, words, exchanging(first, second))
+            yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
 
 
-def _pushed_bases(solved: CellFit) -> Iterator[PoseFault]:
+def _pushed_bases(cell_fit: CellFit) -> Iterator[PoseFault]:
     """Robots whose observations are all outliers from some stop on, as if the base had moved."""
     # Such observations are left out, and the base stays where it was: unlike other frames, a base
     # is not split in two when it moves, as all that its robot carries hangs on it.
-    problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
+    problem, used = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
         flange = problem.tree.flanges[robot]
@@ -273,23 +275,23 @@ def _pushed_bases(solved: CellFit) -> Iterator[PoseFault]:
         after = np.flatnonzero(by_robot & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
-        moved = _base_displacement(solved, base, after)
+        moved = _base_displacement(cell_fit, base, after)
         as_if = f", as if {base} had been pushed by {moved}" if moved else ""
         words = (
             f"All {len(after)} views by way of {flange} from stop "
-            f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
+            f"{cell_fit.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
             f"{base} is where it stood before."
         )
-        look = look_at(solved.cell.rows[after[0]].view)
+        look = look_at(cell_fit.cell.rows[after[0]].view)
         step = Remedy("Fasten it, and calibrate the stops from there on alone.", look)
-        yield _fault(solved, "something_moved", after.tolist(), words, step)
+        yield _fault(cell_fit, "something_moved", after.tolist(), words, step)
 
 
 def _base_displacement(
-    solved: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
+    cell_fit: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
 ) -> str:
     """Mean displacement of a base by some observations, in words; empty where they disagree."""
-    changes = solved.inlier_fit.problem.change_of(base, solved.inlier_fit.fit.state)[rows]
+    changes = cell_fit.inlier_fit.problem.change_of(base, cell_fit.inlier_fit.fit.state)[rows]
     if of is not None:
         changes = invert(of) @ changes @ of
     mean = mean_transform(changes)
@@ -298,9 +300,9 @@ def _base_displacement(
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
-def _exchanged_poses(solved: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+def _exchanged_poses(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
     """Pairs of poses of one robot that are exchanged."""
-    rows, problem, used = solved.cell.rows, solved.inlier_fit.problem, solved.inlier_fit.used
+    rows, problem, used = cell_fit.cell.rows, cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
     for robot, flange in problem.tree.flanges.items():
         by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
         pairs = Counter(
@@ -312,15 +314,15 @@ def _exchanged_poses(solved: CellFit, mutual: Mapping[int, int]) -> Iterator[Pos
             at_both = [at for at in by_robot if rows[at].station in stations]
             if count < 2 * _FEWEST or used[at_both].any():
                 continue
-            first, second = (solved.cell.stops[station] for station in stations)
+            first, second = (cell_fit.cell.stops[station] for station in stations)
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
-            yield _fault(solved, EXCHANGED, at_both, words, _EXCHANGE, short)
+            yield _fault(cell_fit, EXCHANGED, at_both, words, _EXCHANGE, short)
 
 
-def _wrong_poses(solved: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:
+def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:
     """Stops at which all observations through a robot agree that its pose is wrong."""
-    problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
+    problem, used = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
         by_robot = problem.observations_through(problem.tree.flanges[robot])
@@ -328,8 +330,8 @@ def _wrong_poses(solved: CellFit, explained: Collection[int]) -> Iterator[PoseFa
             rows = np.flatnonzero(by_robot & (stops == station))
             if len(rows) < _FEWEST or used[rows].any() or {*explained} & {*rows.tolist()}:
                 continue
-            if moved := _base_displacement(solved, base, rows, problem.poses[robot][station]):
-                stop = solved.cell.stops[station]
+            if moved := _base_displacement(cell_fit, base, rows, problem.poses[robot][station]):
+                stop = cell_fit.cell.stops[station]
                 words = (
                     f"Robot {robot} did not stand at stop {stop} where its pose says: all "
                     f"{len(rows)} views by way of it disagree with the others, as if the flange "
@@ -337,22 +339,22 @@ def _wrong_poses(solved: CellFit, explained: Collection[int]) -> Iterator[PoseFa
                 )
                 do = Remedy(
                     "Correct its pose there in views.csv, or leave the stop out.",
-                    look_at(solved.cell.rows[rows[0]].view),
+                    look_at(cell_fit.cell.rows[rows[0]].view),
                 )
                 short = f"the pose of robot {robot} at stop {stop} is wrong"
-                yield _fault(solved, "wrong_pose", rows.tolist(), words, do, short)
+                yield _fault(cell_fit, "wrong_pose", rows.tolist(), words, do, short)
 
 
-def _reasons(solved: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
+def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
     """Why outliers are left out, by view, given the likely cause of each."""
-    inliers, alone = solved.inlier_fit, solved.cell.mount is not None
+    inliers, alone = cell_fit.inlier_fit, cell_fit.cell.mount is not None
     directions = np.maximum(inliers.distances.directions, 1)
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
     rest, reasons = "the other views" if alone else "the rest of the cell", dict[int, str]()
     for at, cause in causes.items():
-        row, mm = solved.cell.rows[at], 1e3 * float(off_m[at])
+        row, mm = cell_fit.cell.rows[at], 1e3 * float(off_m[at])
         turned = ""
         if inliers.problem.observations.has_rotation[at]:
             turned = f" and {figure(float(np.rad2deg(off_rad[at])))} deg"
@@ -371,11 +373,11 @@ def _reasons(solved: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
 
 
 def _cause(
-    solved: CellFit, at: int, fitting: Mapping[int, Sequence[int]], mutual: Mapping[int, int]
+    cell_fit: CellFit, at: int, fitting: Mapping[int, Sequence[int]], mutual: Mapping[int, int]
 ) -> str:
     """Likely cause of an outlier, by stops that it fits and by inliers of its stop and target."""
-    rows, used, stops = solved.cell.rows, solved.inlier_fit.used, solved.cell.stops
-    seen = np.array(solved.inlier_fit.problem.observations.observed)
+    rows, used, stops = cell_fit.cell.rows, cell_fit.inlier_fit.used, cell_fit.cell.stops
+    seen = np.array(cell_fit.inlier_fit.problem.observations.observed)
     if at in mutual:
         own, other = rows[at], rows[mutual[at]]
         return (
@@ -385,7 +387,7 @@ def _cause(
     reading = "reading" if rows[at].seer.startswith("instrument") else "image"
     cause = f"its pose or its {reading} is wrong, or something had moved"
     of_its_target = np.flatnonzero((seen == seen[at]) & used)
-    of_stop = solved.inlier_fit.problem.observations.stops
+    of_stop = cell_fit.inlier_fit.problem.observations.stops
     mates = np.flatnonzero((of_stop == of_stop[at]) & used)
     if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
         other = rows[of_its_target[0]]

@@ -59,25 +59,29 @@ from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
 def findings_of(run: RunState) -> Findings:
     """Collects the input of the verdict."""
-    answer, solved = run.assessment, run.cell_fit
-    frames = solved.cell.tree.branches.keys()
+    answer, cell_fit = run.assessment, run.cell_fit
+    frames = cell_fit.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
-    explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
+    explained = {cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, of_cell = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
-    of_arms = doubts_of_arms(solved.arms, answer.steps, answer.arms, solved.level, solved.cell)
+    of_arms = doubts_of_arms(
+        cell_fit.arms, answer.steps, answer.arms, cell_fit.level, cell_fit.cell
+    )
     found = [*(_with_alternative(doubt, run) for doubt in of_arms), *lens_findings(answer.lenses)]
     of_rest = [
         *(
             component.finding
             for component in components(
-                answer.problem, answer.state, answer.covariance, solved.cell.priors
+                answer.problem, answer.state, answer.covariance, cell_fit.cell.priors
             )
         ),
-        *solved.camera_findings(answer.covariance),
-        *random_effect_findings(solved.inlier_problem, solved.inlier_fit.fit, answer.covariance),
+        *cell_fit.camera_findings(answer.covariance),
+        *random_effect_findings(
+            cell_fit.inlier_problem, cell_fit.inlier_fit.fit, answer.covariance
+        ),
     ]
-    if any(map(is_of_chain, (*found, *of_rest))) or not solved.inlier_fit.used.all():
-        found += lens_changes(solved)
+    if any(map(is_of_chain, (*found, *of_rest))) or not cell_fit.inlier_fit.used.all():
+        found += lens_changes(cell_fit)
     is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
@@ -96,13 +100,13 @@ def findings_of(run: RunState) -> Findings:
         (
             *run.notes,
             *_clock_words(run),
-            *notes_on_arms(solved.arms, answer.arms),
+            *notes_on_arms(cell_fit.arms, answer.arms),
             *(finding.reason for finding in of_rest if finding.kind == NOTE),
         ),
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
-        None if run.mount else _tie(solved.cell, answer.last_edges),
+        None if run.mount else _tie(cell_fit.cell, answer.last_edges),
         run.session.corrects_targets,
         _use(run),
     )
@@ -144,18 +148,18 @@ def _with_alternative(finding: Finding, run: RunState) -> Finding:
 
 def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     """Input of the prediction of picks."""
-    answer, solved = run.assessment, run.cell_fit
+    answer, cell_fit = run.assessment, run.cell_fit
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
         answer.problem,
         answer.fit,
         answer.covariance,
         answer.held_out,
-        middles_of(solved.cell),
+        middles_of(cell_fit.cell),
         dict(zip(answer.problem.robots, freedom, strict=True)),
-        solved.arms,
-        columns_of_boards(solved),
-        middle_jacobians(solved),
+        cell_fit.arms,
+        columns_of_boards(cell_fit),
+        middle_jacobians(cell_fit),
         answer.problem,
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
         _strays(answer, explained),
@@ -338,11 +342,11 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
 
 
 def _arms(answer: FitAssessment) -> list[JudgedArm]:
-    problem, solved = answer.problem, answer.cell_fit
-    modelled = {name or "robot" for name in solved.cell.session.robot_documents}
+    problem, cell_fit = answer.problem, answer.cell_fit
+    modelled = {name or "robot" for name in cell_fit.cell.session.robot_documents}
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
-        arm, found = solved.arms[robot], answer.arms[robot].sections.arm
+        arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
         judged = JudgedArm(
             len(stops_of(problem, robot)),

@@ -36,9 +36,9 @@ class LensErrors:
         return self.levels.field * self.noise_px
 
 
-def lens_errors(solved: CellFit) -> dict[str, LensErrors]:
+def lens_errors(cell_fit: CellFit) -> dict[str, LensErrors]:
     """Lens errors of each camera; empty for a session without images."""
-    seen = solved.linearised_corners
+    seen = cell_fit.linearised_corners
     if seen is None:
         return {}
     optics = seen.camera_parameters
@@ -60,17 +60,17 @@ def _distance_m(seen: LinearisedCorners, which: int) -> float:
 
 
 def lens_field_of(
-    solved: CellFit, camera: str, covariance: FloatArray, edges: int
+    cell_fit: CellFit, camera: str, covariance: FloatArray, edges: int
 ) -> LensField | None:
     """The result's section on one lens's errors beyond its model; None where there are none.
 
     Args:
-        solved: The fit.
+        cell_fit: The fit.
         camera: The frame of the camera.
         covariance: (p, p) of the fit's unknowns.
         edges: How many of these, the first, belong to edges.
     """
-    seen = solved.linearised_corners
+    seen = cell_fit.linearised_corners
     if seen is None:
         return None
     optics, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
@@ -84,19 +84,19 @@ def lens_field_of(
         # move the poses, which are unknowns of the fit.
         sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
         first, is_free = sum(sizes[:which]), np.isin(places, seen.free)
-        beyond = solved.field_columns[first : first + sizes[which]]
+        beyond = cell_fit.field_columns[first : first + sizes[which]]
         jacobian = np.zeros((len(coefficients.mean), len(covariance)))
-        jacobian[:, solved.columns_of(places[is_free])] = coefficients.slope[:, is_free]
+        jacobian[:, cell_fit.columns_of(places[is_free])] = coefficients.slope[:, is_free]
         jacobian[:, beyond] = coefficients.moving_roots
-        values = solved.inlier_fit.problem.values_of(LENSES, solved.inlier_fit.fit.state)
+        values = cell_fit.inlier_fit.problem.values_of(LENSES, cell_fit.inlier_fit.fit.state)
         change = (values[: len(seen.free)] - optics.values[seen.free])[np.isin(seen.free, places)]
-        fitted = coefficients.moving_roots @ values[beyond - solved.lens_columns.start]
+        fitted = coefficients.moving_roots @ values[beyond - cell_fit.lens_columns.start]
         mean = (coefficients.mean + coefficients.slope[:, is_free] @ change + fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
         own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
         root = _root(own, optics.camera(camera), levels)
     with_lens, free = np.zeros((len(mean), len(lens))), np.isin(lens, seen.free)
-    with_lens[:, free] = jacobian @ covariance[:, solved.columns_of(lens[free])] / noise_px
+    with_lens[:, free] = jacobian @ covariance[:, cell_fit.columns_of(lens[free])] / noise_px
     return LensField(
         field_px=noise_px * levels.field,
         length=levels.length,
@@ -121,12 +121,12 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])
 
 
-def lens_changes(solved: CellFit) -> Iterator[Finding]:
+def lens_changes(cell_fit: CellFit) -> Iterator[Finding]:
     """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     if seen is None or optics is None:
         return
-    stations = {row.view: row.station for row in solved.cell.rows}
+    stations = {row.view: row.station for row in cell_fit.cell.rows}
     for which, (name, problem) in enumerate(optics.problems.items()):
         # Images for the intrinsics alone have no time.
         timed = np.array([view in stations for view in problem.stack.views])
@@ -145,13 +145,13 @@ def lens_changes(solved: CellFit) -> Iterator[Finding]:
         first, (x, y) = stations[stack.views[int(order[step.first])]], step.centre_px
         yield Finding(
             LENS_CHANGED,
-            f"{_named(name, len(optics.problems))} changed: {solved.cell.start_words(first)}, its "
-            f"focal length is {figure(100.0 * abs(step.zoom))} % "
+            f"{_named(name, len(optics.problems))} changed: {cell_fit.cell.start_words(first)}, "
+            f"its focal length is {figure(100.0 * abs(step.zoom))} % "
             f"{'longer' if step.zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * step.sigmas[0])} "
             f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
             f"{figure(max(step.sigmas[1:]))} px), by the corners alone; the result is between both "
             "lenses.",
-            solved.cell.or_separately(
+            cell_fit.cell.or_separately(
                 "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
             ),
             mahalanobis_sq=step.gain,

@@ -341,18 +341,18 @@ def _written_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
 
 def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
     """The sections of a whole cell, by name."""
-    session, cell, solved, answer = run.session, run.cell, run.cell_fit, run.assessment
+    session, cell, cell_fit, answer = run.session, run.cell, run.cell_fit, run.assessment
     kept = {
         name: branch.parent
         for name, branch in cell.tree.branches.items()
-        if name in solved.cell.tree.branches
+        if name in cell_fit.cell.tree.branches
     }
     models = session.robot_documents
     robots = {
         robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
         for name in session.robots
     }
-    for name in solved.arms:
+    for name in cell_fit.arms:
         robots[name] = RobotResult(robots[name].model, **vars(run.assessment.arms[name].sections))
     return CellResult(
         reference=cell.reference,
@@ -365,9 +365,9 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
         noise=answer.sigmas,
         moved=answer.moved,
         untied=tuple(
-            UnconnectedFrame(name, connection_advice(cell, name)) for name in solved.unconnected
+            UnconnectedFrame(name, connection_advice(cell, name)) for name in cell_fit.unconnected
         ),
-        weakest=weakest_link(solved.cell, answer.last_edges),
+        weakest=weakest_link(cell_fit.cell, answer.last_edges),
         details=CellDetails({pair.words: clock for pair, clock in answer.clocks(run).items()}),
         joint_fit=_joint_fit_of_cell(run),
         uncertainty=CellUncertainty(
@@ -384,17 +384,17 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
     intrinsics of which only a part is uncertain (the matrix and not the distortion) have zeros for
     the rest.
     """
-    solved, covariance, edges = (
+    cell_fit, covariance, edges = (
         run.cell_fit,
         run.assessment.covariance,
         6 * len(run.assessment.edges),
     )
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     # Measured poses need no camera, but later use of the result may.
     cameras = {
         frame: CameraResult(camera, estimated=False)
         for name, table in run.session.cameras.items()
-        if (frame := frame_name("camera", name)) in solved.cell.tree.branches
+        if (frame := frame_name("camera", name)) in cell_fit.cell.tree.branches
         and (camera := table.stated) is not None
     }
     if seen is None or optics is None:
@@ -404,10 +404,10 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
         free = np.isin(lens, seen.free)
         estimated = scene.estimated or bool(np.isin(lens, seen.moving).any())
         result = CameraResult(
-            optics.camera(name), estimated, field=lens_field_of(solved, name, covariance, edges)
+            optics.camera(name), estimated, field=lens_field_of(cell_fit, name, covariance, edges)
         )
         if free.any():
-            columns = solved.columns_of(lens[free])
+            columns = cell_fit.columns_of(lens[free])
             own, cross = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
             own[np.ix_(free, free)] = covariance[np.ix_(columns, columns)]
             cross[free] = covariance[columns, :edges]
@@ -418,17 +418,17 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
 
 def _joint_fit_of_cell(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
-    solved, answer = run.cell_fit, run.assessment
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    cell_fit, answer = run.cell_fit, run.assessment
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     columns, arms = [*range(6 * len(answer.edges))], dict[str, FittedArm]()
     cameras, targets = dict[str, tuple[int, ...]](), dict[str, tuple[int, ...]]()
     if seen is not None and optics is not None:
-        columns += solved.columns_of(seen.free).tolist()
+        columns += cell_fit.columns_of(seen.free).tolist()
         for name, at in optics.lenses.items():
             cameras[object_name(name, "camera")] = _relative_indices(seen.free, at)
         for name, shape in _shape_slices(run).items():
             targets[name] = _relative_indices(seen.free, shape)
-    for robot, arm in solved.arms.items():
+    for robot, arm in cell_fit.arms.items():
         fitted = _fitted_arm(run, arm)
         effect = answer.problem.effect_columns.get(f"arm of {arm.robot}")
         if fitted is not None and arm.model is not None and effect is not None:
@@ -440,20 +440,20 @@ def _joint_fit_of_cell(run: RunState) -> CellJointFit:
 
 def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
-    solved, covariance = run.cell_fit, run.assessment.covariance
-    seen, optics = solved.linearised_corners, solved.camera_parameters
+    cell_fit, covariance = run.cell_fit, run.assessment.covariance
+    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
     if seen is None or optics is None:
         return boards, rigs
     all_sigmas = np.zeros(len(optics.values))
-    all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
+    all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[cell_fit.columns_of(seen.free)]
     shapes = zip(
         _shape_slices(run).items(), run.session.boards.items(), optics.corners, strict=True
     )
     for (name, shape), (plate, target), corners in shapes:
         values, sigmas = optics.values[shape], all_sigmas[shape]
         free = _relative_indices(seen.free, shape)
-        if frame_name("target", plate) not in solved.inlier_problem.tree.branches:
+        if frame_name("target", plate) not in cell_fit.inlier_problem.tree.branches:
             continue
         if not target.is_rig:
             boards[name] = BoardResult(
@@ -484,9 +484,9 @@ def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:
 
 def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
-    solved, state, boards = run.cell_fit, run.assessment.state, tuple(run.session.boards.values())
-    held, optics, evidence = held_back(solved, run), solved.camera_parameters, dict[int, Any]()
-    for seen in (fitted_rows(solved), *([] if held is None else [held])):
+    cell_fit, state, boards = run.cell_fit, run.assessment.state, tuple(run.session.boards.values())
+    held, optics, evidence = held_back(cell_fit, run), cell_fit.camera_parameters, dict[int, Any]()
+    for seen in (fitted_rows(cell_fit), *([] if held is None else [held])):
         poses = zip(seen.problem.measured(state), seen.problem.predicted(state), strict=True)
         for row, view, (measured, predicted) in zip(seen.rows, seen.views, poses, strict=True):
             px = None
@@ -510,7 +510,7 @@ def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
             corners = replace(corners, ids=corners.ids - first)
         flange = run.base_from_flange.get(number)
         if observation is not None and len(observation.robots) == 1:
-            arm = solved.arms.get(robot_key(next(iter(observation.robots))))
+            arm = cell_fit.arms.get(robot_key(next(iter(observation.robots))))
             if arm is not None and arm.has_pose[observation.station]:
                 flange = np.asarray(arm.poses[observation.station])
         views.append(ViewEvidence(number, corners, px, flange, measured))

@@ -47,7 +47,8 @@ class CalibrationOptions(TypedDict, total=False):
 class RunState(Observed):
     """State of a run between two stages; None for results of stages still to come.
 
-    The properties `cell`, `fitted` and `solved` raise a RuntimeError before their stage has run.
+    The properties `cell`, `cell_fit` and `assessment` raise a RuntimeError before their stage has
+    run.
     """
 
     solver: SolverName = "joint"  # The requested solver, for one robot and one camera.

@@ -97,7 +97,7 @@ def solve(
     if start.cell.mount is not None and start.cell.priors and not observed.is_misread:
         _refuse_undetermined_lens(observed, start.problem, start.cell.mount)
     try:
-        solved = _fit(start, observed, arms, level)
+        cell_fit = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.is_misread:
@@ -105,7 +105,7 @@ def solve(
             words = chain_words(start.problem, start.cell.mount)
             refuse_open_motion(start.problem, start.state, noise, words)
         raise
-    return solved if solver == "joint" else _by_closed_form(solved, solver)
+    return cell_fit if solver == "joint" else _by_closed_form(cell_fit, solver)
 
 
 def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
@@ -120,40 +120,42 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     initial = CellFit(
         cell, inliers, None, poses, start.untied, arms, level, clock_errors, observed.turned
     )
-    solved = _fit_with_inliers(initial, observed, sizes)
-    if turned := {} if observed.is_misread else _turned_images(solved):
+    cell_fit = _fit_with_inliers(initial, observed, sizes)
+    if turned := {} if observed.is_misread else _turned_images(cell_fit):
         # Their corners would be explained by a lens that changes from view to view.
         observed = replace(observed, turned=turned)
-        solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
-    solved = replace(
-        solved, arms=with_drifts(solved.arms, solved.inlier_problem, solved.inlier_fit.fit, level)
+        cell_fit = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
+    cell_fit = replace(
+        cell_fit,
+        arms=with_drifts(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit, level),
     )
-    if any(arm.drift is not None for arm in solved.arms.values()):
-        solved = _fit_with_inliers(solved, observed, sizes)
-    if not observed.is_misread and (found := _random_effects(solved)):
+    if any(arm.drift is not None for arm in cell_fit.arms.values()):
+        cell_fit = _fit_with_inliers(cell_fit, observed, sizes)
+    if not observed.is_misread and (found := _random_effects(cell_fit)):
         effects = (*clock_errors, *found)
-        solved = _fit_with_inliers(replace(solved, other_effects=effects), observed, sizes)
+        cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed, sizes)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
-    final = None if cell.mount is None or cell.priors else solved.inlier_fit
-    solved = replace(solved, inlier_fit=with_camera_levels(cell, poses, solved.inlier_fit))
+    final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
+    cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
     # Misread poses determine neither the arm nor which views are outliers.
-    solved = solved if observed.is_misread else _calibrate_arms(solved, observed, final)
+    cell_fit = cell_fit if observed.is_misread else _calibrate_arms(cell_fit, observed, final)
     if level != "hand-eye" and not observed.is_misread:
-        solved = _with_functions(solved)
-    solved = replace(solved, inlier_fit=with_repeats(solved.inlier_fit))
+        cell_fit = _with_functions(cell_fit)
+    cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     if observed.is_misread:
-        return solved
+        return cell_fit
     return replace(
-        solved, arms=with_pose_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
+        cell_fit,
+        arms=with_pose_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit),
     )
 
 
-def _random_effects(solved: CellFit) -> tuple[Effect, ...]:
+def _random_effects(cell_fit: CellFit) -> tuple[Effect, ...]:
     """Errors that grow with time, reach or gravity, which the fit's residuals show."""
-    corners, model = solved.linearised_corners, solved.frame_model
+    corners, model = cell_fit.linearised_corners, cell_fit.frame_model
     rows = None if corners is None else model.rows(corners)
-    problem, fit = solved.inlier_problem, solved.inlier_fit.fit
-    return random_effects(problem, fit, solved.arms, corners, rows)
+    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    return random_effects(problem, fit, cell_fit.arms, corners, rows)
 
 
 def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
@@ -192,75 +194,75 @@ def _without_misreported(
     return replace(inliers, used=used).refitted()
 
 
-def _calibrate_arms(solved: CellFit, observed: Observed, final: InlierFit | None) -> CellFit:
+def _calibrate_arms(cell_fit: CellFit, observed: Observed, final: InlierFit | None) -> CellFit:
     """Alternates between calibrating the arms and updating the inliers until neither changes.
 
     Args:
-        solved: The fit.
+        cell_fit: The fit.
         observed: The observations.
         final: Inliers that need no update, if any.
     """
     for iteration in range(_ROUNDS + 1):
-        if solved.level != "hand-eye":
-            arms = _choose_levels(solved)
+        if cell_fit.level != "hand-eye":
+            arms = _choose_levels(cell_fit)
             erring = [name for name, arm in arms.items() if arm.has_free_errors()]
-            clock_errors = clock_effects(solved.cell, observed.clocks, erring)
-            effects = (*clock_errors, *of_random_effects(solved.other_effects))
-            solved = _converge_arms(replace(solved, arms=arms, other_effects=effects))
-        before = solved.inlier_fit
+            clock_errors = clock_effects(cell_fit.cell, observed.clocks, erring)
+            effects = (*clock_errors, *of_random_effects(cell_fit.other_effects))
+            cell_fit = _converge_arms(replace(cell_fit, arms=arms, other_effects=effects))
+        before = cell_fit.inlier_fit
         # The arms are calibrated with the last inliers.
         if iteration == _ROUNDS or before is final:
             break
         inliers = _without_misreported(
-            updated_inliers(solved.cell, before), solved.arms, before.used
+            updated_inliers(cell_fit.cell, before), cell_fit.arms, before.used
         )
-        solved = _converge_arms(replace(solved, inlier_fit=inliers))
+        cell_fit = _converge_arms(replace(cell_fit, inlier_fit=inliers))
         # Other inliers, or other moved frames, may allow another calibration level.
         same_frames = before.problem.unknown.keys() == inliers.problem.unknown.keys()
         if same_frames and np.array_equal(before.used, inliers.used):
             break
-    return solved
+    return cell_fit
 
 
-def _by_closed_form(solved: CellFit, solver: str) -> CellFit:
+def _by_closed_form(cell_fit: CellFit, solver: str) -> CellFit:
     """Replaces the edges by those of a closed form, and the noise by that of its residuals."""
-    inliers, part, mount = solved.inlier_fit, solved.inlier_problem, solved.cell.mount
+    inliers, part, mount = cell_fit.inlier_fit, cell_fit.inlier_problem, cell_fit.cell.mount
     if mount is None:
         raise RuntimeError("closed forms are for one robot and one camera")
     state = closed_form_state(part, solver, inliers.fit.state, mount)
     noise = estimate_noise(part, state, starting_noise(part), from_above=True)
-    return replace(solved, inlier_fit=replace(inliers, fit=Solution(state, noise)), solver=solver)
+    return replace(cell_fit, inlier_fit=replace(inliers, fit=Solution(state, noise)), solver=solver)
 
 
 def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, float]) -> CellFit:
     """Fits lenses, boards and frames, and updates the inliers until they do not change."""
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
-    solved = start
+    cell_fit = start
     for _ in range(_ROUNDS):
         # Errors of an arm are sought beside the stated lenses and boards, which may hide them.
-        if any(arm.errors and arm.errors.is_significant for arm in solved.arms.values()):
-            solved = replace(solved, linearised_corners=None)
-        solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, sizes)
-        if solved.cell.mount is None or observed.is_misread:
+        if any(arm.errors and arm.errors.is_significant for arm in cell_fit.arms.values()):
+            cell_fit = replace(cell_fit, linearised_corners=None)
+        cell_fit = _fit_lenses_and_frames(replace(cell_fit, arms=start.arms), observed, sizes)
+        if cell_fit.cell.mount is None or observed.is_misread:
             break
-        before = solved.inlier_fit.used
-        solved = replace(solved, inlier_fit=refine_inliers(solved.inlier_fit))
-        if np.array_equal(before, solved.inlier_fit.used):
+        before = cell_fit.inlier_fit.used
+        cell_fit = replace(cell_fit, inlier_fit=refine_inliers(cell_fit.inlier_fit))
+        if np.array_equal(before, cell_fit.inlier_fit.used):
             break
-    return solved
+    return cell_fit
 
 
-def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
+def _turned_images(cell_fit: CellFit) -> dict[int, ImageTurn]:
     """How images of outliers were turned or mirrored, by view."""
-    inliers, optics = solved.inlier_fit, solved.camera_parameters
+    inliers, optics = cell_fit.inlier_fit, cell_fit.camera_parameters
     problem, state = inliers.problem, inliers.fit.state
     if optics is None or inliers.used.all():
         return {}
-    typical_px = float(np.nanmedian(solved.reprojection_px(np.flatnonzero(inliers.used), state)))
+    typical_px = float(np.nanmedian(cell_fit.reprojection_px(np.flatnonzero(inliers.used), state)))
     predicted, turns = problem.predicted(state), {}
     for row in np.flatnonzero(~inliers.used).tolist():
-        seer, view = solved.cell.rows[row].seer, solved.poses[row]
+        seer, view = cell_fit.cell.rows[row].seer, cell_fit.poses[row]
         if view.corners is None or seer not in optics.problems:
             continue
         camera = optics.camera(seer)
@@ -272,26 +274,26 @@ def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
 
 
 def _fit_lenses_and_frames(
-    solved: CellFit,
+    cell_fit: CellFit,
     observed: Observed,
     sizes: Mapping[str, float],
 ) -> CellFit:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
-    solved = replace(
-        solved, arms={name: arm.with_found_errors(None) for name, arm in solved.arms.items()}
+    cell_fit = replace(
+        cell_fit, arms={name: arm.with_found_errors(None) for name, arm in cell_fit.arms.items()}
     )
-    solved = solved.with_arm_poses()
-    if observed.scenes and not solved.inlier_fit.problem.is_combined:
-        model, frames = solved.frame_model, solved.frames
-        views = _views_by_camera(observed, solved.poses)
+    cell_fit = cell_fit.with_arm_poses()
+    if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
+        model, frames = cell_fit.frame_model, cell_fit.frames
+        views = _views_by_camera(observed, cell_fit.poses)
         optics = model.camera_parameters(observed.scenes, views)
         if observed.is_misread:
-            return solved.with_joint_fit(model, fit_jointly(optics, model, frames))
-        if (corners := solved.linearised_corners) is not None:
+            return cell_fit.with_joint_fit(model, fit_jointly(optics, model, frames))
+        if (corners := cell_fit.linearised_corners) is not None:
             # Where other inliers are too far from the last fit, it starts anew.
             with suppress(ConvergenceError):
                 fitted, model = refine_jointly(model, corners.camera_parameters, frames, corners)
-                return solved.with_joint_fit(model, fitted)
+                return cell_fit.with_joint_fit(model, fitted)
         try:
             fitted, model = refine_jointly(model, optics, frames)
         except ConvergenceError:
@@ -302,26 +304,30 @@ def _fit_lenses_and_frames(
             if not far:
                 raise
             fitted, model = refine_jointly(model, optics.with_scales(far), frames)
-        return solved.with_joint_fit(model, fitted)
-    solved = replace(solved, linearised_corners=None)
-    if drifts := tuple(arm_effects(solved.arms)):
-        solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, drifts))
-    solved = replace(
-        solved, arms=with_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
+        return cell_fit.with_joint_fit(model, fitted)
+    cell_fit = replace(cell_fit, linearised_corners=None)
+    if drifts := tuple(arm_effects(cell_fit.arms)):
+        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, drifts))
+    cell_fit = replace(
+        cell_fit, arms=with_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit)
     )
-    effects = (*solved.other_effects, *arm_effects(solved.arms))
+    effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
     return (
-        replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects)) if effects else solved
+        replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
+        if effects
+        else cell_fit
     )
 
 
-def _choose_levels(solved: CellFit, *, functions: bool = False) -> dict[str, RobotArm]:
+def _choose_levels(cell_fit: CellFit, *, functions: bool = False) -> dict[str, RobotArm]:
     """Selects the errors of each arm; functions of its joints only where asked for."""
-    part, fit = solved.inlier_problem, solved.inlier_fit.fit
-    views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.inlier_fit.used)]
+    part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        found = arm.with_level(nominal, start, solved.level, views, fit.noise, functions=functions)
+        found = arm.with_level(
+            nominal, start, cell_fit.level, views, fit.noise, functions=functions
+        )
         if not functions:
             return found
         # They also explain much of a slipped joint: where the slip explains more, they are left
@@ -331,44 +337,44 @@ def _choose_levels(solved: CellFit, *, functions: bool = False) -> dict[str, Rob
         slips = any(step.gain > gain for step in find_steps(part, fit, joints))
         return found if gain and not slips else arm
 
-    return change_each(solved.arms, part, fit, with_level)
+    return change_each(cell_fit.arms, part, fit, with_level)
 
 
-def _with_functions(solved: CellFit) -> CellFit:
+def _with_functions(cell_fit: CellFit) -> CellFit:
     """Fits error functions of the joints of each arm that supports them."""
     # Their many unknowns would slow each update of the inliers down, so that they come last.
-    arms = _choose_levels(solved, functions=True)
-    if all(arms[name] is arm for name, arm in solved.arms.items()):
-        return solved
-    return _converge_arms(replace(solved, arms=arms))
+    arms = _choose_levels(cell_fit, functions=True)
+    if all(arms[name] is arm for name, arm in cell_fit.arms.items()):
+        return cell_fit
+    return _converge_arms(replace(cell_fit, arms=arms))
 
 
-def _converge_arms(solved: CellFit) -> CellFit:
+def _converge_arms(cell_fit: CellFit) -> CellFit:
     """Fits and relinearises the calibrated arms in turn until they converge."""
-    is_modelled = any(arm.model is not None for arm in solved.arms.values())
-    effects_of_fit = solved.inlier_fit.problem.effect_columns
+    is_modelled = any(arm.model is not None for arm in cell_fit.arms.values())
+    effects_of_fit = cell_fit.inlier_fit.problem.effect_columns
     # The fit may still estimate an arm that is nominal again, with other inliers.
     is_outdated = any(
         f"arm of {name}" in effects_of_fit and not arm.has_free_errors()
-        for name, arm in solved.arms.items()
+        for name, arm in cell_fit.arms.items()
     )
     for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):
-        solved = solved.with_arm_poses()
-        if solved.linearised_corners is None:
-            effects = (*solved.other_effects, *arm_effects(solved.arms))
-            solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
+        cell_fit = cell_fit.with_arm_poses()
+        if cell_fit.linearised_corners is None:
+            effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
+            cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
         else:
-            model, corners = solved.frame_model, solved.linearised_corners
-            fitted = fit_jointly(corners.camera_parameters, model, solved.frames, None, corners)
+            model, corners = cell_fit.frame_model, cell_fit.linearised_corners
+            fitted = fit_jointly(corners.camera_parameters, model, cell_fit.frames, None, corners)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 fitted, _ = with_sizes(model, fitted)
-            solved = solved.with_joint_fit(model, fitted)
-        problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
-        moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}
-        solved = replace(solved, arms={name: arm for name, (arm, _) in moved.items()})
+            cell_fit = cell_fit.with_joint_fit(model, fitted)
+        problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
+        moved = {name: arm.relinearised(problem, state) for name, arm in cell_fit.arms.items()}
+        cell_fit = replace(cell_fit, arms={name: arm for name, (arm, _) in moved.items()})
         if max(step for _, step in moved.values()) < _CONVERGED_RAD:
             break
-    return solved
+    return cell_fit
 
 
 def _views_by_camera(observed: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:

@@ -404,7 +404,7 @@ def findings(fit: ThermalFit) -> Iterator[str]:
 
 
 def drift_result(
-    fit: ThermalFit, robot: str, stops: HeatedStops, problem: Problem, solved: Solution
+    fit: ThermalFit, robot: str, stops: HeatedStops, problem: Problem, fitted: Solution
 ) -> ThermalResult:
     """A drift's coefficients and its course, as a section of a calibration.
 
@@ -413,7 +413,7 @@ def drift_result(
         robot: The robot in the problem.
         stops: Its stops there, ascending.
         problem: The inlier observations.
-        solved: Their fit.
+        fitted: Their fit.
     """
     model, inputs = fit.model, fit.inputs
     columns = {
@@ -457,7 +457,7 @@ def drift_result(
         rises_k=tuple(fit.rises_k.tolist()),
         trained_s=float(np.ptp(stops.stamps_s)),
         course=tuple(DriftPoint(*row) for row in np.stack(course, axis=1).tolist()),
-        seen=_observed_drift(fit, robot, stops, typical, problem, solved.state),
+        seen=_observed_drift(fit, robot, stops, typical, problem, fitted.state),
         views=tuple(ViewDrift(*row) for row in by_view),
     )
 
