@@ -209,7 +209,7 @@ class RobotArm:
             return None
         poses = problem.poses[self.robot].copy()
         poses[self.has_pose] = move_to_arm(poses[self.has_pose], q, matched.arm, matched.robot)
-        return replace(problem, poses={**problem.poses, self.robot: poses})
+        return problem.with_poses(self.robot, poses)
 
     def reports_matching_joints(self, agrees: Mask) -> Mask:
         """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).

@@ -312,7 +312,7 @@ class ThermalFit:
         poses = problem.poses[robot].copy()
         poses[stood] = poses[stood] @ self.motion(stops)
         effect = self.effect(robot, stops, stood, held=False)
-        problem = replace(problem, poses={**problem.poses, robot: poses})
+        problem = problem.with_poses(robot, poses)
         return problem.with_effects([*problem.effects, effect])
 
 
