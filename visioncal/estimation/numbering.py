@@ -72,6 +72,11 @@ class Numbering:
         return f"points are exchanged: {', '.join(pairs)}"
 
 
+def misfit_by_noise(count: int, noise_m: float) -> float:
+    """Squared misfit [m^2] of placed points by noise alone, added to both sides of a ratio."""
+    return (3.0 * count - 6.0) * max(noise_m, LEAST_NOISE_M) ** 2
+
+
 def find_numbering(
     measured: FloatArray, nominal: FloatArray, noise_m: float = LEAST_NOISE_M
 ) -> Numbering:
@@ -96,7 +101,7 @@ def find_numbering(
     squares = procrustes_residual(measured[None], nominal[orders])
     freedom = 3.0 * count - 6.0
     # The misfit by stated noise makes no difference between orders.
-    floor = freedom * max(noise_m, LEAST_NOISE_M) ** 2
+    floor = misfit_by_noise(count, noise_m)
     ratio = (squares + floor) / (squares.min() + floor)
     as_good = ratio < f_limit(_AS_GOOD, freedom, freedom)
     moves = (orders != stated).sum(axis=1)

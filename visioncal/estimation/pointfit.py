@@ -24,7 +24,7 @@ from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
-from visioncal.estimation.numbering import Numbering, find_numbering
+from visioncal.estimation.numbering import Numbering, find_numbering, misfit_by_noise
 from visioncal.estimation.observability import Direction, axis_words
 from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, refuse_poor, worst_of
 from visioncal.estimation.points import Placement, PointProblem
@@ -192,7 +192,7 @@ def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[f
     Coplanar points have no handedness: mirrored they are the same points seen from behind, with the
     frame's z axis reversed.
     """
-    freedom, floor = 3.0 * len(measured) - 6.0, _floor(len(measured), noise_m)
+    freedom, floor = 3.0 * len(measured) - 6.0, misfit_by_noise(len(measured), noise_m)
     return (
         float(procrustes_residual(measured, nominal)) + floor,
         float(procrustes_residual(measured, mirrored(nominal))) + floor,
@@ -200,16 +200,13 @@ def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[f
     )
 
 
-def _floor(count: int, noise_m: float) -> float:
-    """Squared misfit [m^2] by noise, added to both sides of a ratio."""
-    return (3.0 * count - 6.0) * max(noise_m, LEAST_NOISE_M) ** 2
-
-
 def _check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
     """Refuses points that are the mirror image of the drawing, at a stated noise [m]."""
     as_drawn, flipped, limit = _hands(pairs.measured, pairs.nominal, noise_m)
     reordered = float(procrustes_residual(pairs.measured, pairs.drawn[numbering.assignment]))
-    if as_drawn <= limit * flipped or flipped > limit * (reordered + _floor(len(pairs), noise_m)):
+    if as_drawn <= limit * flipped or flipped > limit * (
+        reordered + misfit_by_noise(len(pairs), noise_m)
+    ):
         return
     rms_mm = 1e3 * np.sqrt(np.array([as_drawn, flipped]) / len(pairs))
     other = ""
