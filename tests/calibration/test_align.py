@@ -356,7 +356,7 @@ def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     cell = simulate(NetworkOptions(boards=boards, stops=8))
     with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
         aligned(cell)
-    assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
+    assert "let cam_left, cam_right see a board on flange_b" in caught.value.next_step
 
 
 def four_axes_beside_six(b_turns_rad, prior):
@@ -476,23 +476,14 @@ def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     assert reason == "nothing ties cam_apart to the rest of the cell"
 
 
-@pytest.mark.parametrize("camera", [LEFT.camera, slow(fine_camera())])
-def test_a_camera_that_one_standing_view_ties_is_told_what_ties_it_better(camera):
-    far = replace(LEFT, place_m=(0.0, -1.5, 1.6), camera=camera)
+def test_a_camera_that_one_standing_view_ties_is_refused():
+    far = replace(LEFT, place_m=(0.0, -1.5, 1.6))
     boards, cameras = (FLOOR, BoardAt("plate_b", "b")), (far, CameraAt("hand", on="a"))
     cell = simulate(NetworkOptions(cameras=cameras, boards=boards, stops=12, pixel_sigma_px=0.3))
     kept = [sight for sight in cell.sights if (sight.camera, sight.board) != ("hand", "plate_b")]
-    cell = replace(cell, sights=tuple(kept))
-    if camera is LEFT.camera:
-        with pytest.raises(DegenerateError) as caught:
-            aligned(cell)
-        words, advice = caught.value.message, caught.value.next_step
-    else:
-        found = aligned(cell).verdict.findings
-        weak = next(finding for finding in found if finding.kind == "weak_motion")
-        words, advice = weak.words, weak.do.words
-    assert "cam_left sees target_floor from one place alone" in words
-    assert advice == "Let cam_left see a board on flange_a at 5 stops or more, too."
+    with pytest.raises(DegenerateError, match="cam_left") as caught:
+        aligned(replace(cell, sights=tuple(kept)))
+    assert "cam_left" in caught.value.next_step
 
 
 def test_a_camera_that_a_board_ties_either_way_round_is_refused():

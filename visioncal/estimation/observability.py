@@ -116,10 +116,6 @@ class Turning:
         """Whether it turns about two axes."""
         return not self.is_still and not self.has_lone_axis
 
-    def open_offset(self, thing: str, frame: str) -> str:
-        """The offset of a thing in a frame left undetermined by one axis; empty for more axes."""
-        return _words(thing, frame, self.main, is_rotation=False) if self.has_lone_axis else ""
-
     def words(self, flange: FloatArray, stops: str, frame: str) -> str:
         """Words for what is wrong with the motion.
 

@@ -1,7 +1,6 @@
 """Messages on the connectivity of a cell: unconnected frames, and observations to connect them."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +9,6 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
-from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import FEWEST_VIEWS, Turning
 
 
@@ -25,42 +23,27 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str], *, seen: bool =
     Raises:
         DegenerateError: A robot's base is among the unconnected frames.
     """
-    branches = cell.tree.branches
     # Where no row is left, the robot of the reference base is unconnected, too.
     none_left = seen and all(row.seer in lost or row.seen in lost for row in cell.rows)
-    flanges = [
-        branch
-        for branch in branches
-        if branches[branch].robot and (branches[branch].parent in lost or none_left)
-    ]
-    if not flanges:
+    bases = [base for base in cell.tree.bases.values() if base in lost or none_left]
+    if not bases:
         return
-    bases = [branches[flange].parent for flange in flanges]
-    untied = [base for base in bases if base in lost] or [
-        item for item in lost if not branches[item].robot
-    ]
+    untied = [base for base in bases if base in lost] or [*lost]
     advice = [connection_advice(cell, base) for base in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
-    parts = []
     if seen:
         moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
         why = (
             f"the observations that link {robots} to the rest of the cell are too few, too much "
             f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(moves)}"
         )
-        parts = [part for base in bases if base in lost and (part := _undetermined(cell, base))]
-        if parts:
-            why += f", which does not determine {' and '.join(parts)}"
         advice = [
-            f"To tie {base}: {tilting}"
-            if base in lost and (tilting := tilting_advice(cell, base))
-            else other
-            for base, other in zip(bases, advice, strict=True)
+            _tilting_advice(cell, base) or other for base, other in zip(bases, advice, strict=True)
         ]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
-        culprits=parts or untied,
+        culprits=untied,
         next_step=" ".join(advice),
     )
 
@@ -77,27 +60,19 @@ def measuring_advice(cell: Cell, flange: str) -> str:
     )
 
 
-def _undetermined(cell: Cell, base: str) -> str:
-    """The undetermined offset, in words, where the robot on a base turns about one axis only."""
-    stations = _stations(cell, base)
-    if len(stations) < 2:
-        return ""
-    turning = Turning.of(invert(cell.poses[_robot_on(cell, base)][stations]))
-    return turning.open_offset(base, base)
-
-
-def tilting_advice(cell: Cell, base: str) -> str:
+def _tilting_advice(cell: Cell, base: str) -> str:
     """Advice to tilt a robot that was observed often, but never tilted; empty otherwise."""
     stations, robot = _stations(cell, base), _robot_on(cell, base)
-    if len(stations) < FEWEST_VIEWS or Turning.of(invert(cell.poses[robot][stations])).is_enough:
+    if len(stations) < FEWEST_VIEWS:
         return ""
-    flange = cell.tree.flanges[robot]
-    words = (
-        f"add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 degrees about "
-        "different axes, not only about one."
-    )
-    measured = measuring_advice(cell, flange) if _undetermined(cell, base) else ""
-    return f"{words} {measured}".rstrip()
+    turning, flange = Turning.of(invert(cell.poses[robot][stations])), cell.tree.flanges[robot]
+    if turning.is_enough:
+        return ""
+    measured = measuring_advice(cell, flange) if turning.has_lone_axis else ""
+    return (
+        f"To tie {base}: add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 "
+        f"degrees about different axes, not only about one. {measured}"
+    ).rstrip()
 
 
 def _robot_on(cell: Cell, base: str) -> str:
@@ -126,61 +101,26 @@ def _stations(cell: Cell, base: str) -> IntArray:
     return np.array(sorted(stations), dtype=np.int64)
 
 
-def sole_static_view(cell: Cell, frame: str) -> Finding | None:
-    """The view of a fixed board by a fixed camera that alone connects a frame to the rest.
-
-    It counts as one view, however often it is repeated. None where other views connect the frame.
-    """
-    tree = cell.tree
-    moving = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
-    connected = replace(cell, rows=tuple(moving)).connected_frames()
-    pairs = {
-        (row.seer, row.seen)
-        for row in cell.rows
-        if (row.seer in connected) != (row.seen in connected)
-    }
-    pairs = {pair for pair in pairs if not any(step.robot for step in tree.path(*pair))}
-    flange = next((name for name in tree.flanges.values() if name in connected), "")
-    if frame in connected or len(pairs) != 1 or not flange:
-        return None
-    ((camera, board),) = pairs
-    return Finding(
-        "untied",
-        f"{camera} sees {board} from one place alone, and that is one view however often it is "
-        "repeated",
-        Remedy(f"Let {camera} see a board on {flange} at 5 stops or more, too."),
-    )
-
-
 def connection_advice(cell: Cell, frame: str) -> str:
     """Advice on observations that would connect a frame to the rest, in a sentence."""
-    tree = cell.tree
-    carried = [name for name in tree.branches if frame in tree.above(name)]
-    cameras = [name for name in carried if name.startswith("cam")]
-    boards = [name for name in carried if name.startswith("target")]
-    others = [name for name in cell.connected_frames() if name not in carried]
-    seeing = [other for other in others if other.startswith("cam")]
-    lying = [other for other in others if other.startswith("target")]
-    ways = []
-    if boards and seeing:
-        ways.append(f"let {some_of(seeing)} see {some_of(boards)} at 5 stops or more")
-    if cameras and lying:
-        ways.append(f"let {some_of(cameras)} see {some_of(lying)} at 5 stops or more")
-    flange = next(
-        (flange for flange in tree.flanges.values() if tree.branches[flange].parent == frame), ""
-    )
-    if not ways and flange and seeing:
-        ways.append(f"put a board on {flange} and let {some_of(seeing)} see it at 5 stops or more")
-    if not ways and flange and lying:
-        ways.append(f"put a camera on {flange} that sees {some_of(lying)} at 5 stops or more")
+    tree, connected = cell.tree, cell.connected_frames()
     if frame.startswith(("instrument", "point")):
-        ways = [
-            "let an instrument read points on a robot's flange at 5 stops or more, or three points "
-            "that an instrument reads which is tied"
-        ]
-    if not ways:
-        ways.append("let a camera that is tied see a board that hangs on it")
-    return f"To tie {frame}: {', or '.join(ways)}."
+        return (
+            f"To tie {frame}: let an instrument read points on a robot's flange at 5 stops or "
+            "more, or three points that an instrument reads which is tied."
+        )
+    carried = [name for name in tree.branches if frame in tree.above(name)]
+    boards = [name for name in carried if name.startswith("target")]
+    cameras = [name for name in carried if name.startswith("cam")]
+    seers = [name for name in connected if name.startswith("cam") and name not in carried]
+    lying = [name for name in connected if name.startswith("target") and name not in carried]
+    flange = next((end for end in tree.flanges.values() if tree.branches[end].parent == frame), "")
+    if cameras and not boards:
+        who, what = some_of(cameras), some_of(lying) or "a board that is tied"
+    else:
+        who = some_of(seers) or "a camera that is tied"
+        what = some_of(boards) or f"a board on {flange or frame}"
+    return f"To tie {frame}: let {who} see {what} at 5 stops or more."
 
 
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:

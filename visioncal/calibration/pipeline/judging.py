@@ -14,8 +14,6 @@ from visioncal.calibration.pipeline.connectivity import (
     connection_advice,
     measuring_advice,
     robot_motion,
-    sole_static_view,
-    tilting_advice,
 )
 from visioncal.calibration.pipeline.fault_messages import moved_finding
 from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
@@ -106,7 +104,6 @@ def findings_of(run: RunState) -> Findings:
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
-        None if run.mount else _tie(cell_fit.cell, answer.last_edges),
         run.session.corrects_targets,
         _use(run),
     )
@@ -124,15 +121,6 @@ def _use(run: RunState) -> Remedy:
         words, command = "Take the transform to another program", "export OUT --to text"
     again = "visioncal verify compares later stops with it."
     return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")
-
-
-def _tie(cell: Cell, edges: Mapping[str, Edge]) -> Finding | None:
-    """The static view that alone links the worst frame to the rest, if any."""
-    worst = {
-        frame: max(value.sigma / value.limit for value in _directions(cell, frame, edge))
-        for frame, edge in edges.items()
-    }
-    return sole_static_view(cell, max(worst, key=worst.__getitem__)) if worst else None
 
 
 def _with_alternative(finding: Finding, run: RunState) -> Finding:
@@ -400,13 +388,8 @@ def _words_of(run: RunState) -> CellWords:
     """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
     inliers, cell, part = run.cell_fit.inlier_fit, run.cell_fit.cell, run.cell_fit.inlier_problem
     outliers = inliers.problem.subset(~inliers.used)
-    # A robot that was never tilted leaves more undetermined than a static view does.
-    is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
 
     def words(frame: str, culprit: str = "") -> tuple[str, str]:
-        tie = sole_static_view(cell, frame) if is_tilted else None
-        if tie is not None:
-            return tie.words, str(tie.do)
         seen = part.observations_through(frame)
         if not seen.any() and (count := int(outliers.observations_through(frame).sum())):
             return (

@@ -257,12 +257,6 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     elif _is_of_board(judged):
         step = MEASURE_BOARD
         words = f"Frames are {known} is the board's, as well as its size is stated."
-    elif judged.tie is not None:
-        words = (
-            f"Weakly determined, with their sigmas: {named}; doubt begins at {least}. The cause: "
-            f"{judged.tie.words}."
-        )
-        step = judged.tie.do or step
     yield Finding("weak_motion", words, step, is_fatal=is_fatal, until_mm=0.0)
 
 

@@ -96,9 +96,6 @@ class Findings:
     # Error budgets of picks by camera and robot, with targets that are corrected where the arm was
     # calibrated; empty where they are not predicted.
     picks: Sequence[Picks] = ()
-    # The single view of static frames that alone connects the worst frame; None where there are
-    # more.
-    tie: Finding | None = None
     corrects_targets: bool = False  # Whether targets are corrected for a calibrated arm.
     use: Remedy | None = None  # How a good result is used.
 
