@@ -8,7 +8,7 @@ DRAWS = False
 # Inputs that are made within a second, and commands that end soon on them.
 QUICK = {
     "pairs", "pairs.rrd", "out", "touches.csv", "features.csv", "points.csv", "drawing.csv",
-    "frames.json", "policy.toml", "arm.toml", "target.toml", "photo.png", "plan", "tracked",
+    "frames.json", "arm.toml", "target.toml", "photo.png", "plan", "tracked",
     "foreign/kuka_csv", "foreign/visp", "foreign/views_npz",
 }  # fmt: skip
 READ = [reading for reading in READINGS if reading.input in QUICK and "_out]" not in reading.words]

@@ -172,7 +172,6 @@ class VerifyOptions:
     against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
-    policy: Path | None = option("Your own table of when to calibrate again (.toml).")
     output: Path | None = option(
         f"A folder for {REPORT} and {VERIFY}.", "-o", "--output", file_okay=False
     )

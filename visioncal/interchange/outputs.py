@@ -14,7 +14,7 @@ from visioncal.core.files import json_text, write_atomically, write_generation
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
     from visioncal.calibration.run import Run as Calibrated
-    from visioncal.calibration.verification import Check, Outcome
+    from visioncal.calibration.verification import Check, Trigger
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
@@ -108,7 +108,7 @@ def write_outputs(
 
 
 def write_check(
-    folder: Path, check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict", document: str
+    folder: Path, check: "Check", triggers: "Sequence[Trigger]", verdict: "Verdict", document: str
 ) -> Written:
     """Writes a check's page and JSON into a folder; see `write_outputs`."""
 

@@ -90,7 +90,6 @@ READINGS: tuple[Reading, ...] = (
     Reading("verify", "board", "IT --against [board_out]"),
     Reading("verify", "out", "[pairs] --against IT -o NEW"),
     Reading("verify", "arm_out", "[pairs] --against IT -o NEW", sound=3),
-    Reading("verify", "policy.toml", "[pairs] --against [out] --policy IT"),
     *_each("diff", "IT [out]", "out", "arm_out"),
     Reading("diff", "board_out", "[board_out] IT --json"),
     *_each("convert", "IT NEW", "board", "pairs", "sweep", "network", "motions"),
@@ -202,7 +201,7 @@ READINGS: tuple[Reading, ...] = (
 )
 # What a sound input may be exchanged with.
 EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "touches.csv", "frames.json",
-             "target.toml", "photo.png", "arm.toml", "plan", "policy.toml", "dynamics_out",
+             "target.toml", "photo.png", "arm.toml", "plan", "dynamics_out",
              "network_out", "arm.json")  # fmt: skip
 
 

@@ -311,7 +311,6 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "drawing.csv": _drawing,
     "targets.csv": _targets,
     "frames.json": _frames,
-    "policy.toml": _packaged("calibration/verification/policy.toml"),
     "arm.toml": _packaged("robot/models/ur10e.toml"),
     "arm.json": _command("export", "[arm_out]", "--to", "robot-json", "-o"),
     "arm.urdf": _command("export", "[arm_out]", "--to", "robot-urdf", "-o"),

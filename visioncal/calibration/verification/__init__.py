@@ -2,16 +2,14 @@
 
 from visioncal.calibration.verification.check import Check, Suspect, verify
 from visioncal.calibration.verification.messages import to_document, verdict_of
-from visioncal.calibration.verification.policy import Outcome, Trigger, load_policy, outcomes
+from visioncal.calibration.verification.triggers import Trigger, triggers_of
 
 __all__ = [
     "Check",
-    "Outcome",
     "Suspect",
     "Trigger",
-    "load_policy",
-    "outcomes",
     "to_document",
+    "triggers_of",
     "verdict_of",
     "verify",
 ]

@@ -19,7 +19,7 @@ from visioncal.calibration.verification.change_hypotheses import (
     VIEW,
 )
 from visioncal.calibration.verification.check import Check, Suspect
-from visioncal.calibration.verification.policy import Outcome
+from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.finding_kinds import AGREEMENT
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted, figure, listed
@@ -299,13 +299,13 @@ def _sentence(text: str) -> str:
 
 
 def to_document(
-    check: Check, triggers: Sequence[Outcome], verdict: Verdict | None = None
+    check: Check, triggers: Sequence[Trigger], verdict: Verdict | None = None
 ) -> dict[str, Any]:
     """Converts a check to a JSON document; unknown values are absent.
 
     Args:
         check: The check.
-        triggers: Evaluation of the policy's triggers.
+        triggers: Evaluation of the reasons to calibrate again.
         verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
     """
     calibration, observed = check.calibration, check.predicted.observed

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
 from visioncal.calibration.verification.messages import change_words, listed_suspects
-from visioncal.calibration.verification.policy import Outcome
+from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
@@ -31,7 +31,7 @@ _BAR, _MOST_LABELS = 0.38, 20
 _STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
 
 
-def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
+def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) -> str:
     """Renders the page of a check as HTML text."""
     change = check.named[0] if check.named else None
     # The change that can be undone, unlike mere noise.
