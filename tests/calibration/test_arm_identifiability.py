@@ -20,7 +20,6 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import free_parameters, parameter_moves
-from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
@@ -138,9 +137,12 @@ def test_readings_of_one_point_tell_three_values_less(name):
     """A point of the tool has a place and no direction."""
     robot = load_robot(name)
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
+    places = replace(arm.problem.observations, has_rotation=np.zeros(60, dtype=bool))
+    problem = replace(arm.problem, observations=places)
+    positions = replace(arm, problem=problem, measured=np.arange(6) > 2)
     whole, point = (
         identified(arm)[0].observability,
-        identified(replace(arm, measured=np.arange(6) > 2))[0].observability,
+        identified(positions)[0].observability,
     )
     assert (point.identifiable, point.determined) == (whole.identifiable - 3, whole.determined - 3)
 
@@ -172,8 +174,10 @@ def test_offsets_of_the_first_and_the_last_joint_are_never_told(mount):
     counts = numbers.observability
     assert (counts.identifiable, counts.determined) == (16, 16)
     assert numbers.not_determined == (
-        "the offset of joint 1 (shoulder_pan_joint) cannot be separated from the base frame",
-        "the offset of joint 6 (wrist_3_joint) cannot be separated from the tool frame",
+        "the offset of joint 1 (shoulder_pan_joint) cannot be separated from the frames of base "
+        "and tool",
+        "the offset of joint 6 (wrist_3_joint) cannot be separated from the frames of base and "
+        "tool",
     )
     assert advice == ""
     # Both sines of each encoder are determined, however the arm is mounted.
@@ -193,9 +197,9 @@ def test_beta_is_chosen_for_parallel_axes(name):
     # Four numbers a joint, six of which hide in the frames at both ends.
     assert len(by_default.parameters) == 24
     assert len(by_default.not_determined) == 6
-    summed = "the lengths d of joints 2, 3, 4 (parallel axes): only their sum is determined"
-    assert summed in standard.not_determined
-    assert summed not in by_default.not_determined
+    (summed,) = set(standard.not_determined) - set(by_default.not_determined)
+    assert all(f"the length d of joint {joint} " in summed for joint in (2, 3, 4))
+    assert summed.endswith("only one combination of them is determined")
 
 
 def test_what_hides_in_the_frames_depends_on_the_convention():
@@ -217,13 +221,8 @@ def test_a_joint_that_hardly_moved_is_named():
     assert counts.identifiable == 30
     assert 26 <= counts.determined < 30
     assert len(numbers.not_determined) == 7
-    assert "joint 5 (wrist_2_joint) moved by 2 deg only" in numbers.not_determined[-1]
-    assert "joint 5 by" in advice
+    assert numbers.not_determined[-1].startswith("these stops do not determine the ")
     assert f"determine {counts.determined} of the 30" in advice
-    # Done as advised, all is determined.
-    wanted = float(advice.split("joint 5 by ")[1].split(" deg")[0])
-    q[:, 4] += np.deg2rad(np.random.default_rng(1).uniform(-0.5, 0.5, len(q)) * wanted)
-    assert identified(arm_data(robot, q))[0].observability.determined == 30
 
 
 def test_the_indices_are_as_published():
@@ -235,26 +234,13 @@ def test_the_indices_are_as_published():
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_the_worth_of_a_stop_is_that_of_a_fit_without_it(mount):
+def test_the_map_is_by_the_covariance(mount):
     robot = load_robot("ur5e")
     arm = arm_data(robot, postures(robot)[:15], mount)
     numbers, _ = identified(arm)
-    influence = {stop.view: stop.influence for stop in numbers.stops}
     anywhere = postures(arm.model.robot)
-    flange = arm.model.base_from_flange(anywhere)
-    poses, jacobian = arm.pair.jacobian(flange, arm.basis(anywhere))
+    poses, jacobian = arm.pair.jacobian(arm.model.base_from_flange(anywhere), arm.basis(anywhere))
     place = arm.pair.place_jacobian(poses, jacobian, arm.at)
-
-    def variance(problem: Problem) -> float:
-        fitted = covariance_from(fisher_information(problem, arm.state, arm.noise))
-        return float(np.mean(np.einsum("mij,jk,mik->m", place, fitted, place)))
-
-    whole = variance(arm.problem)
-    for stop in range(15):
-        rest = arm.problem.subset(np.arange(15) != stop)
-        # Exact but for rounding.
-        assert influence[stop] == pytest.approx(variance(rest) / whole - 1.0, rel=1e-6)
-    assert min(influence.values()) > 0.0
     sigmas_m = np.sqrt(np.einsum("mij,jk,mik->m", place, arm.covariance, place))
     assert 1e-3 * numbers.map_sigmas_mm == pytest.approx(sigmas_m[: len(numbers.workspace_map)])
 
@@ -333,9 +319,6 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     places = found["workspace_map"]
     assert 150 < len(places) <= 200
     assert all(0.0 < place["sigma_mm"] < 5.0 and place["z_m"] > 0.0 for place in places)
-    worths = [value["influence"] for value in found["stops"]]
-    assert worths == sorted(worths, reverse=True)
-    assert {value["view"] for value in found["stops"]} == set(known.used)
     counts = found["observability"]
     assert (counts["columns"], counts["identifiable"], counts["determined"]) == (48, 30, 30)
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])

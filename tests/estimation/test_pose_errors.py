@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 
 from visioncal.core.transforms import adjoint, exp, invert, log
-from visioncal.estimation import pose_errors
 from visioncal.estimation.arm import SIGNIFICANT, misfit_covariance
 from visioncal.estimation.chain import chain
-from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
+from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import (
     covariance_of,
     fit_problem,
-    solve_problem,
 )
 
 X, Z = exp(np.array([0.1, -0.2, 0.3, 0.03, -0.05, 0.09])), exp(np.array([0, 0, 0, 0.6, 0.1, 0.0]))
@@ -134,31 +132,3 @@ def test_many_stops_are_put_by_some_columns():
 def test_too_few_stops_say_nothing():
     problem, fit = fitted(white, 0, stops=5)
     assert find_pose_errors(problem, fit.state, fit.noise, ROBOT) is None
-
-
-@pytest.mark.parametrize("errors", [white, lasting, smooth])
-def test_looks_at_other_postures_err_by_what_is_predicted(errors):
-    ratios = []
-    for seed in range(8):
-        problem, fit = fitted(errors, seed)
-        found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-        there, predicted = left_out_clusters(problem, fit.state, fit.noise, ROBOT, found) ** 2
-        ratios.append(there / predicted)
-    # Of 8 x 22 looks at three axes each, and errors that look alike in a cluster: known to 0.3.
-    assert 0.5 < np.mean(ratios) < 1.6
-
-
-def test_clusters_are_left_out_as_a_fit_without_them_predicts():
-    problem, fit = fitted(smooth, 3)
-    found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-    away = left_out_clusters(problem, fit.state, fit.noise, ROBOT, found)[0]
-    squares, clusters = np.zeros(2), pose_errors.posture_clusters(problem.poses[ROBOT])
-    assert sorted(set(clusters.tolist())) == [0, 1, 2, 3, 4]
-    for cluster in range(5):
-        held = clusters[problem.observations.stops] == cluster
-        state, _ = solve_problem(problem.subset(~held), fit.state, fit.noise)
-        left_out = problem.subset(held)
-        off = log(invert(left_out.predicted(state)) @ left_out.measured(state))
-        squares += np.sum(off.reshape(-1, 2, 3) ** 2, axis=(0, 2))
-    # What the refit has beyond the first order is of the square of errors of 3e-4.
-    assert np.allclose(away, np.sqrt(squares / len(problem)), rtol=1e-2)

@@ -13,8 +13,6 @@ from visioncal.robot import Robot, load_robot
 # What the parameters' changes are, with their sigmas: one sure, one chance, one held.
 SURE, CHANCE = (1.2e-3, 1e-4), (-2e-4, 1.5e-4)
 NOT_TOLD = "the offset of <b>shoulder_pan_joint</b> cannot be separated from the base frame"
-# The order of worth: view 5 most, view 0 least.
-WORTH = {5: 0.31, 4: 0.2, 7: 0.12, 2: 0.08, 1: 0.05, 8: 0.04, 0: 0.003}
 WORKSPACE_MM = {"median": 0.071, "p95": 0.14}
 
 
@@ -72,7 +70,6 @@ def calibrated() -> dict[str, Any]:
         "observability": {"columns": 48, "identifiable": 30, "determined": 29, "condition": 54.2}
         | {"o1": 0.21, "o2": 0.0184, "o3": 0.0031, "o4": 6e-5, "o5": 0.0012},
         "not_determined": [NOT_TOLD],
-        "stops": [{"view": view, "influence": influence} for view, influence in WORTH.items()],
         "left_out": [_unseen(view) for view in (0, 1, 2, 4, 5, 7, 8)],
     }
 

@@ -70,7 +70,7 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
 
 
 def identified(data, convention=None):
-    """The arm's section with its parameters, and which stops to add; stops are views 0, 1 ..."""
+    """The arm's section with its parameters, and which stops to add."""
     level = ArmLevel(level="nominal", unknowns=0, rms_mm=0.0, held_out_mm=0.0, likelihood_ratio=0.0)
     result = ArmResult(level="nominal", levels=(level,))
-    return add_parameters(result, data, range(len(data.stops)), convention)
+    return add_parameters(result, data, convention)

@@ -55,9 +55,6 @@ class ArmErrors:
     # (2,) noise of the fit: white noise and errors together as single stops show them, without what
     # is the same at all stops. None of links.
     fit_sigmas: FloatArray | None = None
-    # (2, 2) errors at postures far from all others of the fit, of rotation [rad] and position [m],
-    # measured and predicted; see `pose_errors.left_out_clusters`. None where that is not known.
-    far_posture_errors: FloatArray | None = None
     # Number of errors, the last ones, that are correlated in time; the others are correlated over
     # the posture. At another time they have other values.
     time_correlated_count: int = 0

@@ -6,25 +6,25 @@ prior to measurement sigma of a direction: over one, it is determined. Observabi
 the same singular values.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import svd
 
 from visioncal.core.number_format import listed
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
-from visioncal.estimation.workspace import turning_range
-from visioncal.robot import Robot, parallel_axes
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
+from visioncal.robot import Robot
 
 # Directions whose singular value is below this share of the largest are unidentifiable; entries of
 # a null direction below the second share of its largest are rounding.
 _LEAST_SHARE, _NOTHING = 1e-7, 1e-6
 # Least share of the largest change for a parameter to be named, and most named.
 _NAMED_SHARE, _MOST_NAMED = 0.5, 3
-# Tried ranges of a joint; of prismatic ones in metres.
-_SPANS_RAD = tuple(np.deg2rad([30.0, 60.0, 120.0, 240.0]).tolist())
 _WORDS = {
     "theta": "offset",
     "d": "length d",
@@ -44,6 +44,33 @@ class Jacobians:
     frames: FloatArray  # (r, f) by the frames.
     arm: FloatArray  # (r, p) by the arm's errors, in units of their prior size.
 
+    @classmethod
+    def of_stops(
+        cls,
+        problem: Problem,
+        state: State,
+        noise: Noise,
+        frames: IntArray,
+        arm: IntArray,
+        size: float,
+    ) -> "Jacobians":
+        """Root of the information of all observations, without priors.
+
+        Args:
+            problem: The observations.
+            state: The linearisation point.
+            noise: Noise levels.
+            frames: (f,) columns of the frames.
+            arm: (p,) columns of the arm's errors.
+            size: Their prior size.
+        """
+        both = np.concatenate([frames, arm])
+        information = fisher_information(problem, state, noise)
+        information -= problem.prior_information(state).information
+        values, vectors = np.linalg.eigh(information[np.ix_(both, both)])
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        return cls(root[:, : len(frames)], size * root[:, len(frames) :])
+
     def free(self) -> tuple[int, FloatArray]:
         """Rank of the frames, and (r, p) the arm's Jacobian projected off them.
 
@@ -60,11 +87,6 @@ class Jacobians:
         rank, free = self.free()
         padded = np.vstack([free, np.zeros((free.shape[1],) * 2)])
         return rank, *_singular(np.asarray(np.linalg.qr(padded, mode="r")))[1:]
-
-    def count_determined(self) -> int:
-        """Number of directions determined better than the prior."""
-        rank, sizes, _ = self.spectrum()
-        return rank + int(np.sum(sizes > 1.0))
 
 
 def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -138,19 +160,13 @@ def null_words(jacobian: Jacobians, named: Sequence[Parameter], robot: Robot) ->
     directions = _echelon(vectors[sizes <= _LEAST_SHARE * sizes[0]])
     for rows, involved in _connected(directions):
         parameters = [named[index] for index in involved]
-        if len(parameters) == 1:
-            moved = jacobian.arm @ directions[rows[0]]
-            frames = np.linalg.lstsq(jacobian.frames, moved, rcond=_LEAST_SHARE)[0]
-            base, tool = np.linalg.norm(frames.reshape(2, 6), axis=1)
-            end = "tool" if tool > base else "base"
-            yield f"{_thing(parameters[0], robot)} cannot be separated from the {end} frame"
-        elif _is_sum(directions[rows][:, involved], parameters):
-            yield f"{_summed(parameters, robot)}: only their sum is determined"
+        things = listed([_thing(parameter, robot) for parameter in parameters])
+        if len(parameters) == len(rows):
+            yield f"{things} cannot be separated from the frames of base and tool"
         else:
             left = len(parameters) - len(rows)
-            of_them = "one combination" if left == 1 else f"{left} combinations"
-            words = listed([_thing(parameter, robot) for parameter in parameters])
-            yield f"{words}: only {of_them} of them {'is' if left == 1 else 'are'} determined"
+            of_them = "one combination of them is" if left == 1 else f"{left} combinations are"
+            yield f"{things}: only {of_them} determined"
 
 
 def _echelon(rows: FloatArray) -> FloatArray:
@@ -177,21 +193,6 @@ def _connected(directions: FloatArray) -> list[tuple[list[int], list[int]]]:
         groups.append((rows, columns))
     ordered = sorted(groups, key=lambda pair: min(pair[1]))
     return [(rows, sorted(columns)) for rows, columns in ordered]
-
-
-def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
-    """Whether the null directions preserve the sum alone, of parameters of one kind."""
-    is_one_kind = len({parameter.kind for parameter in named}) == 1
-    is_preserved = np.abs(directions.sum(axis=1)).max() < _NOTHING
-    return is_one_kind and len(directions) == len(named) - 1 and bool(is_preserved)
-
-
-def _summed(named: Sequence[Parameter], robot: Robot) -> str:
-    joints = [parameter.joint for parameter in named]
-    first, *rest = _WORDS[named[0].kind].split(" ")
-    things = " ".join([f"{first}s", *rest])
-    why = " (parallel axes)" if parallel_axes(robot)[joints[0] : joints[-1]].all() else ""
-    return f"the {things} of joints {', '.join(str(joint + 1) for joint in joints)}{why}"
 
 
 def joint_words(joint: int, robot: Robot) -> str:
@@ -221,60 +222,3 @@ def missing_parameters(
     kept = sorted(index for index in largest if sizes[index] >= _NAMED_SHARE * sizes.max())
     words = [_thing(named[index], robot) for index in kept]
     return listed([*words, "others"] if len(words) < changes.shape[1] else words)
-
-
-@dataclass(frozen=True)
-class Move:
-    """A joint that has to move over a wider range."""
-
-    joint: int  # Index from 0.
-    moved: float  # Its range over the stops [rad or m].
-    wanted: float  # Sufficient range, all other joints unchanged [rad or m].
-
-
-def joints_to_move(
-    robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], missing: int
-) -> tuple[Move, ...]:
-    """Finds joints whose wider range would determine what is missing.
-
-    A joint is moved evenly over a wider range, in an order independent of the other joints. The
-    joint that determines everything with the least range is chosen; else the best one, and then
-    another.
-
-    Args:
-        robot: The arm.
-        q: (m, n) joint angles of the stops [rad].
-        count: Number of directions that stops at given joint angles determine.
-        missing: Number of further directions to determine.
-
-    Returns:
-        The joints; none where no joint alone would help.
-    """
-    moves: list[Move] = []
-    determined = count(q)
-    wanted = determined + missing
-    while determined < wanted:
-        moved = np.ptp(q, axis=0)
-        tried: dict[Move, int] = {}
-        for span in _SPANS_RAD:
-            for joint in np.flatnonzero(moved < span).tolist():
-                move = Move(joint, float(moved[joint]), span)
-                tried[move] = count(_range_of(robot, q, move))
-            if max(tried.values(), default=0) >= wanted:
-                break
-        # Ties: the least wanted range, then the least present range.
-        ranked = sorted(tried, key=lambda value: (-tried[value], value.wanted, value.moved))
-        if not ranked or tried[ranked[0]] <= determined:
-            break
-        moves.append(ranked[0])
-        q, determined = _range_of(robot, q, ranked[0]), tried[ranked[0]]
-    return tuple(moves)
-
-
-def _range_of(robot: Robot, q: FloatArray, move: Move) -> FloatArray:
-    lower, upper = (limit[move.joint] for limit in turning_range(robot))
-    middle = 0.5 * (q[:, move.joint].min() + q[:, move.joint].max())
-    evenly = np.clip(middle + move.wanted * np.linspace(-0.5, 0.5, len(q)), lower, upper)
-    widened = q.copy()
-    widened[:, move.joint] = evenly[np.random.default_rng(move.joint).permutation(len(q))]
-    return widened

@@ -25,11 +25,9 @@ from scipy.linalg import block_diag
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
-from visioncal.estimation.budget import less_noise
-from visioncal.estimation.linalg import covariance_among, gram
+from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, stops_of
+from visioncal.estimation.linalg import gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, CommonRows, MixedModel, Units
-from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import ratio_prior, robot_likelihood
@@ -58,8 +56,6 @@ _ONE_BLOCK, _BLOCK, _MOST_TIES = 200, 96, 16
 _MOST_COLUMNS = 360
 # Least information of stops on a combination of these, over its prior, and most combinations.
 _FAINT, _MOST_COMBINED = 0.1, 96
-# Number of posture clusters for cross-validation.
-_CLUSTERS = 5
 # Variances below this share of the total are rounding.
 _FACTORED = 1e-6
 # Start of a process's size in units of the noise, the size that counts as zero, and one near it.
@@ -166,54 +162,6 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         fit_sigmas=levels,
         time_correlated_count=lasting,
     )
-
-
-def left_out_clusters(
-    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
-) -> FloatArray | None:
-    """Cross-validated errors at postures far from those of the fit.
-
-    The stops are clustered by posture, and each cluster is predicted from a fit to the others: to
-    first order, with the noise and the errors estimated from all.
-
-    Returns:
-        (2, 2) root mean squares of rotation [rad] and position [m], measured and predicted; None
-        for too few stops.
-    """
-    stops, rows = stops_of(problem, robot), np.flatnonzero(rows_of(problem, robot))
-    if len(stops) < 2 * _CLUSTERS:
-        return None
-    cluster_of_stop = posture_clusters(problem.poses[robot][stops])
-    clusters = cluster_of_stop[np.searchsorted(stops, problem.observations.stops[rows])]
-    widened = problem.with_effects([*problem.effects, errors.effect(robot)])
-    widened_state = State(state.edges, np.append(state.values, np.zeros(errors.basis.shape[2])))
-    size, squares, levels = problem.size, np.zeros((2, 2, 3)), noise.robots.copy()
-    white = levels[problem.robots.index(robot)] if errors.white is None else errors.white
-    levels[problem.robots.index(robot)] = white
-    noise_beside = replace(noise, robots=levels)
-    linear = widened.linear(widened_state)
-    covariances = widened.total_covariance(linear, noise_beside)
-    for cluster in range(_CLUSTERS):
-        held = rows[clusters == cluster]
-        kept = ~np.isin(np.arange(len(problem)), held)
-        information, gradient = normal_equations(widened, widened_state, noise, among=kept)
-        fitted = covariance_among(information[:size, :size], problem.moving)
-        jacobian, by_arm = np.split(linear.jacobian_of(held), [size], axis=2)
-        residuals = linear.residuals[held] - jacobian @ (fitted @ gradient[:size])
-        by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
-        fitted = fitted + less_noise(problem.subset(kept), state, noise, robot, white)
-        predicted = covariances[held]
-        predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
-        predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
-        squares[0] += np.sum(residuals**2, axis=0).reshape(2, 3)
-        squares[1] += np.sum(np.diagonal(predicted, axis1=1, axis2=2), axis=0).reshape(2, 3)
-    return np.asarray(np.sqrt(squares.sum(axis=2) / len(rows)))
-
-
-def posture_clusters(poses: FloatArray) -> IntArray:
-    """(s,) cluster of each of (s, 4, 4) postures: the nearest of five that are far apart."""
-    distance_sq = _squared_distances(poses)
-    return np.asarray(np.argmin(distance_sq[spread_postures(poses, _CLUSTERS)], axis=0))
 
 
 def spread_postures(poses: FloatArray, count: int) -> IntArray:

@@ -353,44 +353,6 @@ def left_out_residuals(
     return deletion
 
 
-def whitened(
-    problem: Problem,
-    state: State,
-    noise: Noise,
-    measured: Mask | None = None,
-    *,
-    ideal: bool = True,
-) -> tuple[FloatArray, FloatArray]:
-    """Whitened residuals (n, d) and their Jacobian (n, d, p).
-
-    The Gram matrix of the Jacobian is the information without the priors. Rows of a unit are
-    decorrelated from those before them.
-
-    Args:
-        problem: The observations.
-        state: The linearisation point.
-        noise: Noise levels.
-        measured: (6,) mask of the d pose components to include; None for all.
-        ideal: See `Problem.linear`.
-    """
-    linear, own = problem.linear(state, ideal=ideal), problem.covariance(noise)
-    kept = np.flatnonzero(np.ones(6, dtype=bool) if measured is None else measured)
-    rows = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    rows, by_errors = rows[:, kept], linear.by_errors[:, kept]
-    own = own[:, kept][:, :, kept]
-    total = problem.total_covariance(linear, noise)[:, kept][:, :, kept]
-    white = np.asarray(np.linalg.solve(np.linalg.cholesky(total), rows))
-    errors = problem.error_covariance(noise)
-    for unit, members in problem.shared_units:
-        jacobian = by_errors[members].reshape(len(members) * len(kept), -1)
-        covariance = block_diag(*own[members]) + jacobian @ errors[unit] @ jacobian.T
-        flat = rows[members].reshape(len(jacobian), -1)
-        white[members] = np.linalg.solve(np.linalg.cholesky(covariance), flat).reshape(
-            rows[members].shape
-        )
-    return white[:, :, -1], white[:, :, :-1]
-
-
 def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
     """Squared Mahalanobis distances (n,) of the residuals by the noise alone, unknowns held."""
     linear = problem.linear(solution.state)

@@ -38,8 +38,6 @@ _SYMBOLS = {
 _UNITS = {"_m": ("mm", 1e3), "_rad": ("\N{DEGREE SIGN}", float(np.rad2deg(1.0)))}
 # Decimals without a sigma: about a hundredth of an arm's repeatability.
 _DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
-# Number of most influential stops that are listed, beside the least influential one.
-_MOST_INFLUENTIAL = 5
 
 
 def joint_words(name: str) -> str:
@@ -64,16 +62,7 @@ def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
         _size(errors.sigma_mm, errors.sigma_deg),
     )
     ratio = Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15")
-    facts = (off_by, ratio, Fact("its errors were", *treatment))
-    if errors.away_mm is None or errors.away_deg is None:
-        return facts
-    predicted = _size(errors.away_predicted_mm, errors.away_predicted_deg)
-    away = Fact(
-        "at postures away from the views it errs by",
-        _size(errors.away_mm, errors.away_deg),
-        f"parts of the postures left out in turn; predicted {predicted}",
-    )
-    return (off_by, away, *facts[1:])
+    return (off_by, ratio, Fact("its errors were", *treatment))
 
 
 def _size(mm: float | None, deg: float | None) -> str:
@@ -167,17 +156,6 @@ def spring_table(elastic: ElasticResult) -> Table:
         sigma_words = "" if sigma is None else f"{PLUS_MINUS} {significant(1e-3 * sigma)}"
         rows.append((joint_words(joint.joint), stiffness_words, sigma_words, f"{low} to {high}"))
     return Table.of(("joint", "stiffness [kN m/rad]", "sigma", "torque [N m]"), rows, (0, 2))
-
-
-def stop_table(arm: ArmResult) -> Table | None:
-    """Growth of the variance without the most influential stops, and the least influential."""
-    most, least = arm.stops[:_MOST_INFLUENTIAL], arm.stops[_MOST_INFLUENTIAL:][-1:]
-    labelled = [*((item, "") for item in most), *((item, ", the least") for item in least)]
-    rows = [
-        (f"view {stop.view}{suffix}", f"{significant(100.0 * max(stop.influence, 0.0))} %")
-        for stop, suffix in labelled
-    ]
-    return Table.of(("without", "grows by"), rows) if rows else None
 
 
 def hours(thermal: ThermalResult, stamp_s: float) -> float:

@@ -183,14 +183,6 @@ class Observability:
     o5: float | None = None  # Inverse of the sum of the inverse singular values.
 
 
-@dataclass(frozen=True)
-class StopInfluence:
-    """A stop by its view, and the relative growth of the mean variance without it."""
-
-    view: int
-    influence: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class UnseenView:
     """Residual of a view that the fit left out, by nominal and calibrated arm."""
@@ -231,7 +223,6 @@ class ArmResult(Section):
     measured: tuple[JointRange, ...] = ()  # Ranges of the joints at the stops.
     observability: Observability | None = None  # Observability of the parameters at the stops.
     not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.
-    stops: tuple[StopInfluence, ...] = ()  # The stops by influence, largest first.
     # Residuals of views that were left out of the fit in turn.
     left_out: tuple[UnseenView, ...] = ()
     # Residuals of views that the session holds out of every fit.
@@ -281,12 +272,6 @@ class ArmErrorsResult(Section):
     # `flange` where joints are unknown and the sizes are those of the flange's errors, beside its
     # noise; None where they are those of links.
     of: Literal["flange"] | None = None
-    # Position error at postures away from the views (rms), from leaving out parts of the postures
-    # in turn; None where unknown [mm].
-    away_mm: float | None = None
-    away_deg: float | None = None  # The same in rotation [deg].
-    away_predicted_mm: float | None = None  # Prediction of `away_mm` [mm].
-    away_predicted_deg: float | None = None  # Prediction of `away_deg` [deg].
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
+from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -235,8 +235,7 @@ def with_pose_errors(
             return errors
         # What grows with time, reach or gravity is another at a pick, and in another session.
         varies = random_effect_rms(problem, fit.state, name)
-        far = left_out_clusters(problem, fit.state, fit.noise, name, errors)
-        return replace(errors, white=np.hypot(errors.white, varies), far_posture_errors=far)
+        return replace(errors, white=np.hypot(errors.white, varies))
 
     return {
         name: arm if arm.is_modelled else replace(arm, errors=found(name))

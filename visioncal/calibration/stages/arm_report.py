@@ -9,7 +9,6 @@ from visioncal.calibration.guess.joints import JointReading
 from visioncal.calibration.stages import elastic
 from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.core.choices import Convention
-from visioncal.core.number_format import figure, listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask
@@ -20,8 +19,6 @@ from visioncal.estimation.identifiability import (
     Identifiability,
     Indices,
     Jacobians,
-    joint_words,
-    joints_to_move,
     missing_parameters,
     null_words,
 )
@@ -31,8 +28,6 @@ from visioncal.estimation.parameters import (
     parameter_moves,
 )
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import whitened
-from visioncal.estimation.stop_influence import stop_influence
 from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,
@@ -45,11 +40,10 @@ from visioncal.results.arm import (
     JointRange,
     Observability,
     Region,
-    StopInfluence,
     WorkspacePlace,
     WorkspaceSigma,
 )
-from visioncal.robot import Robot, convert_table, parallel_axes, table_from_document, table_of
+from visioncal.robot import convert_table, parallel_axes, table_from_document, table_of
 
 # Number of postures of a map of the accuracy, and of angles per turn of joint error functions.
 _PLACES, _ANGLES = 200, 180
@@ -101,7 +95,7 @@ def report_of(
     )
     # With backlash and compliance alone the table stays nominal.
     if model.weights.keys() & set(RIGID):
-        result, advice = add_parameters(result, arm, views, convention, zero)
+        result, advice = add_parameters(result, arm, convention, zero)
         with one_blas_thread():
             carried = _carries_over(arm, levels)
         result = replace(result, left_out=levels.left_out(), carries_over=carried)
@@ -116,7 +110,6 @@ def report_of(
 def add_parameters(
     result: ArmResult,
     arm: ArmData,
-    views: Sequence[int],
     convention: Convention | None = None,
     zero: JointReading | None = None,
 ) -> tuple[ArmResult, str]:
@@ -125,7 +118,6 @@ def add_parameters(
     Args:
         result: The arm's section of a calibration.
         arm: The observations of the arm.
-        views: (m,) the view of each stop.
         convention: Convention of the table; None for the stated one, or Hayati's where axes are
             nearly parallel, as it has no singularity there.
         zero: Reading of a joint with a lost zero.
@@ -146,9 +138,10 @@ def add_parameters(
     near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
     with one_blas_thread():
         weight = arm.pair.weight(arm.noise, arm.measured)
-        whole = whitened(arm.problem, arm.state, arm.noise, arm.measured)[1]
-        whole = whole.reshape(-1, arm.problem.size)
-        errors = whole[:, arm.columns[model.is_kept]] * arm.error_rad
+        columns = arm.columns[model.is_kept]
+        by_stops = Jacobians.of_stops(
+            arm.problem, arm.state, arm.noise, arm.frames, columns, arm.error_rad
+        )
         by_errors = _error_jacobians(arm, anywhere, weight)
         units = [parameter.unit for parameter in parameters]
         by_parameters = _pair_jacobians(
@@ -157,43 +150,19 @@ def add_parameters(
             parameter_jacobian(before, parameters, anywhere, model.flange_from_reported) * units,
             weight,
         )
-        counts = Identifiability.of(Jacobians(whole[:, arm.frames], errors), by_errors)
+        counts = Identifiability.of(by_stops, by_errors)
         not_determined = list(null_words(by_parameters, parameters, nominal))
         if counts.missing.size:
-            moves = joints_to_move(
-                model.robot,
-                arm.q,
-                lambda q: _error_jacobians(arm, q, weight).count_determined(),
-                counts.identifiable - counts.determined,
-            )
             named = missing_parameters(
                 by_parameters, by_errors, counts.missing, parameters, nominal
             )
-            wanted = [
-                f"joint {move.joint + 1} by {_distance_words(move.wanted, move.joint, nominal)}"
-                for move in moves
-            ]
-            moved = [
-                f"{joint_words(move.joint, nominal)} moved by "
-                f"{_distance_words(move.moved, move.joint, nominal)} only"
-                for move in moves
-            ]
-            not_determined.append(
-                f"{listed(moved)}, too little to determine {named}"
-                if moved
-                else f"these stops do not determine {named}"
-            )
-            further = f"that move {listed(wanted)} or more" if wanted else "all over the workspace"
+            not_determined.append(f"these stops do not determine {named}")
             advice = (
                 f"The stops determine {counts.determined} of the {counts.identifiable} "
                 f"identifiable values of this arm and its frames: {not_determined[-1]}. What is "
-                f"not determined stays about as stated. Add stops {further}."
+                "not determined stays about as stated. Add stops all over the workspace."
             )
-        place = arm.place_jacobian(anywhere)[0]
         sigmas_mm, near_mm = (1e3 * arm.place_sigmas_m(array) for array in (anywhere, near))
-        influence = stop_influence(
-            arm.problem, arm.state, arm.noise, arm.stops, place, arm.chain
-        ).tolist()
         jacobian = parameter_moves(model, after, parameters)
         covariance = arm.arm_covariance
         sigmas = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)).tolist()
@@ -217,7 +186,6 @@ def add_parameters(
         )
     indices = Indices.of(counts.values, len(arm.stops)) if len(counts.values) else None
     figures = {} if indices is None else {"condition": indices.condition, **vars(indices)}
-    ordered = sorted(zip(influence, views, strict=True), key=lambda pair: -pair[0])
     maps = (
         np.column_stack([model.robot.base_from_flange(q)[:, :3, 3], mm])[:_PLACES].tolist()
         for q, mm in ((anywhere, sigmas_mm), (near, near_mm))
@@ -239,7 +207,6 @@ def add_parameters(
             **figures,
         ),
         not_determined=tuple(not_determined),
-        stops=tuple(StopInfluence(view, share) for share, view in ordered),
     )
     return result, advice
 
@@ -257,12 +224,6 @@ def _pair_jacobians(
     by_flange = weight @ pair.at(flange)[0].by_errors
     frames, arm = by_flange @ pair.frame_jacobian(flange), by_flange @ flange_jacobian
     return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, flange_jacobian.shape[2]))
-
-
-def _distance_words(distance: float, joint: int, robot: Robot) -> str:
-    if robot.chain.prismatic[joint]:
-        return f"{figure(1e3 * distance)} mm"
-    return f"{figure(float(np.rad2deg(distance)))} deg"
 
 
 def _functions_of(arm: ArmData, levels: SelectedArmLevel) -> JointFunctions | None:

@@ -412,22 +412,12 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     if errors.fit_sigmas is not None and errors.white is not None:
         sigmas = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
     deg, mm = (sigmas * units).tolist()
-    result = ArmErrorsResult(
+    return ArmErrorsResult(
         sigma_mm=mm,
         sigma_deg=deg,
         likelihood_ratio=errors.gain,
         estimated=errors.is_estimated,
         of="flange" if is_of_flange else None,
-    )
-    if not is_of_flange or errors.far_posture_errors is None:
-        return result
-    deg, mm, predicted_deg, predicted_mm = (errors.far_posture_errors * units).ravel().tolist()
-    return replace(
-        result,
-        away_mm=mm,
-        away_deg=deg,
-        away_predicted_mm=predicted_mm,
-        away_predicted_deg=predicted_deg,
     )
 
 

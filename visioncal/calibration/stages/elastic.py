@@ -14,7 +14,6 @@ from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.estimation.solve import whitened
 from visioncal.results.arm import (
     ElasticResult,
     Factor,
@@ -106,13 +105,13 @@ def _corrections(arm: ArmData) -> FloatArray:
     A partial residual of a regression (Larsen and McCleary 1972) is the fitted bend plus the
     residual, weighted by its covariance, along the joint.
     """
-    residuals, jacobian = whitened(arm.problem, arm.state, arm.noise, ideal=False)
-    columns = jacobian[:, :, arm.columns[arm.model.columns_of(COMPLIANCE)]]
-    of_stops = (arm.problem.observations.stops == stop for stop in arm.stops.tolist())
-    pairs = [(columns[mask], residuals[mask]) for mask in of_stops]
-    gradient = np.array([np.einsum("mij,mi->j", part, residual) for part, residual in pairs])
-    information = np.array([np.einsum("mij,mij->j", part, part) for part, _ in pairs])
-    return -gradient / np.where(information > 0.0, information, np.nan)
+    linear = arm.problem.linear(arm.state)
+    columns = linear.jacobian[:, :, arm.columns[arm.model.columns_of(COMPLIANCE)]]
+    weighted = np.linalg.solve(arm.problem.total_covariance(linear, arm.noise), columns)
+    is_at = (arm.problem.observations.stops == arm.stops[:, None]).astype(float)
+    gradient = is_at @ np.einsum("mij,mi->mj", weighted, linear.residuals)
+    information = is_at @ np.einsum("mij,mij->mj", weighted, columns)
+    return np.asarray(-gradient / np.where(information > 0.0, information, np.nan))
 
 
 def _payload_factor(arm: ArmData) -> Factor | None:

@@ -200,19 +200,13 @@ def _size(shift_m: float, turn_rad: float) -> str:
 
 def _arm_errors_finding(arm: ArmErrors, turn_rad: float, shift_m: float) -> Finding:
     """Finding on an arm whose joints are not known, with the rms error of a look [rad, m]."""
-    away = ""
-    if arm.far_posture_errors is not None:
-        actual, predicted = (
-            _size(float(shift), float(turn)) for turn, shift in arm.far_posture_errors
-        )
-        away = f", at postures away from them by {actual} (left out in turn; predicted {predicted})"
     return Finding(
         "arm_errors",
         "Residuals follow the arm's posture, or last from stop to stop (likelihood ratio "
         f"{arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f}): a look near the views errs by "
-        f"{_size(shift_m, turn_rad)} (rms){away}. More views will not help: joint angles or a "
-        "kinematic calibration of the arm will. What of its errors looks the same in all views is "
-        "in no residual, and counts in the covariance.",
+        f"{_size(shift_m, turn_rad)} (rms). More views will not help: joint angles or a kinematic "
+        "calibration of the arm will. What of its errors looks the same in all views is in no "
+        "residual, and counts in the covariance.",
         NO_JOINTS,
         until_mm=0.0,
         mahalanobis_sq=arm.gain,
