@@ -13,13 +13,11 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.linalg import covariance_among, spectrum
+from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 
-# Scaled eigenvalue ratio below which the motion does not determine a direction.
-_NULL_RATIO = 1e-8
 # Largest predicted sigmas at a typical noise with which stops can calibrate.
 SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # Typical noise of robots and corners, per axis. Larger noise is no fault of the motion but of
@@ -30,8 +28,8 @@ _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
 # Least rotation of a robot between any of its stops, and most stops that are paired.
 _STILL_RAD, _PAIRED = float(np.deg2rad(0.5)), 300
-# Least share of a unit null direction in a part of an edge that it makes undetermined.
-_PART_OF_NULL = 0.05
+# A direction with a larger predicted sigma is not determined at all [m or rad].
+_OPEN = 0.2
 # Cause and advice where unknowns common to all views are not determined.
 _LENS_OPEN = (
     "the views do not determine lens and board well enough",
@@ -58,6 +56,18 @@ class Direction:
         """The sigma and its limit with their unit."""
         unit, scale = ("deg", np.rad2deg(1.0)) if self.is_rotation else ("mm", 1e3)
         return f"{figure(self.sigma * scale)} {unit} (limit {figure(self.limit * scale)})"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is not determined at all."""
+        return self.sigma > _OPEN
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with it at a typical noise."""
+        if self.is_open:
+            return "is not determined at all"
+        return f"has a predicted sigma of {self.figure} at a typical noise"
 
 
 @dataclass(frozen=True)
@@ -231,6 +241,7 @@ def check_determined(
     pixel_px: Mapping[str, float] = MappingProxyType({}),
     *,
     with_first_effect: bool = False,
+    only_open: bool = False,
 ) -> None:
     """Refuses motion that leaves a direction of an unknown frame undetermined.
 
@@ -245,33 +256,24 @@ def check_determined(
         pixel_px: By camera, the corner noise behind its poses' covariance [px].
         with_first_effect: Whether the first effect has to be determined, too: lens and board, or
             points.
+        only_open: Whether a direction that is known poorly is left to later checks.
 
     Raises:
-        DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
+        DegenerateError: The predicted sigma of a direction is over the limit.
     """
     frames, typical_noise = _at_typical_noise(problem, noise, pixel_px)
     frames, placed = frames.with_effects(()), State(state.edges, np.zeros(0))
-    _refuse_null(frames, typical_noise, placed, words)
-    _refuse_vague(frames, placed, typical_noise, words)
+    _refuse_open(frames, placed, typical_noise, words, only_open=only_open)
     if with_first_effect and problem.effects:
         problem, noise = _at_typical_noise(problem, noise, pixel_px, keeps_less=True)
         cause, advice = words.undetermined
         first = problem.effects[0].determined
-        _refuse_vague(
+        _refuse_open(
             problem.with_effects([first]),
             State(state.edges, state.values[: len(first)]),
             noise,
             replace(words, motion=lambda _: cause, advice=lambda *_: advice),
         )
-
-
-def refuse_open_motion(problem: Problem, state: State, noise: Noise, words: CellWords) -> None:
-    """Refuses motion that leaves a direction undetermined at any noise, before a fit.
-
-    Raises:
-        DegenerateError: A direction is numerically null.
-    """
-    _refuse_null(*_at_typical_noise(problem, noise, {}), state, words)
 
 
 def _at_typical_noise(
@@ -294,58 +296,20 @@ def _at_typical_noise(
     return typical, Noise(robots, np.minimum(noise.sensors, 1.0))
 
 
-def _refuse_null(problem: Problem, noise: Noise, state: State, words: CellWords) -> None:
-    """Refuses frames that are not determined at all, by the first one and its undetermined part."""
-    among = problem.counted
-    eigen = spectrum(fisher_information(problem, state, noise)[np.ix_(among, among)])
-    if eigen.ratio >= _NULL_RATIO:
-        return
-    null = np.zeros((problem.size, int(np.sum(eigen.values < _NULL_RATIO * eigen.values[-1]))))
-    null[among] = eigen.vectors[:, : null.shape[1]]
-    open_frame, culprit = next(iter(problem.unknown)), "a combination of all edges"
-    for frame, edge in problem.unknown.items():
-        rotation, offset = np.split(null[problem.edge_columns(frame)], 2)
-        axes = state.edges[edge][:3, :3]
-        named = [
-            part
-            for block, is_rotation in ((offset, False), (rotation, True))
-            if (part := _open_part(words.names[frame], axes @ block, is_rotation))
-        ]
-        if named:
-            open_frame, culprit = frame, " and ".join(named)
-            break
-    verb = "are" if " and " in culprit else "is"
-    raise DegenerateError(
-        f"{words.title}: {culprit} {verb} not determined at all: {words.motion(open_frame)}.",
-        culprits=[culprit],
-        next_step=words.advice(open_frame, culprit),
-    )
-
-
-def _open_part(names: tuple[str, str], directions: FloatArray, is_rotation: bool) -> str:
-    """Names the part of a rotation or an offset in (3, k) null directions, if any."""
-    vectors, sizes, _ = np.linalg.svd(directions)
-    # Null vectors have unit length over all unknowns, a radian counting as a metre.
-    rank = int(np.sum(sizes > _PART_OF_NULL))
-    if rank == 1:
-        return _words(*names, vectors[:, 0], is_rotation=is_rotation)
-    if rank == 0:
-        return ""
-    return f"{names[0]}'s {'rotation' if is_rotation else 'offset from ' + names[1]}"
-
-
-def _refuse_vague(problem: Problem, state: State, noise: Noise, words: CellWords) -> None:
-    """Refuses frames whose predicted sigmas exceed the limit."""
+def _refuse_open(
+    problem: Problem, state: State, noise: Noise, words: CellWords, *, only_open: bool = False
+) -> None:
+    """Refuses frames that are not determined, by the first of them."""
     covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     found = directions(problem, state, covariance, words.names)
-    beyond = [(frame, item) for frame, item in found if item.sigma > item.limit]
+    least = _OPEN if only_open else 0.0
+    beyond = [(frame, item) for frame, item in found if item.sigma > max(item.limit, least)]
     if beyond:
         frame, worst = beyond[0]
         raise DegenerateError(
-            f"{words.title}: {worst.words} has a predicted sigma of {worst.figure} at a typical "
-            f"noise: {words.motion(frame)}.",
+            f"{words.title}: {worst.words} {worst.fault}: {words.motion(frame)}.",
             culprits=[direction.words for _, direction in beyond],
-            next_step=words.advice(frame, ""),
+            next_step=words.advice(frame, worst.words if worst.is_open else ""),
         )
 
 
@@ -383,6 +347,8 @@ def edge_directions(
     def worst(block: slice, limit: float, *, is_rotation: bool) -> Direction:
         values, vectors = np.linalg.eigh(covariance[block, block])
         words = _words(thing, frame, matrix[:3, :3] @ vectors[:, -1], is_rotation=is_rotation)
+        if values[1] > _OPEN**2:
+            words = f"{thing}'s {'rotation' if is_rotation else 'offset from ' + frame}"
         return Direction(words, float(np.sqrt(max(values[-1], 0.0))), limit, is_rotation)
 
     offset = worst(slice(3, 6), SIGMA_LIMIT_M, is_rotation=False)

@@ -36,7 +36,6 @@ from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
     check_determined,
-    refuse_open_motion,
     too_little_motion,
 )
 from visioncal.estimation.outliers import (
@@ -103,7 +102,7 @@ def solve(
         if start.cell.mount is not None and not observed.is_misread:
             noise = starting_noise(start.problem)
             words = chain_words(start.problem, start.cell.mount)
-            refuse_open_motion(start.problem, start.state, noise, words)
+            check_determined(start.problem, start.state, noise, words, only_open=True)
         raise
     return cell_fit if solver == "joint" else _by_closed_form(cell_fit, solver)
 
