@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.problems import observed, pose, world
-from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
+from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
 
-from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.rereading import exchange_views
@@ -271,32 +270,6 @@ def test_noise_refuses_nothing():
     assert verdict.status == "bad"
     assert any("Weakly determined by the motion" in reason for reason in verdict.reasons)
     assert sum("Left out of the fit, views disagree" in reason for reason in verdict.reasons) == 1
-
-
-@pytest.mark.parametrize(
-    ("kind", "names", "words"),
-    [
-        ("camera", ("left", "hand"), "The views of cameras left and hand are exchanged"),
-        ("robot", ("a", "b"), "The poses of robots a and b are exchanged"),
-    ],
-)
-def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, words):
-    other = dict(zip(names, names[::-1], strict=True))
-
-    def exchanged(_, row):
-        row[kind] = other.get(row[kind], row[kind])
-
-    wrong = rewritten(part(session, 0, 10), exchanged)
-    with pytest.raises(DegenerateError) as caught:
-        calibrate(wrong)
-    assert caught.value.message.startswith(words)
-    assert f"In the column {kind} of views.csv, write {names[1]} for {names[0]}" in (
-        caught.value.next_step
-    )
-    # A check-up finds them in the same way: once shows that.
-    if kind == "camera":
-        found = [finding for finding in doctor(wrong).findings if finding.kind == "exchanged_names"]
-        assert found[0].words.startswith(words)
 
 
 @pytest.mark.slow

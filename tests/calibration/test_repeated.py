@@ -256,4 +256,4 @@ def measured(rows):
     ],
 )
 def test_near_readings_are_copies_where_no_time_tells_them_apart(rows, repeated):
-    assert repeated_rows(measured(rows), {})[0] == repeated
+    assert repeated_rows(measured(rows), {}) == repeated

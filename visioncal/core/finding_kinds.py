@@ -86,7 +86,6 @@ _KINDS = (
     Kind("weak_lens", REMARK, INTRINSICS),
     # Conventions, clocks, joints.
     Kind("misread_poses", 1e-3, CHAIN, hides=_BY_CHAIN),
-    Kind("exchanged_names", 1e-6, hides=_BY_CHAIN),
     Kind("misread_joints", 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     # The frames are by the poses, which a wrong model does not change.
     Kind("other_arm", REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.misread_poses import (
     misread_pose_finding,
     misreadings,
@@ -130,9 +129,6 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
         read += misreadings(run)
     if error is None and not read:
         read += turned_boards(run)
-    if run.mount is None and (error is not None or not read):
-        names = exchanged_names(run)
-        read = read if names is None else [names]
     if cause is not None:
         yield cause
     yield from read

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.misread_poses import (
     may_be_misread,
@@ -45,7 +44,7 @@ def explained(
     cause = unseen_cause(state) or (poor_motion(state) if stage == "intrinsics" else None)
     hint = None if sought is None else sought.finding
     if cause is None and state.mount is None:
-        hint = hint or exchanged_names(state) or next(misreadings(state), None)
+        hint = hint or next(misreadings(state), None)
         return error if hint is None else because(error, hint)
     # Lost views are often why the remaining ones do not suffice.
     error = error.with_culprits([view for view in state.lost_views if view not in error.culprits])

@@ -8,7 +8,6 @@ import numpy as np
 from visioncal.calibration.guess.fit import CLOSING_SCORE, distances, robust_fit
 from visioncal.calibration.guess.readings import SHIFTS, Hypothesis, changes
 from visioncal.calibration.guess.search import FEWEST_ROWS, Recording, chains, closes
-from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_numbers,
     guess_from_camera_poses,
@@ -267,16 +266,10 @@ def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
 
     Each camera is tested with one target and one robot alone, those of most views first.
     """
-    is_first = True
     for robot in run.session.robots:
         for pair in pairs_of(run, robot):
             if _closes_in_cell(run, robot, pair):
                 continue
-            # Exchanged names are tested first: that is cheaper, and unambiguous.
-            if is_first and (exchanged := exchanged_names(run)) is not None:
-                yield exchanged
-                return
-            is_first = False
             hint = _misread_in_pair(run, robot, pair)
             if hint is None:
                 continue

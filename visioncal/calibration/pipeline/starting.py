@@ -9,8 +9,7 @@ from visioncal.calibration.pipeline.connectivity import ambiguous_error, refuse_
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
-from visioncal.calibration.stages.pairwise import AGREE_M
-from visioncal.calibration.stages.pnp import ViewPoses, distances_m
+from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import Target
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
@@ -72,20 +71,6 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
     return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *unlinked))
-
-
-def agreeing_views(cell: Cell, observed: Observed) -> frozenset[int]:
-    """Views that agree with the initial frames of a cell; nothing is fitted.
-
-    Raises:
-        DataError: Nothing was seen.
-        DegenerateError: A robot is linked to nothing, or a frame may be in two places.
-    """
-    start = find_start(cell, observed)
-    problem = start.problem
-    distance = distances_m(problem.observations.measured, problem.predicted(start.state))
-    is_near = (distance < AGREE_M).tolist()
-    return frozenset(pose.view for pose, agrees in zip(start.poses, is_near, strict=True) if agrees)
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:

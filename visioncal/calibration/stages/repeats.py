@@ -1,8 +1,8 @@
 """Rows that repeat others: copies of a reading say nothing new about arm, camera or noise."""
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -16,7 +16,7 @@ from visioncal.core.finding_kinds import REPEATED_READINGS
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
 from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
-from visioncal.session import Observation, Session
+from visioncal.session import Session, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, joint_columns
 from visioncal.session.observations import APART_DEG, APART_MM, APART_RAD
 
@@ -32,37 +32,13 @@ _MANY, _STANDING_PX = 4, 0.5
 _FEWEST_STOPS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """An observation for comparison with others."""
-
-    view: int  # Its number.
-    # What is equal in rows that are compared at all: who observes what, the kinds of numbers, and
-    # other measurements such as loads and temperatures.
-    alike: Hashable
-    # When it was taken, and the stop that it states; None for what is not known.
-    stated: tuple[float | None, int | None]
-    state: FloatArray  # State of the robots, in units of what rows of one stop may differ by.
-    reading: FloatArray  # What was read, in such units.
-    is_image: bool  # Whether corners were read.
-
-    def is_repeated_by(self, other: "_Row") -> bool:
-        """Whether another row, of nearly the same numbers, is a copy of this one.
-
-        Corners and exact numbers are never read twice; others are, at another time or stop.
-        """
-        pairs = zip(self.stated, other.stated, strict=True)
-        is_apart = any(None not in pair and pair[0] != pair[1] for pair in pairs)
-        return self.is_image or not is_apart or np.array_equal(self.reading, other.reading)
-
-
 def without_repeats(seen: T) -> T:
     """Leaves out rows that repeat others, and reports them; of each reading the first row is used.
 
     The corners are of all cameras, and no pose is known yet.
     """
     try:
-        repeated, copies = repeated_rows(seen.timed, seen.corners)
+        repeated = repeated_rows(seen.timed, seen.corners)
     except DataError:
         # Where the robot is cannot be told yet, and whether it is where it was neither.
         return seen
@@ -71,23 +47,16 @@ def without_repeats(seen: T) -> T:
     for frame, look in seen.cameras.items():
         unique = {view: px for view, px in look.corners.items() if view not in repeated}
         seen = seen.with_camera(frame, replace(look, corners=unique))
-    # Readings that differ may be of another time that is not stated, and some of them are equal by
-    # the instrument's resolution.
-    kind = "repeated_views" if 2 * copies > len(repeated) else REPEATED_READINGS
-    originals = listed([*dict.fromkeys(repeated.values())])
-    views, repeat, rows, their = (
-        ("View", "repeats", "row", "its")
-        if len(repeated) == 1
-        else ("Views", "repeat", "rows", "their")
-    )
+    views, originals = listed([*repeated]), listed([*dict.fromkeys(repeated.values())])
+    # Readings may be of another time that is not stated.
     finding = Finding(
-        kind,
-        f"{views} {listed([*repeated])} {repeat} {originals}: what was read is the same, or "
-        f"differs by less than {APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without "
-        "a time or a stop of its own. They count once.",
+        "repeated_views" if seen.corners else REPEATED_READINGS,
+        f"Views {views} repeat {originals}: what was read is the same, or differs by less than "
+        f"{APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without a time or a stop of "
+        "its own. They count once.",
         Remedy(
-            f"In views.csv, delete the {rows} of {views.lower()} {listed([*repeated])}; or, if "
-            f"they were read anew, write {their} times into stamp_s, or {their} stops into stop."
+            f"In views.csv, delete the rows of views {views}; or, if they were read anew, write "
+            "their times into stamp_s, or their stops into stop."
         ),
         tuple(repeated),
         until_mm=LEAST_NEED_MM,
@@ -160,79 +129,63 @@ def _mean_of(images: Sequence[Corners]) -> tuple[Corners, list[int]]:
     return mean, [images[at].view for at in standing[1:].tolist()]
 
 
-def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> tuple[dict[int, int], int]:
-    """The earlier view by repeated one, and how many of these are copies of a picture or number.
-
-    `corners` are those of all cameras, by view.
-    """
+def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int, int]:
+    """The earlier view by repeated one; `corners` are those of all cameras, by view."""
     groups = defaultdict(list)
-    for row in _rows(session, corners):
-        groups[row.alike].append(row)
-    repeated, copies = dict[int, int](), 0
-    for rows in groups.values():
-        numbers = np.array([np.append(row.state, row.reading) for row in rows])
-        # Their pairs that are near in all numbers, by the earlier row.
-        for first, later in sorted(cKDTree(numbers).query_pairs(1.0, p=np.inf)):
-            row, other = rows[first], rows[later]
-            is_new = not {row.view, other.view} & repeated.keys()
-            if is_new and row.is_repeated_by(other):
-                repeated[other.view] = row.view
-                copies += row.is_image or np.array_equal(row.reading, other.reading)
-    return {view: repeated[view] for view in sorted(repeated)}, copies
-
-
-def _rows(session: Session, corners: Mapping[int, Corners]) -> Iterator[_Row]:
-    for observation in session.observations:
-        view, found = observation.view, corners.get(observation.view.number)
-        ids, place = b"", view.reading_m
-        pose = view.cam_from_target()
-        pose = view.instrument_from_probe() if pose is None else pose
-        if found is not None and len(found.ids):
-            ids, reading = found.ids.tobytes(), np.ravel(found.px) / _APART_PX
-        elif found is None and pose is not None:
-            reading = _entries(pose)
-        elif found is None and place is not None:
-            reading = place * (1e3 / APART_MM)
-        else:
+    for row in session.observations:
+        view, found = row.view, corners.get(row.view.number)
+        measured = [_entries(view.cam_from_target()), _entries(view.instrument_from_probe())]
+        reading = np.concatenate(measured)
+        if found is not None:
+            reading = found.px.ravel() / _APART_PX
+        elif not len(reading) and view.reading_m is not None:
+            reading = view.reading_m * (1e3 / APART_MM)
+        if not len(reading):
             continue
-        states = []
-        for name in sorted(observation.robots):
-            robot = observation.robots[name]
-            pose, joints = robot.base_from_flange(), robot.joints_rad
-            parts = [] if pose is None else [_entries(pose)]
-            parts += [] if joints is None else [joints / APART_RAD]
-            states.append(np.concatenate([np.zeros(0), *parts]))
-        sizes = tuple(map(len, states))
-        # A robot's pose in its stream is that of the time.
-        time = None if all(sizes) and not observation.missing_robots else view.stamp_s
-        who = (observation.seer, observation.seen)
-        yield _Row(
-            view.number,
-            (who, ids, len(reading), sizes, _others(observation), time),
-            (view.stamp_s, view.stop),
-            np.concatenate([np.zeros(0), *states]),
-            reading,
-            bool(ids),
+        states = [np.zeros(0)]
+        for _, robot in sorted(row.robots.items()):
+            joints = robot.joints_rad
+            states += [_entries(robot.base_from_flange())]
+            states += [] if joints is None else [joints / APART_RAD]
+        # Who observes what, and what else is measured. A robot's pose in its stream is that of the
+        # time.
+        alike = (
+            *(row.seer, row.seen, None if found is None else found.ids.tobytes()),
+            *map(len, states),
+            *(_others(one) for one in (view, *(robot for _, robot in sorted(row.robots.items())))),
+            view.stamp_s if row.missing_robots else None,
         )
+        groups[alike].append((view, np.concatenate([*states, reading])))
+    repeated = dict[int, int]()
+    for rows in groups.values():
+        # The pairs that are near in all numbers, by the earlier row.
+        tree = cKDTree([numbers for _, numbers in rows])
+        for first, later in sorted(tree.query_pairs(1.0, p=np.inf)):
+            (view, numbers), (other, others) = rows[first], rows[later]
+            # Corners and exact numbers are never read twice; others are, at another time or stop.
+            pairs = (view.stamp_s, other.stamp_s), (view.stop, other.stop)
+            is_apart = any(None not in pair and pair[0] != pair[1] for pair in pairs)
+            is_copy = view.number in corners or not is_apart or np.array_equal(numbers, others)
+            if is_copy and not {view.number, other.number} & repeated.keys():
+                repeated[other.number] = view.number
+    return dict(sorted(repeated.items()))
 
 
-def _entries(pose: RigidTransform) -> FloatArray:
-    matrix = pose.as_matrix()
-    rotation = matrix[:3, :3].ravel() / np.deg2rad(APART_DEG)
-    return np.concatenate([matrix[:3, 3] * (1e3 / APART_MM), rotation])
+def _entries(pose: RigidTransform | None) -> FloatArray:
+    """Numbers of a pose in units of what rows of one stop may differ by; none for none."""
+    if pose is None:
+        return np.zeros(0)
+    units = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
+    return np.asarray((pose.as_matrix()[:3] / units).ravel())
 
 
-def _others(observation: Observation) -> tuple[tuple[str, float], ...]:
-    """What else the rows of an observation measured: loads, temperatures, torques."""
-    rows = [observation.view, *(observation.robots[name] for name in sorted(observation.robots))]
-    compared = {*POSE, *MEASURED_CAM_POSE, "stamp_s"}
-    return tuple(
+def _others(row: View) -> frozenset[tuple[str, float]]:
+    """What a row measured besides: loads, temperatures, torques."""
+    compared = {*POSE, *MEASURED_CAM_POSE, "stamp_s", *joint_columns(tuple(row.numbers))}
+    return frozenset(
         (name, value)
-        for row in rows
-        for name, value in sorted(row.numbers.items())
-        if name not in compared
-        and not name.startswith("meas_")
-        and name not in joint_columns((name,))
+        for name, value in row.numbers.items()
+        if name not in compared and not name.startswith("meas_")
     )
 
 
