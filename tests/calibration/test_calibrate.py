@@ -223,11 +223,6 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     unused = {view.view: view.reason for view in calibration.views if not view.used}
     assert set(unused) == {1, 4, 7, 9}
     assert "640 x 400 px, and the camera's images are 1280 x 800" in unused[9]
-    assert any(
-        reason.startswith("1 of the images of another size, and not used: images/")
-        and "view 9." in reason
-        for reason in calibration.verdict.reasons
-    )
     assert "missing" in unused[1]
     assert "cut short" in unused[4]
     assert "empty" in unused[7]

@@ -10,7 +10,6 @@ from support.problems import observed, world
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages import refine
-from visioncal.calibration.stages.turned_images import find_image_turn
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import point_covariance, radius95
@@ -230,37 +229,6 @@ def test_a_focus_that_follows_the_distance_is_counted_and_named(mount):
     # 6 components: 3.7 is one in a thousand. Left out of the model, it is above 100.
     assert np.mean(squared) / 3 < 3.7
     assert named == 2
-
-
-# What was done to an image (rows, columns), and what undoes it by the words of the finding.
-CHANGES = {
-    "turned by 180 deg": lambda value: np.rot90(value, 2),
-    "turned by 90 deg counterclockwise": np.rot90,
-    "turned by 90 deg clockwise": lambda value: np.rot90(value, -1),
-    "mirrored left to right": np.fliplr,
-    "mirrored upside down": np.flipud,
-}
-
-
-@pytest.mark.parametrize("words", CHANGES)
-def test_how_an_image_was_turned_is_by_its_corners(words):
-    image, rng = np.zeros((400, 400), dtype=np.int64), np.random.default_rng(0)
-    rows, columns = np.mgrid[60:240:30, 100:340:30].reshape(2, -1)
-    rows = rows + (columns // 30) * 3  # On no lattice that a turn carries into itself.
-    image[rows, columns] = np.arange(1, len(rows) + 1)
-    places = np.stack([columns, rows], axis=1).astype(float)
-    seen = np.argwhere(CHANGES[words](image))[:, ::-1] + rng.normal(0.0, 0.1, places.shape)
-    assert find_image_turn(seen, places, (400, 400), 0.1).words == words
-    # Quarters change the size of other images; where corners agree, or nowhere, nothing is said.
-    is_quarter = "90" in words
-    found = find_image_turn(seen, places, (400, 399), 0.1)
-    assert found is None or not is_quarter
-    assert find_image_turn(places, places, (400, 400), 0.1) is None
-    assert find_image_turn(seen + 7.0, places, (400, 400), 0.1) is None
-    # However much the others are off by, corners amid the predicted ones are on none of them.
-    upper = places[places[:, 1] < 130.0]
-    amid = np.array([0.0, 399.0]) + (upper + 12.0) * np.array([1.0, -1.0])
-    assert find_image_turn(amid, upper, (400, 400), 10.0) is None
 
 
 def mahalanobis_sq_of_place(cell, known):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # The arm was calibrated: what a result is good for depends on how its targets are sent.
 CALIBRATED_ARM = "calibrated_arm"
-MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
+MISSING, EMPTY_ROWS = "missing_images", "empty_rows"
 EMPTY_IMAGE, REPEATED_READINGS = "empty_image", "repeated_readings"
 EXCHANGED, ARM_ERRORS, UNEXPLAINED = "exchanged_views", "arm_errors", "unexplained"
 LENS_CHANGED, MOVED_FRAME, BOARD_CHANGED = "lens_changed", "moved_at_once", "board_changed"
@@ -68,7 +68,6 @@ _KINDS = (
     # What was seen and read.
     Kind(MISSING, is_doubt=False, is_unusable=True),
     Kind(EMPTY_ROWS, is_doubt=False, is_unusable=True),
-    Kind(OTHER_SIZE, is_doubt=False, is_unusable=True),
     # Few robots fill all of a fixed camera's image, and picks are where the views looked.
     Kind(EMPTY_IMAGE, is_doubt=False),
     Kind(REPEATED_READINGS, is_doubt=False),
@@ -80,8 +79,7 @@ _KINDS = (
     Kind("other_board", FACT, hides=("lost_views",)),
     Kind("other_lens", FACT),
     Kind("lost_views", REMARK),
-    *map(Kind, ("left_out", "unnamed_images", "blurred_images", "unread_markers", "remark")),
-    Kind("mirrored_images"),
+    *map(Kind, ("left_out", "remark")),
     Kind("unused"),
     Kind("weak_lens", REMARK, INTRINSICS),
     # Conventions, clocks, joints.
@@ -100,7 +98,6 @@ _KINDS = (
     ),
     # Views.
     Kind(EXCHANGED, 1e-6, leaves_out=True, order=-1),
-    Kind("turned_images", 1e-6, leaves_out=True),
     Kind("wrong_pose", 1e-3, leaves_out=True),
     Kind("something_moved", 1e-3, leaves_out=True),
     Kind("wrong_views", 1e-3),

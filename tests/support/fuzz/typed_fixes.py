@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import tomli_w
 from support.commands import visioncal
@@ -89,16 +88,6 @@ def _respelt(folder: Path, found: _Found) -> None:
     edit(folder, lambda text: text.replace(f'"{found[1]}"', f'"{found[2]}"'))
 
 
-def _turned_back(folder: Path, _: _Found) -> None:
-    for file in (folder / "images").iterdir():
-        cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)[:, ::-1])
-
-
-def _turned_around(_: Path, found: _Found) -> None:
-    image = cv2.imread(found[1], cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(found[1], cv2.rotate(image, cv2.ROTATE_180))
-
-
 _EDITS: tuple[tuple[str, Callable[[Path, _Found], None]], ...] = (
     (r"iconv -f (\S+) -t", _encoded),
     (r"[Ii]n (session\.toml|views\.csv), replace (\S+) by (\S+?)\.?(?:\s|$)", _replaced),
@@ -106,8 +95,6 @@ _EDITS: tuple[tuple[str, Callable[[Path, _Found], None]], ...] = (
     (r"delete views\.csv, line (\d+)", _line_deleted),
     (r"delete the rows? of view ([\d, ]+)", _rows_deleted),
     (r"no target named '(\S+)'\. Did you mean (\S+)", _respelt),
-    (r"mogrify -flop", _turned_back),
-    (r"mogrify -rotate 180 (\S+)", _turned_around),
     (r"multiply q1_rad to q(\d)_rad by pi / 180", _in_radians),
 )
 _WRITTEN = r"[Ii]n (\w+\.toml), write (.+?)(?:, which|;|\.(?:\s|$)|, and delete)"

@@ -1,7 +1,7 @@
 """The fit of a cell: inliers, camera parameters and arms, with its views on the problem."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -11,7 +11,6 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.fit_messages import lens_and_board_findings
 from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
@@ -36,8 +35,6 @@ class CellFit:
     level: str  # The requested calibration level of the arms.
     # Errors of clocks, and those that grow with time, reach or gravity.
     other_effects: tuple[Effect, ...]
-    # How images of outliers were turned or mirrored, by view.
-    turned: Mapping[int, ImageTurn] = field(default_factory=dict)
     solver: str = "joint"  # The solver of the edges.
 
     @property

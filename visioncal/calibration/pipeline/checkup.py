@@ -15,12 +15,11 @@ from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cell import Cell, read_cell
-from visioncal.calibration.stages.image_checks import unnamed_images, unseen_cause
+from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.suspects.ranking import LEAST_RUN
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
-from visioncal.core.finding_kinds import MISSING
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.summaries import html_card
@@ -148,9 +147,6 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
         if hint is None and run.mount is not None and not lens:
             yield from _motion(run, run.mount)
         yield from _lost(run)
-    kinds = {finding.kind for finding in (*warnings, *([] if cause is None else [cause]))}
-    if not kinds & {MISSING, "shared_image"}:
-        yield from unnamed_images(run.session)
 
 
 def _refused(kind: str, error: VisioncalError) -> Finding:

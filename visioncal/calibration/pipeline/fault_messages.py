@@ -1,6 +1,5 @@
-"""Messages on outliers and moved frames: exchanged, wrong or turned observations, by cause."""
+"""Messages on outliers and moved frames: exchanged or wrong observations, by cause."""
 
-import shlex
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +8,6 @@ import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
-from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.ranking import run_evidence
 from visioncal.core.finding_kinds import EXCHANGED
@@ -126,8 +124,7 @@ def moved_finding(moved: Moved) -> Finding:
 def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
     """What explains outliers, and why each is left out, by view.
 
-    Turned images, exchanged or wrong poses, and what moved; else the stops that a view fits instead
-    of its own.
+    Exchanged or wrong poses, and what moved; else the stops that a view fits instead of its own.
     """
     outliers, agreed = np.flatnonzero(~cell_fit.inlier_fit.used), cell_fit.inlier_fit
     if not len(outliers):
@@ -137,7 +134,7 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
         for name, target in cell_fit.cell.session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
-    mutual, faults = exchanged(agreed.problem, fitting), [*_turned_images(cell_fit)]
+    mutual, faults = exchanged(agreed.problem, fitting), list[PoseFault]()
     if cell_fit.cell.mount is not None:
         faults += _exchanged_views(cell_fit, mutual, set())
         faults = faults or [*_moved_run(cell_fit)]
@@ -160,24 +157,6 @@ def _fault(
     words = words.format(views=f"views {some_of([*map(str, views)], _LISTED)}")
     found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
     return PoseFault(found, tuple(rows), short)
-
-
-def _turned_images(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Turned or mirrored images, which agree with the others once they are turned back."""
-    rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
-    for at, row in enumerate(cell_fit.cell.rows):
-        if row.view in cell_fit.turned and not cell_fit.inlier_fit.used[at]:
-            rows_by_turn[cell_fit.turned[row.view]].append(at)
-    images = {view.number: view.image for view in cell_fit.cell.session.views}
-    for how, rows in rows_by_turn.items():
-        files = [images[cell_fit.cell.rows[row].view] for row in rows]
-        step = Remedy("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
-        if all(files):
-            named = " ".join(f"SESSION/{shlex.quote(file)}" for file in files)
-            turn = f"mogrify {how.option} {named}"
-            step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
-        words = f"images of {{views}} are {how.words}: turned back, they agree. They were left out."
-        yield _fault(cell_fit, "turned_images", rows, words, step, f"its image is {how.words}")
 
 
 def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:

@@ -16,11 +16,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
-from visioncal.calibration.stages.corner_numbers import (
-    MOST_FROM_BEHIND,
-    numbering_finding,
-    share_from_behind,
-)
+from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.checks import is_scattered
 from visioncal.core.conventions import PoseNumbers
@@ -106,14 +102,9 @@ def session_is_mirrored(session: Session) -> bool:
     # Neither a left-handed robot frame has that effect, nor images that were mirrored before
     # another program numbered their corners.
     boards, corners = session.boards, session.corners
-    if any(view.image for view in session.views) or not corners:
-        return False
-    if any(board.is_rig for board in boards.values()):
-        # The z axis of points may have either sign.
-        return False
     seen = [view for view in session.views if view.number in corners]
     views = [(corners[view.number], boards[session.board_of(view)]) for view in seen]
-    return share_from_behind(views) > MOST_FROM_BEHIND
+    return not any(view.image for view in session.views) and are_from_behind(views)
 
 
 def _unrecorded(run: RunState, what: str) -> Finding | None:
@@ -245,20 +236,33 @@ def misreadings(run: RunState) -> Iterator[Finding]:
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:
-    """Findings on boards whose numbering turns their frames over; where nothing is misread.
+    """Findings on boards that corners.csv numbers as if they were seen from behind.
 
-    The chain closes nevertheless, unlike that of mirrored images.
+    Their frames are turned over. The chain closes nevertheless: of mirrored images it does not.
     """
     session = run.session
     for name, target in session.boards.items():
-        corners = [
-            session.corners[view.number]
+        views = [
+            view
             for view in session.views
             if view.has_corners and view.number in run.poses and session.board_of(view) == name
         ]
-        found = numbering_finding(corners, target, name if len(session.boards) > 1 else "")
-        if found is not None and (run.mount is None or _closes(run)):
-            yield found
+        if not are_from_behind([(session.corners[view.number], target) for view in views]):
+            continue
+        if run.mount is None or _closes(run):
+            whose = f"target {name}" if name else "the board"
+            yield Finding(
+                "corner_numbers",
+                f"corners.csv numbers the corners of {whose} as if it was seen from behind: rows "
+                "from the bottom up, column by column, or counterclockwise. The camera's pose "
+                "holds, but the board's frame is turned over: its z axis points at the camera.",
+                Remedy(
+                    "Number them as they are printed, row by row from corner 0, at the upper left; "
+                    "those of a marker clockwise from there. Calibrate again.",
+                    CALIBRATE,
+                ),
+                tuple(view.number for view in views),
+            )
 
 
 def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:

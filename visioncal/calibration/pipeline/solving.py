@@ -26,10 +26,8 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
 from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
 from visioncal.calibration.stages.refine import refine_jointly, with_sizes
-from visioncal.calibration.stages.turned_images import ImageTurn, find_image_turn
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
-from visioncal.core.transforms import apply
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
@@ -55,7 +53,6 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.session.frames import frame_name
-from visioncal.vision.camera import project
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
@@ -116,14 +113,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     else:
         inliers, sizes = initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
-    initial = CellFit(
-        cell, inliers, None, poses, start.untied, arms, level, clock_errors, observed.turned
-    )
+    initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)
     cell_fit = _fit_with_inliers(initial, observed, sizes)
-    if turned := {} if observed.is_misread else _turned_images(cell_fit):
-        # Their corners would be explained by a lens that changes from view to view.
-        observed = replace(observed, turned=turned)
-        cell_fit = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
     cell_fit = replace(
         cell_fit,
         arms=with_drifts(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit, level),
@@ -252,26 +243,6 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
     return cell_fit
 
 
-def _turned_images(cell_fit: CellFit) -> dict[int, ImageTurn]:
-    """How images of outliers were turned or mirrored, by view."""
-    inliers, optics = cell_fit.inlier_fit, cell_fit.camera_parameters
-    problem, state = inliers.problem, inliers.fit.state
-    if optics is None or inliers.used.all():
-        return {}
-    typical_px = float(np.nanmedian(cell_fit.reprojection_px(np.flatnonzero(inliers.used), state)))
-    predicted, turns = problem.predicted(state), {}
-    for row in np.flatnonzero(~inliers.used).tolist():
-        seer, view = cell_fit.cell.rows[row].seer, cell_fit.poses[row]
-        if view.corners is None or seer not in optics.problems:
-            continue
-        camera = optics.camera(seer)
-        predicted_px = project(camera, apply(predicted[row], optics.corners[view.board]))
-        how = find_image_turn(view.corners.px, predicted_px, camera.resolution, typical_px)
-        if how is not None:
-            turns[view.view] = how
-    return turns
-
-
 def _fit_lenses_and_frames(
     cell_fit: CellFit,
     observed: Observed,
@@ -380,7 +351,7 @@ def _views_by_camera(observed: Observed, views: Sequence[ViewPoses]) -> dict[str
     """The views that a fit may use of each camera's images, each with its chosen pose."""
     poses = {**observed.poses, **{view.view: view for view in views}}
     # Spared frames of a sweep were taken while the robot moved.
-    excluded = observed.held_back | observed.spared.keys() | observed.turned.keys()
+    excluded = observed.held_back | observed.spared.keys()
     return {
         frame: [poses[view] for view in look.corners if view in poses and view not in excluded]
         for frame, look in observed.cameras.items()

@@ -8,7 +8,6 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.detect import Detections, detect, image_of
-from visioncal.calibration.stages.image_size import other_images, other_size_findings
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
@@ -82,8 +81,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             if seen.dense is not None:
                 seen, found = _with_dense(seen, views, found)
             corners, resolution = found.corners, found.resolution
-            others = other_size_findings(session, resolution, found.other_sizes)
-            seen = seen.noting(found.rejections, others)
+            seen = seen.noting(found.rejections)
         # The corners of several boards are numbered through.
         numbered = {
             view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
@@ -103,7 +101,7 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         view
         for view in (rows[rejection.view] for rejection in detections.rejections)
         if not view.has_corners
-        and view.number not in detections.other_sizes
+        and detections.searches[view.number].size == detections.resolution
         and kind_of(session.boards[session.board_of(view)]).is_dense
     ]
     found: dict[int, DenseCorners] = {}
@@ -234,20 +232,16 @@ def _other_lens(
     if not (is_wrong or (is_far and lens.sigma_px <= _CLEARLY_BETTER * stated_px)):
         return None
     poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
-    words, do = other_images(stated, lens.camera.matrix)
-    if words:
-        words += " The lens was estimated of these images."
-    else:
-        words = (
-            "The stated matrix and distortion are not this camera's: by them corners deviate by "
-            f"{figure(stated_px)} px from any pose of the target, by a lens estimated of these "
-            f"images by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy "
-            f"= {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
-        )
-        do = (
-            "In session.toml, delete matrix and distortion, or give those of this camera: matrix "
-            "is fx, fy, cx, cy in pixels."
-        )
+    words = (
+        "The stated matrix and distortion are not this camera's, or of images of another size: by "
+        f"them corners deviate by {figure(stated_px)} px from any pose of the target, by a lens "
+        f"estimated of these images by {figure(poses.sigma_px)} px. The estimated one was taken: "
+        f"fx, fy, cx, cy = {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
+    )
+    do = (
+        "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
+        "fx, fy, cx, cy in pixels."
+    )
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     return result, poses, Finding("other_lens", words, Remedy(do))
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.image_size import other_images
 from visioncal.core.finding_kinds import NOTE
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import chi2_limit
@@ -233,16 +232,13 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             ),
         )
     if not problem.scene.estimated and len(free) and _has_changed(fitted, free):
-        words, do = other_images(problem.scene.camera, optics.values[lens[:4]])
         moved = f"fx, fy, cx, cy moved by {_px((optics.values - optics.stated)[lens[:4]])} px."
         rays = normalise(problem.scene.camera, problem.stack.px)
         rays = np.column_stack([rays, np.ones(len(rays))])
         before, after = (project(at, rays) for at in (problem.scene.camera, optics.camera(camera)))
         moved_px = np.nanmax(np.linalg.norm(after - before, axis=1), initial=0.0)
         is_wrong = problem.scene.matrix_sigma_px is None or contradicted_lens(optics, camera)
-        if words:
-            yield Finding("lens", f"{words} It was refined.", Remedy(do, CALIBRATE))
-        elif is_wrong and moved_px > _LEAST_MOVE_PX:
+        if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
             yield Finding("lens", words, _NEW_LENS)
         else:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Self
 from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport
-from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection, Searched
@@ -70,8 +69,6 @@ class Observed:
     # Whether robots' poses are clearly misread, so that they determine nothing of lenses and
     # boards.
     is_misread: bool = False
-    # How turned or mirrored images, which determine nothing of their lens, were turned, by view.
-    turned: Mapping[int, ImageTurn] = field(default_factory=dict)
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
@@ -215,31 +212,12 @@ def nothing_seen(observed: Observed) -> DataError:
             f"session {observed.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
-    few = [view for view in observed.lost_views if "too few corners" in view]
-    if few:
-        return DataError(
-            f"session {observed.session.name!r}: no view shows enough of the target.",
-            next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
-            "corners enough.",
-        )
-    outside = [view for view in observed.lost_views if "lies far outside the image" in view]
-    if 2 * len(outside) > len(observed.lost_views):
-        return DataError(
-            f"session {observed.session.name!r}: the corners lie outside the image: their pixels "
-            "are not counted from its upper left corner.",
-            culprits=outside,
-            next_step="In corners.csv, u_px counts to the right and v_px down, from the centre of "
-            "the upper left pixel of the whole image.",
-        )
-    return DataError(
-        f"session {observed.session.name!r}: no view shows the target.",
-        next_step="Look at an image: is the board in it, and is it the one that the session "
-        f"declares?{_identify_command(observed)} {DESCRIBE_IT}",
-    )
-
-
-def _identify_command(observed: Observed) -> str:
-    """The command that identifies the board in an image, where images are files."""
     image = next((view.image for view in observed.session.views if view.image), "")
     has_files = image and isinstance(observed.session.images, FolderImages)
-    return f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""
+    command = f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""
+    return DataError(
+        f"session {observed.session.name!r}: no view shows the target, or enough of it.",
+        culprits=observed.lost_views,
+        next_step="Look at an image: is the whole board in it, sharp, near enough and not "
+        f"mirrored, and is it the one that the session declares?{command} {DESCRIBE_IT}",
+    )

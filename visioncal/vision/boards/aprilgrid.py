@@ -67,7 +67,7 @@ class AprilGrid(Board):
     size_key = "size_m"
     side, sides = "side of a tag", "tags"
     unit = "side"
-    has_markers = is_seen_in_part = True
+    is_seen_in_part = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, size_m, square_sigma_m, spacing, dictionary, id and border."""

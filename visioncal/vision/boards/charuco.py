@@ -81,7 +81,7 @@ class Charuco(Board):
 
     name: ClassVar[TargetKind] = "charuco"
     keys = "columns rows square_m square_sigma_m marker_m dictionary legacy"
-    has_markers = marks_squares = is_seen_in_part = is_dense = has_quick_search = True
+    marks_squares = is_seen_in_part = is_dense = has_quick_search = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary and legacy."""
@@ -205,28 +205,6 @@ class Charuco(Board):
         detected = px.reshape(-1, 2)[order].astype(np.float64)
         return DetectedCorners(
             ids.ravel()[order].astype(np.int64), _refined(image, detected, marker_px)
-        )
-
-    def variants(self, image: Image, target: Target) -> tuple[Target, ...]:
-        """Targets with the other corner layout, columns and rows exchanged, or both."""
-        transposed = replace(target, columns=target.rows, rows=target.columns)
-        variants = [
-            replace(target, legacy=not target.legacy),
-            transposed,
-            replace(transposed, legacy=not target.legacy),
-        ]
-        dictionary = charuco_board(target).getDictionary()
-        marker_px, marker_ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
-        if not marker_px:
-            return ()
-        markers = _by_id(marker_px, marker_ids)
-        candidates = [
-            variant
-            for variant in variants
-            if len(_matches(markers, variant)[0]) >= 4 * _LAYOUT_MARKERS
-        ]
-        return tuple(
-            variant for variant in candidates if _misfit(markers, variant) <= LAYOUT_MISFIT
         )
 
     def identify(self, image: Image, markers: Sequence[Marker]) -> list[Identity]:

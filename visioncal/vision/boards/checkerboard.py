@@ -44,7 +44,6 @@ class Checkerboard(Board):
     # A checkerboard has no markers that get lost in a reduced copy.
     long_side_px = 1000
     has_quick_search = True
-    most_pixels = _MOST_PIXELS
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, square_m and square_sigma_m."""
@@ -134,11 +133,6 @@ class Checkerboard(Board):
             ):
                 return other
         return None
-
-    def inside(self, target: Target) -> Target:
-        """The checkerboard that the squares of a ChArUco board are."""
-        columns, rows = target.columns - 1, target.rows - 1
-        return replace(target, kind=self.name, columns=columns, rows=rows)
 
 
 CHECKERBOARD = Checkerboard()

@@ -13,7 +13,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target, TargetKind
-from visioncal.vision.boards.imaging import MOST_PIXELS
 from visioncal.vision.boards.template import Refined, unrefined
 
 if TYPE_CHECKING:
@@ -101,8 +100,6 @@ class BoardKind(ABC):
     side: ClassVar[str] = "side of a square"
     sides: ClassVar[str] = "squares"
     unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
-    # Whether it has markers, whose bits differ from those of their mirror image.
-    has_markers: ClassVar[bool] = False
     # Whether some of its corners can be detected without the others.
     is_seen_in_part: ClassVar[bool] = False
     # Whether its markers are in the light squares of a checkerboard.
@@ -114,7 +111,6 @@ class BoardKind(ABC):
     is_dense: ClassVar[bool] = False
     # What a turn has to map to itself to leave the print as it was; empty where no turn does.
     symmetric: ClassVar[Literal["", "squares", "places"]] = ""
-    most_pixels: ClassVar[int] = MOST_PIXELS  # Largest image that is searched.
 
     @abstractmethod
     def read(self, table: DocumentTable, name: str) -> Target:
@@ -187,11 +183,6 @@ class BoardKind(ABC):
         """Boards of this kind in an image with these markers, without their size."""
         del image, markers
         return []
-
-    def variants(self, image: Image, target: Target) -> tuple[Target, ...]:
-        """Other layouts of a declared target that fit the markers in a (h, w) grey image."""
-        del image, target
-        return ()
 
     def miscounted(self, image: Image, target: Target) -> Target | None:
         """The board whose squares were counted wrongly, where it is seen in an image."""

@@ -49,7 +49,7 @@ class MarkerKind(BoardKind):
     size_key = "size_m"
     side, sides = "side of the dark square", "a side"
     unit = "side"
-    has_markers = has_lone_tags = True
+    has_lone_tags = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads size_m, square_sigma_m, dictionary and id."""
