@@ -84,10 +84,6 @@ def covariance_by_source(
             parts[sources.sensors[frame]] += gram(gain.rows[rows], own[rows] @ gain.rows[rows])
     for index, robot in enumerate(problem.robots):
         parts[sources.robots[robot]] += gain.of_flange(problem, index, noise.robots[index] ** 2)
-    errors, first = problem.error_covariance(noise), len(gain.units) - len(problem.repeats)
-    for unit, repeated in enumerate(problem.repeats, start=first):
-        by_unit = gain.units[unit]
-        parts[sources.sensors[observers[repeated[0]]]] += by_unit.T @ errors[unit] @ by_unit
     prior_info = problem.prior_information(state).information
     for prior in problem.priors:
         _, jacobian = problem.prior_rows(prior, state)

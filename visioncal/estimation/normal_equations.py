@@ -59,12 +59,9 @@ class Whitening:
         weighted = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
         information = np.zeros((len(members), width, width))
         np.add.at(information, units[shared], weighted @ by_errors[shared])
-        # Errors of flanges are independent; those of repeats are not.
-        roots, first = np.sqrt(np.maximum(errors, 0.0)), len(members) - len(problem.repeats)
-        roots[first:] = np.linalg.cholesky(errors[first:])
-        transposed = np.swapaxes(roots, 1, 2)
-        factor = np.linalg.cholesky(transposed @ information @ roots + np.eye(width))
-        taken[shared] = (np.linalg.inv(factor) @ transposed)[units[shared]] @ weighted
+        roots = np.sqrt(errors)
+        factor = np.linalg.cholesky(roots @ information @ roots + np.eye(width))
+        taken[shared] = (np.linalg.inv(factor) @ roots)[units[shared]] @ weighted
         return cls(weights, taken, units, len(members))
 
     def equations(

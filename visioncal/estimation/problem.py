@@ -118,8 +118,8 @@ class Problem:
     points: frozenset[str] = frozenset()
     # (s,) lower bounds of the sensors' noise levels; empty for no bounds.
     least_levels: FloatArray = field(default_factory=lambda: np.zeros(0))
-    # Whether repeated observations of one stationary frame by another share an error as large as
-    # the noise of one: errors of a lens or a print repeat in every view.
+    # Whether repeated observations of one stationary frame by another count as one: errors of a
+    # lens or a print repeat in every view.
     with_repeats: bool = False
     # Whether the observations' own noise is unknown: it and that of the only robot are then one
     # noise of estimated levels, in the observed frame.
@@ -315,21 +315,6 @@ class Problem:
         return through
 
     @cached_property
-    def units(self) -> tuple[IntArray, IntArray]:
-        """Units of observations with shared errors: those of robots at one stop, and repeats.
-
-        Returns:
-            (n,) the unit of each observation, -1 for none, and (u, w) the indices of each unit's
-            robots, padded with -1; units of repeats come last and have no robots.
-        """
-        of, robots = self._robot_units
-        units = of.copy()
-        for at, rows in enumerate(self.repeats, start=len(robots)):
-            units[rows] = at
-        no_robots = np.full((len(self.repeats), max(robots.shape[1], 1)), -1, dtype=np.int64)
-        return units, np.concatenate([robots.reshape(-1, no_robots.shape[1]), no_robots])
-
-    @cached_property
     def shared_units(self) -> tuple[tuple[int, IntArray], ...]:
         """The units with several observations, and the rows of these."""
         of, members = self.units
@@ -348,17 +333,22 @@ class Problem:
         return alone
 
     @cached_property
-    def repeats(self) -> tuple[IntArray, ...]:
-        """The rows of repeated observations: several of one pair with no robot on its path."""
-        if not self.with_repeats:
-            return ()
-        stationary = [
-            group.rows for group in self.groups if not any(step.robot for step in group.path)
-        ]
-        return tuple(rows for rows in stationary if len(rows) > 1)
+    def repeat_counts(self) -> FloatArray:
+        """(n,) number of the observations that count as one, with no robot on their path."""
+        counts = np.ones(len(self))
+        for group in self.groups if self.with_repeats else ():
+            if not any(step.robot for step in group.path):
+                counts[group.rows] = len(group.rows)
+        return counts
 
     @cached_property
-    def _robot_units(self) -> tuple[IntArray, IntArray]:
+    def units(self) -> tuple[IntArray, IntArray]:
+        """Units of observations with shared errors: those of robots at one stop.
+
+        Returns:
+            (n,) the unit of each observation, -1 for none, and (u, w) the indices of each unit's
+            robots, padded with -1.
+        """
         if self.is_combined:  # each observation is its own unit
             return np.arange(len(self)), np.zeros((len(self), 1), dtype=np.int64)
         count, joined = len(self.robots), []
@@ -370,7 +360,7 @@ class Problem:
                 first[group.rows] = keys + mine[0]
                 joined += [np.stack([keys + mine[0], keys + index], axis=1) for index in mine]
         if not joined:
-            return first, np.zeros((0, 0), dtype=np.int64)
+            return first, np.zeros((0, 1), dtype=np.int64)
         used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
         pairs = pairs.reshape(-1, 2)
         units, of_key = len(used), np.arange(len(used))
@@ -397,11 +387,7 @@ class Problem:
     def by_sensor(self) -> FloatArray:
         """(n, 6, s) Jacobian of the measured poses with respect to the `sensor_values`."""
         parts = [effect.by_sensor for effect in self.effects if effect.by_sensor is not None]
-        jacobian = np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
-        # Repeats share one Jacobian: individual ones differ by noise, and would fit that noise.
-        for rows in self.repeats:
-            jacobian[rows] = jacobian[rows].mean(axis=0)
-        return jacobian
+        return np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
 
     @cached_property
     def flange_jacobian(self) -> Mapping[str, FloatArray]:
@@ -614,8 +600,6 @@ class Problem:
                     np.concatenate([*edges, 6 * len(self.unknown) + group.values]),
                     np.concatenate([*(moved[index][place] for index in unknown), effects], axis=2),
                 )
-        for rows in self.repeats:
-            errors[rows, :, 0] = np.eye(6)
         by_flanges = errors.reshape(len(self), 6, 6 * width)
         result = back, by_flanges, tuple(blocks[index] for index in range(len(self.groups)))
         self._last_moved[:] = [(state, result)]
@@ -685,7 +669,8 @@ class Problem:
         observations = self.observations
         # The last level is that of observations with known covariance.
         level = np.append(noise.sensors, 1.0)[observations.sensors]
-        covariance = level[:, None, None] ** 2 * observations.covariance
+        scale = (self.repeat_counts * level**2)[:, None, None]
+        covariance = np.asarray(scale * observations.covariance)
         places = np.flatnonzero(~observations.has_rotation)
         covariance[places, :3, :] = covariance[places, :, :3] = 0.0
         covariance[places, :3, :3] = _NOT_MEASURED * np.eye(3)
@@ -705,18 +690,10 @@ class Problem:
         """Covariances (u, 6 w, 6 w) of each unit's shared errors."""
         _, members = self.units
         width = 6 * members.shape[1]
-        if not len(members):
-            return np.zeros((0, width, width))
         levels = np.repeat(noise.robots, 3, axis=1) ** 2
         variances = np.full((len(members), members.shape[1], 6), ANYTHING)
         variances[members >= 0] = levels[members[members >= 0]]
-        covariance = variances.reshape(len(members), width)[:, :, None] * np.eye(width)
-        own = self.covariance(noise) if self.repeats else np.zeros((0, 6, 6))
-        first = len(members) - len(self.repeats)
-        for at, rows in enumerate(self.repeats, start=first):
-            # So that the mean of n repeats has the covariance of a single observation.
-            covariance[at, :6, :6] = (1.0 - 1.0 / len(rows)) * own[rows].mean(axis=0)
-        return covariance
+        return np.asarray(variances.reshape(len(members), width)[:, :, None] * np.eye(width))
 
 
 def _rows_of(array: FloatArray, rows: IntArray) -> FloatArray:

@@ -259,15 +259,12 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
         for axis in range(3):
             at = 6 * slots + axis
             parts[2 * robot, rows, at, at] = parts[2 * robot + 1, rows, at + 3, at + 3] = 1.0
-    moving, covariance = problem.moving, reduced.covariance.copy()
-    if problem.repeats:
-        first = len(members) - len(problem.repeats)
-        covariance[first:] += problem.error_covariance(noise)[first:]
+    moving = problem.moving
     jacobian = np.ascontiguousarray(reduced.jacobian[:, :, moving])
     levels = np.arange(2 * count)
     seen = np.intersect1d(np.arange(count), members)
     model = MixedModel(
-        (Units(reduced.errors, jacobian, covariance, parts, levels),),
+        (Units(reduced.errors, jacobian, reduced.covariance, parts, levels),),
         (CommonRows(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),),
         np.zeros((jacobian.shape[2], len(levels))),
         ratio_prior(seen.tolist(), len(levels)),

@@ -221,7 +221,7 @@ def estimate_noise(
     squares, redundancies = posterior(problem, state, noise, robots.reduced)
     sensors = noise.sensors.copy()
     for sensor in range(len(sensors)):
-        observed = problem.observations.sensors == sensor
+        observed = (problem.observations.sensors == sensor) & (problem.repeat_counts == 1.0)
         redundancy = float(redundancies[observed].sum())
         if redundancy > 1.0:
             factor = np.sqrt(float(squares[observed].sum()) / redundancy)
@@ -361,59 +361,23 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
     return np.asarray(np.sum(linear.residuals * white, axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class RepeatErrors:
-    """Errors shared by repeats of one static frame seen by another, as q additional unknowns."""
-
-    jacobian: FloatArray  # (n, 6, q) of the residuals by these errors.
-    values: FloatArray  # (q,) maximum-posterior estimates.
-    covariance: FloatArray  # (p + q, p + q) of all unknowns, these last.
-
-    @classmethod
-    def of(cls, problem: Problem, solution: Solution) -> "RepeatErrors":
-        """Estimates them at a converged fit."""
-        state, noise, (unit_of, members) = solution.state, solution.noise, problem.units
-        fitted = fitted_covariance(problem, state, noise)
-        linear, count = problem.linear(state), len(problem.repeats)
-        rows = np.flatnonzero(unit_of >= len(members) - count) if count else np.zeros(0, np.int64)
-        places = 6 * (unit_of[rows] - len(members) + count)[:, None] + np.arange(6)
-        jacobian = np.zeros((len(problem), 6, 6 * count))
-        jacobian[rows[:, None, None], np.arange(6)[:, None], places[:, None]] = linear.by_errors[
-            rows, :, :6
-        ]
-        own = jacobian[rows]
-        weighted = np.linalg.solve(problem.covariance(noise)[rows], own)
-        prior = problem.error_covariance(noise)[len(members) - count :, :6, :6]
-        prior_information = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
-        inverse = np.linalg.inv(prior_information + gram(weighted, own))
-        values = -inverse @ gram(weighted, linear.residuals[rows])
-        response = -inverse @ gram(weighted, linear.jacobian_of(rows))
-        cross = fitted @ response.T
-        covariance = np.block([[fitted, cross], [cross.T, inverse + response @ cross]])
-        return cls(jacobian, values, covariance)
-
-
 def equations_from(
-    problem: Problem, solution: Solution, errors: RepeatErrors, asked: IntArray
+    problem: Problem, solution: Solution, asked: IntArray
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     """Accumulates information and gradient of the observations from each stop on, last stop first.
 
     Args:
         problem: The observations.
         solution: The unknowns and the noise.
-        errors: Shared errors of repeats, which come last among the unknowns.
         asked: (a,) indices of the unknowns of interest.
 
     Yields:
-        Each stop with the rows of the information (a, p + q) and gradient (a,) of it and all later
+        Each stop with the rows of the information (a, p) and gradient (a,) of it and all later
         stops, without priors.
     """
-    state, stops = solution.state, problem.observations.stops
-    # Errors shared by repeats are unknowns here, not noise.
-    apart, linear = replace(problem, with_repeats=False), problem.linear(state)
-    whitening = Whitening.of(apart, solution.noise, linear.by_errors)
-    residuals = linear.residuals + errors.jacobian @ errors.values
-    augmented = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
+    stops, linear = problem.observations.stops, problem.linear(solution.state)
+    whitening = Whitening.of(problem, solution.noise, linear.by_errors)
+    augmented = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
     total = np.zeros((len(asked), augmented.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         at_stop = np.flatnonzero(stops == stop)

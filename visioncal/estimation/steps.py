@@ -31,7 +31,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
-    RepeatErrors,
     Solution,
     equations_from,
     fit_problem,
@@ -171,7 +170,7 @@ def find_steps(
         kinds: Number of kinds of residuals, rotations and positions, if a change may be in one
             alone: it then has to explain a half as much, and noise explains it more often.
     """
-    errors, size = RepeatErrors.of(problem, fit), problem.size
+    size, fitted = problem.size, fitted_covariance(problem, fit.state, fit.noise)
     effects = [candidate.effect for candidate in candidates if candidate.effect is not None]
     widened = problem.with_effects([*problem.effects, *effects])
     values = np.append(fit.state.values, np.zeros(widened.size - size))
@@ -191,10 +190,10 @@ def find_steps(
     for candidate in candidates:
         tried[candidate.kind] += len(candidate.stops)
     for stop, information, gradient in equations_from(
-        widened, start, errors, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+        widened, start, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
     ):
-        across = np.delete(information, np.s_[size : widened.size], axis=1)
-        following = -errors.covariance @ across.T
+        across = information[:, :size]
+        following = -fitted @ across.T
         for at, candidate in enumerate(candidates):
             if stop not in candidate.stops:
                 continue
@@ -216,7 +215,7 @@ def find_steps(
                 continue
             squares[at] = square
             gain = -freedom * float(np.log1p(-min(square / freedom, _MOST_EXPLAINED)))
-            before = following[:size, mine] @ value
+            before = following[:, mine] @ value
             after = before.copy()
             if candidate.effect is None:
                 after[columns[at]] += value
