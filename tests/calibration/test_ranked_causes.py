@@ -50,7 +50,7 @@ EXCHANGED = Finding(
 POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
 FIELD = Finding("lens_field", "The lens departs.", mahalanobis_sq=300.0, up_to_mm=0.08)
 DRIFT = Finding("moved_slowly", "Residuals drift with time.")
-MEASURED = MeasuredScale(0, 4.7e-3, 6e-4, 8e-4)
+MEASURED = MeasuredScale(4.7e-3, 6e-4, 8e-4)
 SIZE = scale_finding(
     "board", load_target("charuco_9x6_30mm"), MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4)
 )

@@ -15,7 +15,6 @@ import numpy as np
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among, covariance_from
@@ -29,7 +28,6 @@ from visioncal.estimation.solve import (
     covariance_of,
     fit_problem,
     fitted_covariance,
-    held_shift,
 )
 
 # False-alarm probability of the test for freeing unknowns.
@@ -55,22 +53,11 @@ class FrameModel(Protocol):
         """Initial noise levels; None for `starting_noise`."""
 
     @property
-    def errors(self) -> tuple[ArmErrors, ...]:
-        """Estimated arm errors."""
-
-    @property
     def has_links(self) -> bool:
         """Whether arm link errors are free, which are correlated with a board's scale."""
 
-    @property
-    def has_errors(self) -> bool:
-        """Whether any arm errors are free."""
-
     def problem(self, seen: LinearisedCorners) -> Problem:
         """Builds the problem of the used observations, with lenses and boards as first effect."""
-
-    def rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) index of the view of each of its observations; -1 for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,19 +155,6 @@ def diverging() -> Iterator[None]:
         ) from error
 
 
-def refit_jointly(
-    fitted: ConvergedFit, model: FrameModel, optics: CameraParameters | None = None
-) -> ConvergedFit:
-    """Refits from a converged fit, with other sizes of errors of lenses and boards."""
-    return fit_jointly(
-        optics or fitted.camera_parameters,
-        model,
-        fitted.frames,
-        fitted.others,
-        before=fitted.linearised,
-    )
-
-
 def _settled(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     for _ in range(_ROUNDS):
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
@@ -233,7 +207,6 @@ def _fitted(
 class MeasuredScale:
     """Scale of a board (or rig) measured by the chain alone, without the prior of its size."""
 
-    board: int  # Index of the board.
     scale: float  # Relative deviation from the stated size, positive if larger.
     sigma: float  # Its standard deviation.
     stated_sigma: float  # Relative standard deviation of the stated size.
@@ -249,70 +222,49 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(model: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
-    """A board's scale by the robots' motion; infinite sigma if it is unobservable."""
-    optics, place = fitted.camera_parameters, fitted.camera_parameters.scale_of(board)
-    stated = optics.stated_scale_sigma(board)
-    if place[0] not in fitted.linearised.free:
-        return MeasuredScale(board, 0.0, np.inf, stated)
-    covariance = covariance_of(fitted.problem, fitted.fit)
-    ((column,), prior) = fitted.columns_of(place), float(optics.prior_information[place, place][0])
-    scale = float(optics.values[place[0]] + held_shift(fitted.problem, fitted.fit)[column])
-    # The estimate is the mean of the measured and the stated scale, weighted by their information.
-    measured = 1.0 / float(covariance[column, column]) - prior
-    if measured <= _UNMEASURED * prior:
-        return MeasuredScale(board, 0.0, np.inf, stated)
-    scale *= 1.0 + prior / measured
-    sigma = (UNEVEN_LINKS if model.has_links else 1.0) * measured**-0.5
-    return MeasuredScale(board, scale, sigma, stated)
+def measured_scale(
+    model: FrameModel, fitted: ConvergedFit, frame: str, board: int
+) -> MeasuredScale:
+    """Measures the scale of a target by the robots' motion, without the prior of its size.
 
-
-def measured_rig(model: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
-    """Measures the scale of a rig of points by the robots' motion, its table being taken as exact.
-
-    Its views alone cannot determine it: a larger rig farther away looks the same.
+    Its views alone cannot determine it: a larger target farther away looks the same.
 
     Args:
         model: Frame part of the fit.
         fitted: The converged fit.
-        frame: Frame of the rig.
-        rig: Index of the rig among the targets.
+        frame: Frame of the target.
+        board: Index of the target.
     """
-    problem, state = fitted.problem, fitted.fit.state
-    problem = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
+    problem, state, optics = fitted.problem, fitted.fit.state, fitted.camera_parameters
+    widened = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
     extended = State(state.edges, np.append(state.values, 0.0))
-    information, gradient = normal_equations(problem, extended, fitted.fit.noise)
-    covariance = covariance_among(information, problem.moving)
-    sigma = (UNEVEN_LINKS if model.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
-    return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
+    information, gradient = normal_equations(widened, extended, fitted.fit.noise)
+    covariance = covariance_among(information, widened.moving)
+    total, scale, stated = np.zeros(widened.size), 0.0, 0.0
+    total[-1] = 1.0
+    if board in optics.printed and optics.scale_of(board)[0] in fitted.linearised.free:
+        place = optics.scale_of(board)
+        scale, stated = float(optics.values[place[0]]), optics.stated_scale_sigma(board)
+        total[fitted.columns_of(place)] = 1.0
+    scale -= float(total @ covariance @ gradient)
+    sigma = float(total @ covariance @ total) ** 0.5
+    return MeasuredScale(scale, (UNEVEN_LINKS if model.has_links else 1.0) * sigma, stated)
 
 
-def rig_by_stated_arms(
-    fitted: ConvergedFit, stated: Problem, frame: str, rig: int
-) -> MeasuredScale | None:
-    """Measures the scale of a rig with nominal arms; see `measured_rig`.
+def scale_by_stated_arms(fitted: ConvergedFit, stated: Problem, frame: str) -> MeasuredScale | None:
+    """Measures the scale of an exact target with nominal arms; None where errors are likelier.
 
-    Longer links explain a larger rig as well, but one scale is simpler than many link errors.
-
-    Args:
-        fitted: The fit, with calibrated arms.
-        stated: The same observations, with nominal arms.
-        frame: Frame of the rig.
-        rig: Index of the rig among the targets.
-
-    Returns:
-        Its scale; None if arm errors have the higher likelihood.
+    Longer links explain a larger target as well, but one scale is simpler than many link errors.
+    `stated` has the same observations as the fit, which has calibrated arms.
     """
-    with_scale = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
-    fit = fit_problem(with_scale, State(fitted.fit.state.edges, with_scale.start_values))
-
-    def nll(problem: Problem, solution: Solution) -> float:
-        return robot_likelihood(problem, solution.state, solution.noise).white[1]
-
-    if nll(with_scale, fit) > nll(fitted.problem, fitted.fit):
+    widened = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
+    fit = fit_problem(widened, State(fitted.fit.state.edges, widened.start_values))
+    pairs = ((fitted.problem, fitted.fit), (widened, fit))
+    calibrated, sized = (robot_likelihood(at, by.state, by.noise).white[1] for at, by in pairs)
+    if sized > calibrated:
         return None
-    sigma = float(covariance_of(with_scale, fit)[-1, -1] ** 0.5)
-    return MeasuredScale(rig, float(fit.state.values[-1]), sigma, 0.0)
+    sigma = float(covariance_of(widened, fit)[-1, -1] ** 0.5)
+    return MeasuredScale(float(fit.state.values[-1]), sigma, 0.0)
 
 
 def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf) -> Effect:

@@ -17,10 +17,9 @@ from visioncal.estimation.joint import (
     MeasuredScale,
     chance_limit,
     contradicted_lens,
-    measured_rig,
     measured_scale,
     moved_mahalanobis_sq,
-    rig_by_stated_arms,
+    scale_by_stated_arms,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem
@@ -68,16 +67,15 @@ def lens_and_board_findings(
             yield finding.of(of)
     scene = next(iter(optics.problems.values())).scene
     for board, target in enumerate(scene.targets):
-        measured = measured_scale(model, fitted, board) if board in optics.printed else None
         called = f"board {scene.names[board]}".strip()
-        if measured is None:
-            yield from _point_findings(target, optics.moved_points(board))
-            frame = frame_name("target", scene.names[board])
-            rig = measured_rig(model, fitted, frame, board)
+        frame = frame_name("target", scene.names[board])
+        measured = measured_scale(model, fitted, frame, board)
+        if board not in optics.printed:
             if stated is not None:
-                rig = rig_by_stated_arms(fitted, stated, frame, board) or rig
-            if rig.is_another and abs(rig.scale) >= _SAME_SIZE:
-                yield _rig_size_finding(target, rig)
+                measured = scale_by_stated_arms(fitted, stated, frame) or measured
+            yield from _point_findings(target, optics.moved_points(board))
+            if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
+                yield _rig_size_finding(target, measured)
             continue
         (place,) = optics.scale_of(board)
         if measured.is_another and place in fitted.linearised.moving:

@@ -23,7 +23,6 @@ from visioncal.estimation.joint import (
     FrameModel,
     diverging,
     fit_jointly,
-    refit_jointly,
 )
 from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
@@ -152,13 +151,17 @@ def _follows(
     model: FrameModel, fitted: ConvergedFit, sized: CameraParameters
 ) -> ConvergedFit | None:
     """A refit with other sizes; None where it diverges."""
+
     # Cameras that disagree about a stop agree once the board has shrunk to nothing, or the lenses
     # image nothing: such a fit may converge, but no corner is where it was seen.
+    def refitted(optics: CameraParameters) -> ConvergedFit:
+        return fit_jointly(optics, model, fitted.frames, fitted.others, fitted.linearised)
+
     try:
-        refit = refit_jointly(fitted, model, sized)
+        refit = refitted(sized)
         if _is_shrunk(refit):
             stated = tuple(replace(item, scale=0.0) for item in sized.board_sizes)
-            refit = refit_jointly(fitted, model, sized.with_sizes({}, {}, stated))
+            refit = refitted(sized.with_sizes({}, {}, stated))
     except ConvergenceError:
         return None
     sigmas = zip(refit.linearised.sigmas_px, fitted.linearised.sigmas_px, strict=True)
