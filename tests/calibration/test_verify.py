@@ -267,7 +267,7 @@ def test_one_of_two_boards_that_moved_is_named():
     moved = predict_detected(known, prior_calibration)
     # Some stops show both.
     assert len(moved.problem) > moved.stops == 24
-    mine = np.array([shown[views[0]] for views in moved.views]) == 1
+    mine = np.array([shown[view] for view in moved.views]) == 1
     seen = moved.problem.observations
     measured = np.where(mine[:, None, None], seen.measured @ exp(pushed), seen.measured)
     pushed = replace(moved.problem, observations=replace(seen, measured=measured))

@@ -374,26 +374,3 @@ def test_repeated_views_of_a_still_board_count_as_one():
     plain = replace(moving, with_repeats=False)
     found = [covariance_of(value, Solution(state, NOISE)) for value in (moving, plain)]
     np.testing.assert_array_equal(*found)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_observations_of_one_stop_merge_without_loss(count):
-    """What moves with two effects on sensors stays apart: it tells of both together."""
-    rng = np.random.default_rng(4)
-    cell, problem = problem_of(4, stops=8)
-    rows = np.repeat(np.arange(len(problem)), 2)
-    seen = replace(problem.observations.take(rows), sensors=np.full(len(rows), -1))
-    known = PriorInformation(np.eye(2), np.zeros(2))
-    by_sensor = rng.normal(size=(count, len(rows), 6, 2)) * 1e-3
-    effects = [Effect.free(f"effect {at}", known, value) for at, value in enumerate(by_sensor)]
-    twice = replace(problem, observations=seen).with_effects(effects)
-    merged = twice.merged()
-    assert len(merged) == (len(problem) if count == 1 else len(rows))
-    state = replace(true_state(cell, problem), values=np.zeros(2 * count))
-    information, gradient = normal_equations(merged, state, NOISE, ideal=True)
-    expected, expected_gradient = normal_equations(twice, state, NOISE, ideal=True)
-    # The same sums in another order. At the true state residuals are zero: what rounding leaves of
-    # the gradient moves no unknown by more than 1e-15 of its unit.
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(information, expected, rtol=1e-6, atol=1e-9 * scale)
-    np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-15 * scale)

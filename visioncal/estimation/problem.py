@@ -20,7 +20,6 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import PathStep, Stride, Tree, TreePaths
@@ -146,80 +145,6 @@ class Problem:
             self,
             observations=self.observations.take(rows),
             effects=tuple(effect.take(rows) for effect in self.effects),
-        )
-
-    @cached_property
-    def of_one_stop(self) -> IntArray:
-        """(n,) groups of observations of the same frames at one stop, numbered by appearance.
-
-        Observations that several sensor effects move stay separate: merging would mix the effects.
-        """
-        observations, keys = self.observations, dict[tuple[int, str, str, int], int]()
-        moved = [
-            effect.by_sensor.any(axis=(1, 2))
-            for effect in self.effects
-            if effect.by_sensor is not None
-        ]
-        separate = np.where(np.sum(moved, axis=0) > 1, np.arange(len(observations)), -1).tolist()
-        labels = zip(
-            observations.stops.tolist(),
-            observations.observers,
-            observations.observed,
-            separate,
-            strict=True,
-        )
-        return np.array([keys.setdefault(pair, len(keys)) for pair in labels], dtype=np.int64)
-
-    def merged(self) -> "Problem":
-        """Merges the observations of each stop (`of_one_stop`) into one.
-
-        Poses are averaged, weighted by their information (equally if the noise is unknown). Their
-        differences are information on the sensor effect and are added to its prior: nothing is
-        lost.
-        """
-        units = self.of_one_stop
-        first_rows = np.unique(units, return_index=True)[1]
-        if len(first_rows) == len(units):
-            return self
-        observations, by_sensor = self.observations.take(first_rows), self.by_sensor[first_rows]
-        measured, covariance = observations.measured.copy(), observations.covariance.copy()
-        width = by_sensor.shape[2]
-        information, gradient = np.zeros((width, width)), np.zeros(width)
-        for unit in np.flatnonzero(np.bincount(units) > 1).tolist():
-            rows = np.flatnonzero(units == unit)
-            weights = np.tile(np.eye(6), (len(rows), 1, 1))
-            if not self.is_combined:
-                weights = covariance_from(self.observations.covariance[rows])
-            mean = covariance_from(weights.sum(axis=0))
-            shares = mean @ weights
-            residuals = log(invert(measured[unit]) @ self.observations.measured[rows])
-            shift = np.einsum("mij,mj->i", shares, residuals)
-            measured[unit] = measured[unit] @ exp(shift)
-            by_sensor[unit] = np.einsum("mij,mjk->ik", shares, self.by_sensor[rows])
-            if not self.is_combined:
-                covariance[unit] = mean
-                differences = self.by_sensor[rows] - by_sensor[unit]
-                weighted = np.swapaxes(differences, 1, 2) @ weights
-                information += np.sum(weighted @ differences, axis=0)
-                gradient += np.einsum("mij,mj->i", weighted, residuals - shift)
-        effects, start = [], 0
-        for effect in self.effects:
-            merged_effect = effect.take(first_rows)
-            if effect.by_sensor is not None:
-                columns = slice(start, start + len(effect))
-                start += len(effect)
-                prior = PriorInformation(
-                    effect.prior.information + information[columns, columns],
-                    effect.prior.gradient + gradient[columns],
-                )
-                merged_effect = replace(
-                    merged_effect, prior=prior, by_sensor=by_sensor[:, :, columns]
-                )
-            effects.append(merged_effect)
-        return replace(
-            self,
-            observations=replace(observations, measured=measured, covariance=covariance),
-            effects=tuple(effects),
         )
 
     def with_poses(self, robot: str, poses: FloatArray) -> "Problem":

@@ -122,12 +122,11 @@ class ObservedPoses(Observed):
         """(m,) stop of the robot at each view, numbered from 0.
 
         Views of one stop share the robot's error. Of measured poses, the noise is not separated
-        from the robot's: each of several boards then has stops of its own.
+        from the robot's: each then has a stop of its own.
         """
-        own = len(self.boards) > 1 and any(self.poses[view].corners is None for view in views)
+        own = any(self.poses[view].corners is None for view in views)
         keys: dict[tuple[int, int], int] = {}
-        boards = (self.poses[view].board if own else 0 for view in views)
-        both = zip((self._stations[view] for view in views), boards, strict=True)
+        both = ((self._stations[view], view if own else 0) for view in views)
         return np.array([keys.setdefault(pair, len(keys)) for pair in both], dtype=np.int64)
 
     @cached_property

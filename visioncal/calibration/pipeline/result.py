@@ -262,14 +262,12 @@ def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     whole, state = assessment.problem, assessment.state
     problem = whole.with_effects([part for part in whole.effects if part.name not in growing])
     values = [whole.values_of(part.name, state) for part in problem.effects]
-    merged = problem.merged()
-    linear = merged.linear(State(state.edges, np.concatenate([np.zeros(0), *values])))
-    first = np.unique(problem.of_one_stop, return_index=True)[1]
+    linear = problem.linear(State(state.edges, np.concatenate([np.zeros(0), *values])))
     views = np.array([row.view for row in run.cell_fit.cell.rows])[run.cell_fit.inlier_fit.used]
-    (poses, *_), observations = merged.poses.values(), merged.observations
+    (poses, *_), observations = problem.poses.values(), problem.observations
     return FittedStops(
-        views=tuple(views[first].tolist()),
-        boards=tuple(merged.unknown[name] - 1 for name in observations.observed),
+        views=tuple(views.tolist()),
+        boards=tuple(problem.unknown[name] - 1 for name in observations.observed),
         poses=log(poses[observations.stops]),
         residuals=np.round(linear.residuals, 9),
         by_noise=by_noise,

@@ -69,7 +69,7 @@ def causes_of(
         other = replace(size, columns=replace(size.columns, units=units))
         causes.append(_simultaneous(REPLACED, board, other))
     # Camera and board together fit any two stops.
-    if len(prior.boards) == 1 and len(predicted.problem) >= FEWEST_VIEWS:
+    if len(prior.boards) == 1 and predicted.stops >= FEWEST_VIEWS:
         causes += [_simultaneous(BOTH, camera, board) for board in boards]
     causes += _joints(predicted, prior)
     if predicted.stops > 1:
@@ -164,7 +164,7 @@ def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause
         # All boards of a stop move together.
         transform = adjoint(invert(boards) @ boards[first])
         columns = ChangeHypothesis(
-            f"{VIEW} {predicted.views[first][0]}",
+            f"{VIEW} {predicted.views[first]}",
             _MOTION_UNITS,
             np.where(at_stop[:, None, None], -transform, 0.0),
             start=changes[first],

@@ -336,13 +336,13 @@ def to_document(
         },
         "stops": [
             {
-                "views": list(views),
+                "views": [view],
                 "off_mm": 1e3 * float(np.linalg.norm(away[3:])),
                 "off_deg": float(np.rad2deg(np.linalg.norm(away[:3]))),
                 "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
                 "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
             }
-            for views, away, left in zip(
+            for view, away, left in zip(
                 check.predicted.views, check.residuals, check.remaining, strict=True
             )
         ],

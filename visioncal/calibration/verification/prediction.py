@@ -42,8 +42,8 @@ class PredictedStops:
 
     # The session's observations, with the calibration's lens, boards and arm.
     observed: ObservedPoses
-    problem: Problem  # The m observations of a board at a stop, with the calibration's unknowns.
-    views: tuple[tuple[int, ...], ...]  # (m,) the views that each observation combines.
+    problem: Problem  # The m views of a board, with the calibration's unknowns.
+    views: tuple[int, ...]  # (m,) their numbers.
     warnings: tuple[str, ...]  # Warnings, in sentences.
 
     @property
@@ -149,14 +149,8 @@ def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     # robot's.
     run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
     observed = _with_poses(_with_arm(ObservedPoses.of(run), prior), prior)
-    problem, used = observed.problem(observed.used), np.array(observed.used)
-    merged = problem.of_one_stop
-    return PredictedStops(
-        observed,
-        problem.merged(),
-        tuple(tuple(used[merged == at].tolist()) for at in range(merged.max() + 1)),
-        tuple(_warnings(observed, prior)),
-    )
+    problem, warnings = observed.problem(observed.used), tuple(_warnings(observed, prior))
+    return PredictedStops(observed, problem, observed.used, warnings)
 
 
 def _in_lens_model(

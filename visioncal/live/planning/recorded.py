@@ -242,7 +242,7 @@ def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
         poses={name: pose[stops] for name, pose in part.poses.items()},
         observations=replace(part.observations, stops=of),
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
-    ).merged()
+    )
     noise = cell_fit.inlier_fit.fit.noise
     return _RecordedStart(
         problem,
@@ -280,7 +280,7 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     )
     free = free_parameters_of_camera(optics.linearised())
     observed = replace(observed, free=free).posed(poses)
-    problem = observed.problem(chosen).merged()
+    problem = observed.problem(chosen)
     return _RecordedStart(
         problem,
         problem.start(observed.frames),

@@ -36,7 +36,7 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
     change = check.named[0] if check.named else None
     # The change that can be undone, unlike mere noise.
     undone = "" if change is None or change.cause.kind == NOISE else change_words(check, change)
-    stops = [", ".join(map(str, views)) for views in check.predicted.views]
+    stops = [str(view) for view in check.predicted.views]
     before, after = _lengths(check.residuals), _lengths(check.remaining)
     return template("check.html.j2").render(
         check=check,
