@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
-from visioncal.core.transforms import compose, invert, nearest_rotation, quaternions, skew
+from visioncal.core.transforms import compose, exp, invert, nearest_rotation, quaternions, skew
 from visioncal.core.types import FloatArray
 
 _FEWEST_VIEWS, _GROUP = 2, 100
@@ -301,17 +301,20 @@ def _lone_axis(robot: FloatArray, camera: FloatArray) -> FloatArray:
     along the axis remains undetermined, and zero.
     """
     matched = rotation_pairs(robot, camera).matched
-    axis, aligned = np.linalg.svd(matched)[0][:, 0], nearest_rotation(matched)
-    seen = _half_way(camera) @ aligned.T
-    along = (seen @ axis)[:, None] * axis
-    columns = np.stack([seen - along, np.cross(axis, seen)], axis=2)
-    turns = robot[:, :3, :3]
-    system = np.concatenate([turns @ columns, turns], axis=2)
-    right = -(robot[:, :3, 3] + (turns @ along[:, :, None])[:, :, 0])
-    system, right = system - system.mean(axis=0), right - right.mean(axis=0)
-    cosine, sine = np.linalg.lstsq(system.reshape(-1, 5), right.reshape(-1))[0][:2]
-    turn = Rotation.from_rotvec(np.arctan2(sine, cosine) * axis).as_matrix()
-    return np.asarray(turn @ aligned)
+    axis, aligned = np.linalg.svd(matched)[0][..., None, :, 0], nearest_rotation(matched)
+    seen = _half_way(camera) @ np.swapaxes(aligned, -1, -2)
+    along = np.sum(seen * axis, axis=-1, keepdims=True) * axis
+    turns = robot[..., :3, :3]
+    columns = turns @ np.stack([seen - along, np.cross(axis, seen)], axis=-1)
+    system = np.concatenate([columns, turns], axis=-1)
+    right = -(robot[..., :3, 3:] + turns @ along[..., None])
+    whole = np.concatenate([system, right], axis=-1)
+    whole = (whole - whole.mean(axis=-3, keepdims=True)).reshape(*matched.shape[:-2], -1, 6)
+    cosine, sine = np.moveaxis((np.linalg.pinv(whole[..., :5]) @ whole[..., 5:])[..., :2, 0], -1, 0)
+    turn = np.arctan2(sine, cosine)[..., None] * axis[..., 0, :]
+    return np.asarray(
+        exp(np.concatenate([turn, np.zeros_like(turn)], axis=-1))[..., :3, :3] @ aligned
+    )
 
 
 def _mean_camera(camera: FloatArray) -> FloatArray:
@@ -320,8 +323,9 @@ def _mean_camera(camera: FloatArray) -> FloatArray:
 
 
 def _half_way(camera: FloatArray) -> FloatArray:
-    """The (m, 3) target's point half-way to the camera; see `complete`."""
-    return np.asarray(camera[:, :3, :3] @ (0.5 * _mean_camera(camera)) + camera[:, :3, 3])
+    """The (..., m, 3) target's point half-way to the camera; see `complete`."""
+    middle = 0.5 * _mean_camera(camera)[..., None, :, None]
+    return np.asarray((camera[..., :3, :3] @ middle)[..., 0] + camera[..., :3, 3])
 
 
 def _smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> FloatArray:

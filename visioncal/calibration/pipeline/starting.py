@@ -58,15 +58,15 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount, len(cell.rows))
         _refuse_few_of_each(cell)
-    initial = init_frames(problem, views, targets_of(cell))
-    tied, chosen = initial.connected, {view.view: view for view in initial.views}
+    tied = init_frames(problem, views, targets_of(cell))
+    chosen = {view.view: view for view in tied.views}
     if tied.untied:
         refuse_unconnected_robots(cell, tied.untied, seen=True)
         cell = _without_frames(cell, tied.untied)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
     cell, unlinked = _connected_part(
-        cell.without({rejection.view: rejection.reason for rejection in initial.rejections})
+        cell.without({rejection.view: rejection.reason for rejection in tied.rejections})
     )
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)

@@ -3,71 +3,58 @@
 The mirrored solutions of a planar target, and the turns of a board with a rotational symmetry, look
 alike in one image; the robots' motion separates them.
 
-Every pair of frames of which one saw the other at several stops is solved by itself, by a consensus
-of its earliest views: what moves later has not moved yet. A pair with no robot between gives one
-transform; with one robot between it gives two, by a hand-eye calibration. Each body of frames (what
-stands in the cell, what a flange carries) is grown by the best transforms first (Prim 1957); frames
-that these do not reach are placed by views in which all else is placed. A board that looks the same
-turned is tried in every orientation, and all views together decide.
-
-Where one arm looks at a board in the hand of another, views give `u * first * v * second * w =
-seen` with both arms' poses and three unknown transforms. With one of them known, the other two are
-a hand-eye calibration: these are solved in turn (as Wu, Wang, Qi and Ren 2016 iterate), from starts
-with v in 24 orientations.
+Every pair of frames of which one saw the other is a chain of segments with robots between, each
+segment a constant transform between two frames of one body (what stands in the cell, what a flange
+carries). A consensus of the pair's earliest views, as what moves later has not moved yet, gives one
+unknown segment directly, two by a hand-eye calibration, three by hand-eye calibrations in turn.
+Frames are joined by the best transforms first (Kruskal 1956), which makes more segments known. A
+board that looks the same turned is tried in every orientation, and all views together decide.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from itertools import chain, product
+from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.stages.pairwise import (
     AGREE_M,
     FEWEST,
+    WORST_M,
     Candidates,
-    PairEdges,
+    between_arms,
     common_transform,
     hand_eye,
     partial_hand_eye,
     settled_distances,
 )
-from visioncal.calibration.stages.pnp import ViewPoses, distances_m
+from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection, Target
-from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.procrustes import align, spreads
-from visioncal.estimation.tree import PathStep
+from visioncal.estimation.tree import PathStep, Tree
 from visioncal.vision.targets import rotation_transforms
 
 # A rival within this ratio of the chosen candidate's distance is as likely.
 CLEAR_RATIO = 3.0
 # Share of the stops, and fewest views of a pair, that initial poses are estimated from.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
-# Distances of views are capped here in a start's score [m]; most orientations that are tried.
-_CAPPED_M, _MOST_TRIED = 0.1, 256
-# Between two arms: fewest views, rounds of a start, number of starts that are continued, their
-# rounds, and the largest median distance of the views in the end [m].
-_FEWEST_VIEWS, _FIRST_ROUNDS, _FOLLOWED, _LONG, _NEAR_M = 5, 6, 4, 40, 0.02
-# Fewest stops at which points are read to determine them and the instrument; fewest points that
-# place an instrument, and their least extent in the second direction [m].
-_FEWEST_STOPS, _FEWEST_POINTS, _SPREAD_M = 4, 3, 0.02
+# Most orientations of boards that are tried.
+_MOST_TRIED = 256
+# Fewest stops at which points are read to determine them and the instrument; least extent of points
+# in the second direction that places an instrument [m].
+_FEWEST_STOPS, _SPREAD_M = 4, 0.02
 # Assumed sigma of these starts [m].
 _ROUGH_M = 1e-2
 
-# (4, 4) `body_from_frame` by name; and a frame with (t, 4, 4) candidate poses and a sigma [m].
-_Placed: TypeAlias = Mapping[str, FloatArray]
-_Option: TypeAlias = tuple[str, FloatArray, float]
-
 
 @dataclass(frozen=True, eq=False)
-class ConnectedFrames:
-    """Initial poses of the frames that are connected to the tree."""
+class InitialFrames:
+    """Initial poses of the frames, and one pose of each view."""
 
     # (4, 4) `parent_from_frame` of the unknown frames that are connected.
     edges: Mapping[str, FloatArray]
@@ -75,40 +62,54 @@ class ConnectedFrames:
     # Frames that are connected only through boards that look the same turned, so that other poses
     # fit as well.
     ambiguous: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class InitialFrames:
-    """Initial poses of the frames, and one pose of each view."""
-
-    connected: ConnectedFrames  # The frames.
     # The unambiguous views, with one pose each; where a turned pose was chosen, the corners are
     # renumbered to match.
-    views: tuple[ViewPoses, ...]
-    rejections: tuple[Rejection, ...]  # The ambiguous views.
+    views: tuple[ViewPoses, ...] = ()
+    rejections: tuple[Rejection, ...] = ()  # The ambiguous views.
 
 
 @dataclass(frozen=True, eq=False)
 class _Relation:
-    """A transform `first_from_second` (4, 4) between two frames of one body.
-
-    `turns` (t, 4, 4) are symmetries by which the second frame may have been seen turned.
-    """
+    """A transform `first_from_second` between two frames of one body."""
 
     first: str
     second: str
-    matrix: FloatArray
+    # (t, 4, 4), several where a board that looks the same turned leaves several.
+    matrices: FloatArray
     sigma_m: float  # With rotations on a lever.
-    turns: FloatArray = field(default_factory=lambda: np.eye(4)[None])
 
 
 @dataclass(frozen=True, eq=False)
-class _Factor:
-    """A factor of a chain: a frame's pose in its body, or a robot's poses (m, 4, 4)."""
+class _Joined:
+    """The frames of a tree, joined to components of its bodies."""
 
-    frame: str  # Empty for a robot.
-    robot: FloatArray
-    is_inverse: bool
+    component: Mapping[str, str]  # Of each frame; its body's name where it is placed in that.
+    poses: Mapping[str, FloatArray]  # (4, 4) of each frame in its component.
+
+    @classmethod
+    def apart(cls, tree: Tree) -> Self:
+        """Every frame by itself."""
+        frames = (tree.root, *tree.branches)
+        return cls({frame: frame for frame in frames}, dict.fromkeys(frames, np.eye(4)))
+
+    def between(self, first: str, second: str) -> FloatArray | None:
+        """(4, 4) `first_from_second`; None where they are not joined."""
+        if self.component[first] != self.component[second]:
+            return None
+        return np.asarray(invert(self.poses[first]) @ self.poses[second])
+
+    def is_alone(self, frame: str) -> bool:
+        return [*self.component.values()].count(self.component[frame]) == 1
+
+    def with_joined(self, kept: str, moved: str, kept_from_moved: FloatArray) -> Self:
+        """The frames with the component of one of two joined to that of the other."""
+        change = self.poses[kept] @ kept_from_moved @ invert(self.poses[moved])
+        frames = [name for name, at in self.component.items() if at == self.component[moved]]
+        poses = {name: change @ self.poses[name] for name in frames}
+        components = dict.fromkeys(frames, self.component[kept])
+        return replace(
+            self, component={**self.component, **components}, poses={**self.poses, **poses}
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,29 +119,14 @@ class _Pair:
     seer: str
     seen: str
     rows: IntArray  # All observations, in the order of time.
-    early: IntArray  # The earliest of them; all, where positions alone were read.
+    early: IntArray  # The earliest of them.
     robots: tuple[PathStep, ...]  # The robots between.
-    factors: tuple[_Factor, ...]  # The chain, of the earliest observations.
-    candidates: Candidates  # Their poses.
-
-    def unplaced(self, placed: _Placed) -> list[int]:
-        """The factors that are frames still to place."""
-        frames = [(at, factor.frame) for at, factor in enumerate(self.factors)]
-        return [at for at, frame in frames if frame and frame not in placed]
-
-
-def _product(factors: Sequence[_Factor], placed: _Placed) -> FloatArray:
-    """Product (m, 4, 4) of factors with placed frames; (1, 4, 4) without a robot."""
-    result = np.eye(4)[None]
-    for factor in factors:
-        matrix = factor.robot @ placed[factor.frame] if factor.frame else factor.robot
-        result = result @ (invert(matrix) if factor.is_inverse else matrix)
-    return result
+    segments: tuple[tuple[str, str], ...]  # The frames at the ends of what is between the robots.
 
 
 def init_network(
     problem: Problem, candidates: Candidates, symmetries: Mapping[str, FloatArray]
-) -> ConnectedFrames:
+) -> InitialFrames:
     """Finds initial poses of the frames; the root's body is placed by known edges.
 
     Args:
@@ -149,116 +135,207 @@ def init_network(
         symmetries: (t, 4, 4) turns after which a target looks the same, the identity first, by the
             frame of a target that has them.
     """
-    growth, tree = _Growth.of(problem, candidates, symmetries), problem.tree
-    relations = [*growth.known_relations(), *growth.mounted_points()]
-    for pair in growth.oriented:
-        relations += growth.relations_of(pair)
-    growth = replace(growth, relations=relations)
-    placed, ambiguous = growth.best()
-    if not placed.keys() & {*tree.unknown}:
-        # Whether the motion determines them is checked later.
-        growth = replace(growth, relations=[*relations, *growth.weak_relations()])
-        placed, ambiguous = growth.best()
+    growth, branches = _Growth.of(problem, candidates, symmetries), problem.tree.branches
+    joined, ambiguous = growth.best()
     edges = {
-        name: invert(placed[tree.branches[name].parent]) @ placed[name]
-        for name in tree.unknown
-        if name in placed and tree.branches[name].parent in placed
+        name: edge
+        for name in problem.tree.unknown
+        if growth.is_placed(joined, name)
+        and (edge := joined.between(branches[name].parent, name)) is not None
     }
-    untied = tuple(name for name in tree.unknown if name not in edges)
-    return ConnectedFrames(edges, untied, ambiguous)
+    untied = tuple(name for name in problem.tree.unknown if name not in edges)
+    return InitialFrames(edges, untied, ambiguous)
 
 
 @dataclass(frozen=True, eq=False)
 class _Growth:
-    """Growth of the tree."""
+    """Growth of the components of a tree."""
 
     problem: Problem
     candidates: Candidates
     symmetries: Mapping[str, FloatArray]
     oriented: Sequence[_Pair]  # The pairs whose rotations were measured, too.
     pointed: Sequence[_Pair]  # The pairs of which positions alone were read.
-    relations: Sequence[_Relation] = ()  # Transforms that pairs determine by themselves.
 
     @classmethod
     def of(
         cls, problem: Problem, candidates: Candidates, symmetries: Mapping[str, FloatArray]
-    ) -> "_Growth":
+    ) -> Self:
         """Collects the observations by pairs of frames."""
         seen, rows = problem.observations, dict[tuple[str, str], list[int]]()
         for at in np.argsort(seen.stops, kind="stable").tolist():
             rows.setdefault((seen.observers[at], seen.observed[at]), []).append(at)
         pairs: tuple[list[_Pair], list[_Pair]] = [], []
         for (seer, target), numbers in rows.items():
-            every = np.array(numbers)
-            is_oriented = bool(seen.has_rotation[every[0]])
-            early, last_stop = every, _EARLY_SHARE * float(seen.stops.max())
-            if is_oriented:
-                count = int(np.searchsorted(seen.stops[every], last_stop, side="right"))
-                early = every[: max(count, _FEWEST_EARLY)]
+            every, last_stop = np.array(numbers), _EARLY_SHARE * float(seen.stops.max())
+            count = int(np.searchsorted(seen.stops[every], last_stop, side="right"))
             robots = tuple(step for step in problem.tree.path(seer, target) if step.robot)
-            identity = np.broadcast_to(np.eye(4), (len(early), 4, 4))
-            factors = [_Factor(seer, identity, True)]
+            # Of places alone, the chain is that between the bodies of both.
+            is_oriented = bool(seen.has_rotation[every[0]])
+            frames = [seer if is_oriented else problem.tree.body(seer)]
             for step in robots:
-                flange = _Factor("", problem.poses[step.robot][seen.stops[early]], step.is_up)
-                base = _Factor(problem.tree.branches[step.frame].parent, identity, step.is_up)
-                factors += [flange, base] if step.is_up else [base, flange]
-            factors.append(_Factor(target, identity, False))
-            chosen = candidates.take(early)
-            pair = _Pair(seer, target, every, early, robots, tuple(factors), chosen)
+                ends = step.frame, problem.tree.branches[step.frame].parent
+                frames += ends if step.is_up else ends[::-1]
+            frames.append(target if is_oriented else problem.tree.body(target))
+            segments = tuple(zip(frames[::2], frames[1::2], strict=True))
+            early = every[: max(count, _FEWEST_EARLY)]
+            pair = _Pair(seer, target, every, early, robots, segments)
             pairs[not is_oriented].append(pair)
         return cls(problem, candidates, symmetries, *pairs)
 
-    def turns_of(self, frame: str) -> FloatArray:
-        """The turns (t, 4, 4) after which a frame looks the same, the identity first."""
-        return self.symmetries.get(frame, np.eye(4)[None])
+    def best(self) -> tuple[_Joined, tuple[str, ...]]:
+        """Joins all frames, by the orientations of boards that fit the views.
 
-    def known_relations(self) -> Iterator[_Relation]:
+        Returns:
+            The frames, and those that depend on the unknown orientation of a board.
+        """
+        known = [*self._known(), *self._mounted_points()]
+        apart = _Joined.apart(self.problem.tree)
+        for pair in self.oriented:
+            if len(pair.segments) <= 2:
+                known += self._solved(apart, pair, len(pair.segments))
+        joined, by_turn, counts = self._grown(known, ())
+        if not by_turn:
+            return joined, ()
+        while np.prod(counts, dtype=float) > _MOST_TRIED:
+            counts[counts.index(max(counts))] = 1
+        tried = []
+        for choice in product(*map(range, counts)):
+            joined, by_turn, _ = self._grown(known, choice)
+            tried.append((self._score(joined), choice, joined, by_turn))
+        tried.sort(key=lambda item: item[0])
+        score, chosen, joined, by_turn = tried[0]
+        ambiguous = {
+            name
+            for value, rival, _, _ in tried[1:]
+            if value < CLEAR_RATIO * score
+            for name, own, other in zip(by_turn, chosen, rival, strict=False)
+            if own != other
+        }
+        return joined, tuple(name for name in self.problem.tree.branches if name in ambiguous)
+
+    def _grown(
+        self, known: Sequence[_Relation], chosen: Sequence[int]
+    ) -> tuple[_Joined, list[str], list[int]]:
+        """The joined frames; those joined by a turned board, and the number of its turns."""
+        joined, relations = _Joined.apart(self.problem.tree), [*known]
+        by_turn: list[str] = []
+        counts: list[int] = []
+        while True:
+            options = [
+                (relation, self._matrices(joined, relation))
+                for relation in relations
+                if joined.component[relation.first] != joined.component[relation.second]
+            ]
+            if not options:
+                if not (found := self._found(joined)):
+                    return joined, by_turn, counts
+                relations += found
+                continue
+            # What has several transforms comes last: others may be reached unambiguously.
+            relation, matrices = min(options, key=lambda item: (len(item[1]), item[0].sigma_m))
+            first, second, choice = relation.first, relation.second, 0
+            is_placed = self.is_placed(joined, second)
+            if len(matrices) > 1:
+                choice = chosen[len(by_turn)] if len(by_turn) < len(chosen) else 0
+                by_turn.append(first if is_placed else second)
+                counts.append(len(matrices))
+            if is_placed:
+                joined = joined.with_joined(second, first, invert(matrices[choice]))
+            else:
+                joined = joined.with_joined(first, second, matrices[choice])
+
+    def _matrices(self, joined: _Joined, relation: _Relation) -> FloatArray:
+        """The transforms of a relation that differ by more than the axes of a board by itself."""
+        is_free = relation.second in self.symmetries and joined.is_alone(relation.second)
+        return relation.matrices[:1] if is_free else relation.matrices
+
+    def is_placed(self, joined: _Joined, frame: str) -> bool:
+        """Whether a frame is placed in its body."""
+        tree = self.problem.tree
+        return joined.component[frame] in {tree.root, *tree.flanges.values()}
+
+    def _found(self, joined: _Joined) -> list[_Relation]:
+        """More relations, by what is joined."""
+        return (
+            [*chain.from_iterable(self._solved(joined, pair, 1) for pair in self.oriented)]
+            or [*self._by_points(joined)]
+            or [*chain.from_iterable(self._solved(joined, pair, 2) for pair in self.oriented)]
+            or [*chain.from_iterable(self._solved(joined, pair, 3) for pair in self.oriented)]
+            or [*self._partly_solved(joined)]
+        )
+
+    def _known(self) -> Iterator[_Relation]:
         """The stated transforms."""
         for name, branch in self.problem.tree.branches.items():
             if branch.known is not None:
-                yield _Relation(branch.parent, name, branch.known, 0.0)
+                yield _Relation(branch.parent, name, branch.known[None], 0.0)
         for prior in self.problem.priors:
             if prior.matrix is not None:
-                yield _Relation(prior.first, prior.second, prior.matrix, prior.sigma_m)
+                yield _Relation(prior.first, prior.second, prior.matrix[None], prior.sigma_m)
 
-    def relations_of(self, pair: _Pair) -> Iterator[_Relation]:
-        """The relations that one pair determines by itself."""
-        if not pair.robots:
-            turns = self.turns_of(pair.seen)
-            yield _Relation(pair.seer, pair.seen, *common_transform(pair.candidates), turns)
-        if len(pair.robots) != 1:
-            return
+    def _parts(
+        self, joined: _Joined, pair: _Pair, rows: IntArray
+    ) -> tuple[list[tuple[str, str]], list[FloatArray]]:
+        """The unknown segments of a chain, and the (m or 1, 4, 4) products beside and between."""
+        unknown, parts = [], [np.eye(4)[None]]
+        for at, segment in enumerate(pair.segments):
+            if at:
+                parts[-1] = parts[-1] @ invert(_robot_part(self.problem, pair.robots[at - 1], rows))
+            if (known := joined.between(*segment)) is not None:
+                parts[-1] = parts[-1] @ known
+            else:
+                unknown.append(segment)
+                parts.append(np.eye(4)[None])
+        return unknown, parts
+
+    def _solved(self, joined: _Joined, pair: _Pair, count: int) -> Iterator[_Relation]:
+        """The relations by a pair with a number of unknown segments."""
+        turns = self.symmetries.get(pair.seen, np.eye(4)[None])
         # Where the earliest views do not agree by half, all may.
-        for rows in (pair.early, pair.rows) if len(pair.early) < len(pair.rows) else (pair.early,):
+        for rows in (pair.early, pair.rows):
+            unknown, parts = self._parts(joined, pair, rows)
+            if len(unknown) != count:
+                return
+            candidates = self.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
+            if count == 1:
+                fits = [common_transform(candidates, turn) for turn in range(len(turns))]
+                matrices = np.array([matrix for matrix, _ in fits])
+                yield _Relation(*unknown[0], matrices, fits[0][1])
+                return
             if len(rows) < FEWEST:
                 continue
-            parts = self._robot_and_candidates(pair, rows)
-            if (edges := hand_eye(*parts, is_up=pair.robots[0].is_up)) is not None:
-                yield from self._edges_of_robot(pair, edges)
+            if count == 2 and (edges := hand_eye(invert(parts[1]), candidates)) is not None:
+                yield _Relation(*unknown[0], invert(edges.x)[None], edges.sigmas_m[0])
+                matrices = edges.z @ turns if unknown[1][1] == pair.seen else edges.z[None]
+                yield _Relation(*unknown[1], matrices, edges.sigmas_m[1])
+                return
+            if count == 3 and (found := between_arms(parts[1], parts[2], candidates)) is not None:
+                yield _Relation(*unknown[1], found[0][None], found[1])
                 return
 
-    def weak_relations(self) -> Iterator[_Relation]:
-        """The relations of the pair with the most views, even if partly determined."""
-        one_robot = [item for item in self.oriented if len(item.robots) == 1]
-        if pairs := [pair for pair in one_robot if len(pair.rows) >= FEWEST]:
-            pair = max(pairs, key=lambda value: len(value.rows))
-            edges, _ = partial_hand_eye(*self._robot_and_candidates(pair, pair.rows))
-            yield from self._edges_of_robot(pair, edges)
+    def _partly_solved(self, joined: _Joined) -> Iterator[_Relation]:
+        """Relations where the motion determines them in part, and a prior may the rest.
 
-    def _edges_of_robot(self, pair: _Pair, edges: PairEdges) -> Iterator[_Relation]:
-        """The transforms on both sides of the robot that is between a pair."""
-        (step,) = pair.robots
-        flange, base = step.frame, self.problem.tree.branches[step.frame].parent
-        near, far = (flange, base) if step.is_up else (base, flange)
-        yield _Relation(near, pair.seer, edges.x, edges.sigmas_m[0])
-        yield _Relation(far, pair.seen, edges.z, edges.sigmas_m[1], self.turns_of(pair.seen))
+        Where nothing else is placed, whether the motion determines it is checked later.
+        """
+        is_first = not any(self.is_placed(joined, name) for name in self.problem.tree.unknown)
+        priors = _with_priors(self.problem)
+        for pair in sorted(self.oriented, key=lambda value: -len(value.rows)):
+            rows = pair.rows if is_first else pair.early
+            unknown, parts = self._parts(joined, pair, rows)
+            if len(unknown) != 2 or len(rows) < FEWEST:
+                continue
+            ends = {end for segment in unknown for end in segment}
+            has_prior = any(not self.is_placed(joined, end) for end in priors & ends)
+            candidates = self.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
+            edges, typical_m = partial_hand_eye(invert(parts[1]), candidates)
+            if is_first or (has_prior and typical_m <= AGREE_M):
+                yield _Relation(*unknown[0], invert(edges.x)[None], np.inf)
+                yield _Relation(*unknown[1], edges.z[None], np.inf)
+                return
 
-    def _robot_and_candidates(self, pair: _Pair, rows: IntArray) -> tuple[FloatArray, Candidates]:
-        """The robot's part of the chain (m, 4, 4) in some views of a pair, and their candidates."""
-        robot = _robot_part(self.problem, pair.robots[0], rows)
-        return robot, self.candidates.take(rows)
-
-    def mounted_points(self) -> Iterator[_Relation]:
+    def _mounted_points(self) -> Iterator[_Relation]:
         """Relations from an instrument that reads points on a robot's flange, to both."""
         groups: dict[tuple[str, str], list[_Pair]] = {}
         for pair in self.pointed:
@@ -277,199 +354,49 @@ class _Growth:
             )
             mounting, errors = find_mounting(problem, np.unique(stops, return_inverse=True)[1])
             sigma_m = float(np.median(np.linalg.norm(errors, axis=1))) + _ROUGH_M
-            yield _Relation(branch.parent, seer, mounting.frame, sigma_m)
+            yield _Relation(branch.parent, seer, mounting.frame[None], sigma_m)
             for pair, point in zip(pairs, mounting.points, strict=True):
-                yield _Relation(flange, pair.seen, compose(np.eye(3), point), sigma_m)
+                yield _Relation(flange, pair.seen, compose(np.eye(3), point)[None], sigma_m)
 
-    def best(self) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-        """Places all frames in their bodies, by the orientations of boards that fit the views.
-
-        Returns:
-            (4, 4) `body_from_frame` by name, and the frames that depend on the unknown orientation
-            of a board.
-        """
-        placed, by_turn, counts = self._grown(())
-        if not by_turn:
-            return placed, ()
-        while np.prod(counts, dtype=float) > _MOST_TRIED:
-            counts[counts.index(max(counts))] = 1
-        tried = []
-        for choice in product(*map(range, counts)):
-            placed, by_turn, _ = self._grown(choice)
-            tried.append((self._score(placed), choice, placed, by_turn))
-        tried.sort(key=lambda item: item[0])
-        score, chosen, placed, by_turn = tried[0]
-        ambiguous = {
-            name
-            for value, rival, _, _ in tried[1:]
-            if value < CLEAR_RATIO * score
-            for name, own, other in zip(by_turn, chosen, rival, strict=False)
-            if own != other
-        }
-        return placed, tuple(name for name in placed if name in ambiguous)
-
-    def _grown(self, chosen: Sequence[int]) -> tuple[dict[str, FloatArray], list[str], list[int]]:
-        """Frames (4, 4) in their bodies; those placed by a turned board, and their options."""
-        tree = self.problem.tree
-        placed = dict.fromkeys((tree.root, *tree.flanges.values()), np.eye(4))
-        by_turn: list[str] = []
-        counts: list[int] = []
-        while options := (
-            [*self._related(placed)]
-            or [*self._completed(placed)]
-            or [*self._placed_by_points(placed)]
-            or [*self._by_hand_eye(placed)]
-            or [*self._by_partial_hand_eye(placed)]
-        ):
-            # Frames with several candidates come last: others may be reached unambiguously.
-            name, matrices, _ = min(options, key=lambda pair: (len(pair[1]), pair[2]))
-            choice = 0
-            if len(matrices) > 1:
-                choice = chosen[len(by_turn)] if len(by_turn) < len(chosen) else 0
-                by_turn.append(name)
-                counts.append(len(matrices))
-            placed[name] = matrices[choice]
-        return placed, by_turn, counts
-
-    def _score(self, placed: _Placed) -> float:
-        """Mean distance [m] of the early views from their predictions."""
-        capped = [
-            np.minimum(pair.candidates.distances(_product(pair.factors, placed)).min(1), _CAPPED_M)
-            for pair in self.oriented
-            if not pair.unplaced(placed)
-        ]
-        return float(np.concatenate(capped).mean()) if capped else 0.0
-
-    def _related(self, placed: _Placed) -> Iterator[_Option]:
-        """Frames that a relation places."""
-        for relation in self.relations:
-            first, second = relation.first, relation.second
-            if first in placed and second not in placed:
-                yield second, (placed[first] @ relation.matrix)[None], relation.sigma_m
-            elif second in placed and first not in placed:
-                poses = placed[second] @ invert(relation.matrix @ relation.turns)
-                yield first, poses, relation.sigma_m
-
-    def _completed(self, placed: _Placed) -> Iterator[_Option]:
-        """Frames that are the only unplaced one in the chain of some views."""
-        for pair in self.oriented:
-            unplaced = pair.unplaced(placed)
-            if len(unplaced) != 1:
-                continue
-            factor, candidates = pair.factors[unplaced[0]], self._between(pair, unplaced, placed)[0]
-            if factor.is_inverse:
-                candidates = replace(candidates, poses=invert(candidates.poses))
-            # A board's own frame may be in any orientation: that of its first view is taken.
-            count = 1 if factor.frame == pair.seen else len(self.turns_of(pair.seen))
-            fits = [common_transform(candidates, turn) for turn in range(count)]
-            yield factor.frame, np.array([matrix for matrix, _ in fits]), fits[0][1]
-
-    def _placed_by_points(self, placed: _Placed) -> Iterator[_Option]:
+    def _by_points(self, joined: _Joined) -> Iterator[_Relation]:
         """Points that a placed instrument read, and instruments that read placed points."""
-        unplaced_seers: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
+        readings: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
         for pair in self.pointed:
-            inner = pair.factors[1:-1]
-            if not all(factor.frame in placed for factor in inner if factor.frame):
+            unknown, (body, *_) = self._parts(joined, pair, pair.rows)
+            of_seer, of_seen = pair.segments[0][0], pair.segments[-1][1]
+            seer, seen = joined.between(of_seer, pair.seer), joined.between(of_seen, pair.seen)
+            read = self.candidates.poses[pair.rows, 0, :3, 3]
+            if unknown or (seer is None) == (seen is None):
                 continue
-            read, body = pair.candidates.poses[:, 0, :3, 3], _product(inner, placed)
-            if pair.seer in placed and pair.seen not in placed:
-                seen = apply(invert(body), apply(placed[pair.seer][None], read[:, None]))
-                point = np.median(seen[:, 0], axis=0)
-                yield pair.seen, compose(np.eye(3), point)[None], _ROUGH_M
-            elif pair.seer not in placed and pair.seen in placed:
-                points = apply(body, np.broadcast_to(placed[pair.seen][:3, 3], (len(read), 1, 3)))
-                unplaced_seers.setdefault(pair.seer, []).append((points[:, 0], read))
-        for seer, parts in unplaced_seers.items():
+            if seer is not None:
+                places = apply(invert(body), apply(seer[None], read[:, None]))
+                point = np.median(places[:, 0], axis=0)
+                yield _Relation(of_seen, pair.seen, compose(np.eye(3), point)[None], _ROUGH_M)
+            elif seen is not None:
+                points = apply(body, np.broadcast_to(seen[:3, 3], (len(read), 1, 3)))
+                readings.setdefault(pair.seer, []).append((points[:, 0], read))
+        for name, parts in readings.items():
             points, read = (np.concatenate(pair) for pair in zip(*parts, strict=True))
-            if len(read) >= _FEWEST_POINTS and spreads(points)[0][1] > _SPREAD_M:
-                yield seer, align(points, read)[None], _ROUGH_M
+            if len(read) >= FEWEST and spreads(points)[0][1] > _SPREAD_M:
+                of_seer = self.problem.tree.body(name)
+                yield _Relation(of_seer, name, align(points, read)[None], _ROUGH_M)
 
-    def _between(
-        self, pair: _Pair, unplaced: Sequence[int], placed: _Placed
-    ) -> tuple[Candidates, list[FloatArray]]:
-        """The candidates carried to the outer unplaced frames, and the products between these."""
-        bounds = [-1, *unplaced, len(pair.factors)]
-        parts = [_product(pair.factors[begin + 1 : end], placed) for begin, end in pairwise(bounds)]
-        return pair.candidates.carried(invert(parts[0]), invert(parts[-1])), parts[1:-1]
-
-    def _open_pairs(self, placed: _Placed) -> Iterator[tuple[_Pair, list[int]]]:
-        """Pairs with two or three unplaced frames, and robots between each two of these."""
+    def _score(self, joined: _Joined) -> float:
+        """Mean distance [m] of the early views from their predictions."""
+        capped = [np.zeros(0)]
         for pair in self.oriented:
-            unplaced = pair.unplaced(placed)
-            # Unknowns without a robot between cannot be distinguished.
-            between = [pair.factors[begin + 1 : end] for begin, end in pairwise(unplaced)]
-            is_separated = all(any(not factor.frame for factor in part) for part in between)
-            if len(pair.early) >= FEWEST and len(unplaced) in (2, 3) and is_separated:
-                yield pair, unplaced
-
-    def _by_hand_eye(self, placed: _Placed) -> Iterator[_Option]:
-        """Frames that are one of two unplaced ones, with a robot between, or of three."""
-        # Views give `u * between * v = seen` with unknown u and v: a hand-eye calibration with
-        # `between^-1` as the robot. With three unknowns, two arms are between them.
-        for pair, unplaced in self._open_pairs(placed):
-            candidates, robots = self._between(pair, unplaced, placed)
-            if len(unplaced) == 2:
-                edges = hand_eye(invert(robots[0]), candidates, is_up=True)
-                if edges is not None:
-                    yield from _both_options(pair, unplaced, edges)
-            elif (found := _between_arms(robots[0], robots[1], candidates)) is not None:
-                yield _option(pair.factors[unplaced[1]], *found)
-
-    def _by_partial_hand_eye(self, placed: _Placed) -> Iterator[_Option]:
-        """The same where the motion determines them in part, and a prior may the rest."""
-        priors = _with_priors(self.problem)
-        for pair, unplaced in self._open_pairs(placed):
-            path = {step.frame for step in self.problem.tree.path(pair.seer, pair.seen)}
-            if len(unplaced) == 2 and priors & (path - placed.keys()):
-                candidates, robots = self._between(pair, unplaced, placed)
-                edges, typical_m = partial_hand_eye(invert(robots[0]), candidates)
-                if typical_m <= AGREE_M:
-                    yield from _both_options(pair, unplaced, edges)
+            unknown, parts = self._parts(joined, pair, pair.early)
+            if not unknown:
+                distances = self.candidates.take(pair.early).distances(parts[0]).min(axis=1)
+                capped.append(np.minimum(distances, WORST_M))
+        every = np.concatenate(capped)
+        return float(every.mean()) if len(every) else 0.0
 
 
 def _robot_part(problem: Problem, step: PathStep, rows: IntArray) -> FloatArray:
-    """The robot's part (m, 4, 4) of a chain with one robot, in some observations."""
+    """The inverse (m, 4, 4) of the robot's part of a chain, in some observations."""
     robot = problem.poses[step.robot][problem.observations.stops[rows]]
     return robot if step.is_up else invert(robot)
-
-
-def _both_options(pair: _Pair, unplaced: Sequence[int], edges: PairEdges) -> Iterator[_Option]:
-    yield _option(pair.factors[unplaced[0]], invert(edges.x), edges.sigmas_m[0])
-    yield _option(pair.factors[unplaced[1]], edges.z, edges.sigmas_m[1])
-
-
-def _option(factor: _Factor, matrix: FloatArray, sigma_m: float) -> _Option:
-    return factor.frame, (invert(matrix) if factor.is_inverse else matrix)[None], sigma_m
-
-
-def _between_arms(
-    first: FloatArray, second: FloatArray, candidates: Candidates
-) -> tuple[FloatArray, float] | None:
-    """Finds the transform v between two arms, and the views' median distance [m]."""
-    if len(first) < _FEWEST_VIEWS or candidates.turns.max(initial=0) > 0:
-        return None
-    seen = candidates.poses[:, 0]
-
-    def alternated(middle: FloatArray, rounds: int) -> tuple[FloatArray, float]:
-        median = np.inf
-        for _ in range(rounds):
-            # u and w for given v; then v and w for given u; then u and v for given w.
-            u_inverse, w = park(invert(first @ middle @ second), seen)
-            _, w = park(invert(second), invert(first) @ u_inverse @ seen)
-            u_inverse, middle = park(invert(first), seen @ invert(w) @ invert(second))
-            predicted = invert(u_inverse) @ first @ middle @ second @ w
-            median = float(np.median(distances_m(seen, predicted)))
-        return middle, median
-
-    def park(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
-        solution = SOLVERS["park"](robot, camera)
-        return solution.x, solution.z
-
-    starts = compose(Rotation.create_group("O").as_matrix(), np.zeros(3))
-    tried = sorted((alternated(start, _FIRST_ROUNDS) for start in starts), key=lambda at: at[1])
-    followed = [alternated(start, _LONG) for start, _ in tried[:_FOLLOWED]]
-    middle, median = min(followed, key=lambda pair: pair[1])
-    return (middle, median) if median < _NEAR_M else None
 
 
 def init_frames(
@@ -505,10 +432,10 @@ def init_frames(
     seen = problem.observations.observed
     chosen = (views[at].chosen(int(picks[at]), targets.get(seen[at])) for at in clear)
     rejections = tuple(Rejection(views[at].view, why) for at in unclear)
-    return InitialFrames(tied, tuple(chosen), rejections)
+    return replace(tied, views=tuple(chosen), rejections=rejections)
 
 
-def _distances(problem: Problem, candidates: Candidates, tied: ConnectedFrames) -> FloatArray:
+def _distances(problem: Problem, candidates: Candidates, tied: InitialFrames) -> FloatArray:
     """(n, k) distances of the views' candidates from their predictions [m]."""
     # The distances of views of unconnected frames have no meaning.
     frames = {name: tied.edges.get(name, np.eye(4)) for name in problem.unknown}
@@ -524,7 +451,7 @@ def _distances(problem: Problem, candidates: Candidates, tied: ConnectedFrames) 
 
 
 def _is_ambiguous(
-    problem: Problem, candidates: Candidates, tied: ConnectedFrames, distances: FloatArray
+    problem: Problem, candidates: Candidates, tied: InitialFrames, distances: FloatArray
 ) -> Mask:
     """(n,) whether another candidate is as likely as the nearest."""
     ordered, ambiguous = np.sort(distances, axis=1), np.zeros(len(distances), dtype=bool)
@@ -545,8 +472,8 @@ def _is_ambiguous(
 
 
 def _numbered_as_first(
-    problem: Problem, tied: ConnectedFrames, picks: IntArray, symmetries: Mapping[str, FloatArray]
-) -> tuple[ConnectedFrames, IntArray]:
+    problem: Problem, tied: InitialFrames, picks: IntArray, symmetries: Mapping[str, FloatArray]
+) -> tuple[InitialFrames, IntArray]:
     """Turns symmetric boards so that first views keep their corner numbers."""
     # Frames with priors are left as they are.
     edges, picks = dict(tied.edges), picks.copy()

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.stages.pnp import ViewPoses, distances_m
-from visioncal.core.transforms import invert, mean_transform
+from visioncal.core.transforms import compose, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
@@ -23,13 +24,14 @@ _TRIPLES = 40
 FEWEST = 3
 # Below this scaled eigenvalue ratio the motion leaves a direction undetermined; an edge with a
 # larger sigma [m, with rotations on a lever] is no start.
-_NULL_RATIO, _WORST_M = 1e-8, 0.1
+_NULL_RATIO, WORST_M = 1e-8, 0.1
 # Largest mean distance of views that agree, rotations on a lever [m].
 AGREE_M = 0.02
 # Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
 _NOISE, _CAMERA_SIGMA = Noise(np.full((1, 2), 5e-4), np.zeros(0)), 1e-6
-# Rounds in which each view's candidate follows both edges.
-_ROUNDS = 10
+# Rounds in which each view's candidate follows both edges; between two arms, fewest views, and
+# rounds in which the three transforms follow each other.
+_ROUNDS, _FEWEST_BETWEEN, _ALTERNATIONS = 10, 5, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +69,14 @@ class Candidates:
 
 
 @dataclass(frozen=True, eq=False)
-class HandEyeEdges:
+class PairEdges:
     """Both edges of `robot * x * camera = z`, and the residuals (m, k) of the candidates [m]."""
 
     x: FloatArray
     z: FloatArray
     residuals: FloatArray
+    # Of each edge, rotations on a lever [m]; infinite where undetermined.
+    sigmas_m: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def picks(self) -> IntArray:
@@ -82,11 +86,11 @@ class HandEyeEdges:
 
 def _solve_edges(
     robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray, solver: Solver
-) -> HandEyeEdges:
+) -> PairEdges:
     """Solves for both edges by (..., t) views with one candidate each, for (...,) sets at once."""
     edges = solver(robot[rows], candidates.poses[rows, picks])
     predicted = invert(robot @ edges.x[..., None, :, :]) @ edges.z[..., None, :, :]
-    return HandEyeEdges(edges.x, edges.z, candidates.distances(predicted))
+    return PairEdges(edges.x, edges.z, candidates.distances(predicted))
 
 
 def settled_distances(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
@@ -108,25 +112,22 @@ def settled_distances(robot: FloatArray, candidates: Candidates, picks: IntArray
 
 def _trimmed_edges(
     robot: FloatArray, candidates: Candidates, solver: Solver
-) -> tuple[Mask, HandEyeEdges, float]:
+) -> tuple[Mask, PairEdges, float]:
     """Solves for both edges by the better half of the views, with any of their candidates.
 
     Returns:
         (m,) mask of that half, the edges, and the half's mean distance [m].
     """
 
-    def solve(mask: Mask, edges: HandEyeEdges) -> HandEyeEdges:
+    def solve(mask: Mask, edges: PairEdges) -> PairEdges:
         rows = np.flatnonzero(mask)
         return _solve_edges(robot, candidates, rows, edges.picks[rows], solver)
 
     every, *sets = _starts(candidates)
+    rows, picks = (np.array(part) for part in zip(*sets, strict=True))
+    many = _solve_edges(robot, candidates, rows, picks, solver)
     starts = [_solve_edges(robot, candidates, *every, solver)]
-    if sets and solver is SOLVERS["park"]:
-        rows, picks = (np.array(part) for part in zip(*sets, strict=True))
-        many = _solve_edges(robot, candidates, rows, picks, solver)
-        starts += map(HandEyeEdges, many.x, many.z, many.residuals)
-    else:
-        starts += [_solve_edges(robot, candidates, *item, solver) for item in sets]
+    starts += map(PairEdges, many.x, many.z, many.residuals)
     half, edges = trimmed_start(
         starts,
         lambda item: np.asarray(item.residuals.min(axis=1)),
@@ -156,34 +157,18 @@ def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray,
     return mean_transform(picked), least_sum / half**1.5
 
 
-@dataclass(frozen=True, eq=False)
-class PairEdges:
-    """Both edges of `robot * x * camera = z` by a consensus of views."""
-
-    x: FloatArray  # (4, 4).
-    z: FloatArray  # (4, 4).
-    sigmas_m: tuple[float, float]  # Of each, rotations on a lever [m]; infinite where undetermined.
-
-
-def hand_eye(robot: FloatArray, candidates: Candidates, *, is_up: bool) -> PairEdges | None:
+def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     """Solves for both edges of `robot * x * camera = z` by a consensus of m views.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The views.
-        is_up: Whether that is `base_from_flange`, which has the robot's noise at its end.
-
-    Returns:
-        The edges; None where the motion leaves a direction undetermined, or no half of the views
-        agrees.
+    `robot` is (m, 4, 4), the robot's part of the chain. None where the motion leaves a direction
+    undetermined, or no half of the views agrees.
     """
     half, edges, typical_m = _trimmed_edges(robot, candidates, SOLVERS["park"])
     if typical_m > AGREE_M:
         return None
     picked = candidates.poses[half, edges.picks[half]]
     exact = np.tile(_CAMERA_SIGMA**2 * np.eye(6), (len(picked), 1, 1))
-    poses = robot[half] if is_up else invert(robot[half])
-    problem = chain("eye-in-hand" if is_up else "eye-to-hand", poses, picked, exact)
+    problem = chain("eye-in-hand", robot[half], picked, exact)
     state = State(np.stack([edges.x, edges.z]), np.zeros(0))
     information = fisher_information(problem, state, _NOISE)
     if spectrum(information).ratio < _NULL_RATIO:
@@ -192,9 +177,7 @@ def hand_eye(robot: FloatArray, candidates: Candidates, *, is_up: bool) -> PairE
     # Views that agree poorly determine less than their motion would.
     excess = max(typical_m / _NOISE.robots[0, 1], 1.0)
     x, z = (np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])).tolist()
-    if max(x, z) > _WORST_M:
-        return None
-    return PairEdges(edges.x, edges.z, (excess * x, excess * z))
+    return None if max(x, z) > WORST_M else replace(edges, sigmas_m=(excess * x, excess * z))
 
 
 def partial_hand_eye(robot: FloatArray, candidates: Candidates) -> tuple[PairEdges, float]:
@@ -204,8 +187,33 @@ def partial_hand_eye(robot: FloatArray, candidates: Candidates) -> tuple[PairEdg
         The edges, and the mean distance of the better half of the views [m].
     """
     found = [_trimmed_edges(robot, candidates, item) for item in (SOLVERS["park"], lone_axis)]
-    _, edges, typical_m = min(found, key=lambda item: item[2])
-    return PairEdges(edges.x, edges.z, (np.inf, np.inf)), typical_m
+    return min((item[1:] for item in found), key=lambda item: item[1])
+
+
+def between_arms(
+    first: FloatArray, second: FloatArray, candidates: Candidates
+) -> tuple[FloatArray, float] | None:
+    """Finds v of `u * first * v * second * w = camera`, of two arms, and the views' median [m].
+
+    With one of the three known, the others are a hand-eye calibration: these are solved in turn (as
+    Wu, Wang, Qi and Ren 2016 iterate), from starts with v in 24 orientations. `first` and `second`
+    are (m, 4, 4). None where no start converges, or with too few views.
+    """
+    middle = compose(Rotation.create_group("O").as_matrix(), np.zeros(3))[:, None]
+    seen, park = candidates.poses[None, :, 0].repeat(len(middle), axis=0), SOLVERS["park"]
+    before, after = (invert(arm)[None].repeat(len(middle), axis=0) for arm in (first, second))
+    if len(first) < _FEWEST_BETWEEN or candidates.turns.any():
+        return None
+    for _ in range(_ALTERNATIONS):
+        # u and w for given v; then v and w for given u; then u and v for given w.
+        u_inverse = park(after @ invert(middle) @ before, seen).x[:, None]
+        w = park(after, before @ u_inverse @ seen).z[:, None]
+        edges = park(before, seen @ invert(w) @ after)
+        u_inverse, middle = edges.x[:, None], edges.z[:, None]
+    predicted = invert(u_inverse) @ first @ middle @ second @ w
+    medians = np.median(distances_m(seen, predicted), axis=1)
+    best = medians.argmin()
+    return (middle[best, 0], float(medians[best])) if medians[best] < AGREE_M else None
 
 
 def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:
