@@ -122,6 +122,7 @@ def exact(options: CellOptions | None = None) -> CellOptions:
         offset_sigma_rad=0.0,
         eccentricity_sigma_rad=0.0,
         ripple_sigma_rad=0.0,
+        function_sigma_rad=0.0,
         compliance_rad_per_nm=(),
         backlash_rad=(),
         lens_mismatch_px=0.0,

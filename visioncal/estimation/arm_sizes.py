@@ -1,10 +1,16 @@
-"""Sizes of an arm's errors: joint offsets, links, gears, compliance, backlash.
+"""Sizes of an arm's errors: joint offsets, links, gears, compliance, backlash, joint functions.
 
 Every error is a set of columns: the flange's Jacobian at each stop. All columns are carried,
 however redundant, as random effects with one size per block, and the sizes of all blocks are
 estimated together by restricted likelihood with log-normal priors (Harville 1977 for the
 likelihood, Gilmour, Thompson and Cullis 1995 for the steps): what the data do not determine stays
 nominal. Blocks without evidence have size zero, one after the other, the least likely first.
+
+Encoders and their mounts err by some tenths of a milliradian, repeatably over each turn, with more
+than low harmonics. Each joint's function is a periodic Gaussian process (MacKay 1998), `s^2 exp(-2
+sin^2(d/2) / l^2)` for two angles d apart, represented by harmonics with the variances of that
+kernel's Fourier series. The first two orders have further sizes of their own: that of eccentric
+gears, and one of second harmonics. All joints share s and l, which is sought on a grid.
 """
 
 from collections.abc import Mapping
@@ -15,15 +21,30 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import LinAlgError
+from scipy.special import ive
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
+from visioncal.estimation.armmodel import (
+    BACKLASH,
+    COMPLIANCE,
+    HARMONICS,
+    WEIGHT,
+    JointFunctions,
+)
+from visioncal.estimation.linalg import gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 
+# Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
+# of the variance lie beyond. Shorter ones are not tried after this many that are less likely.
+_LENGTHS_RAD, _CARRIED, _WORSE = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0, 2
+# Combinations of harmonics that move all stops by less per unit are dropped [rad, m].
+_LEAST_MOTION = 5e-3
+# Harmonics of order 2 of each joint.
+_SECOND = "second"
 # Typical sizes of errors [rad], with a log-normal prior of a factor of e, and the torque of a
 # compliance's [N m].
 _TYPICAL = {
@@ -34,12 +55,18 @@ _TYPICAL = {
     BACKLASH: 1e-4,
     "ratios": 1e-4,
     "eccentricity": 1.5e-4,
+    _SECOND: 1e-4,
+    HARMONICS: 2e-4,
 }
 _TORQUE_NM = 10.0
 # Noise at the start, as a share of the residuals with the nominal arm.
 _LITTLE_NOISE = 0.1
-# Least gain in log-likelihood of a step.
-_LITTLE = 1e-2
+# Least twice gain by functions with all other sizes held: those that are just significant have half
+# of that or more. Least gain in log-likelihood of a step.
+_LEAST_GAIN, _LITTLE = 5.0, 1e-2
+# Least ratio of data to prior information of combinations that are unknowns; others keep their
+# prior.
+_INFORMATIVE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +76,18 @@ class ArmSizes:
     errors: Mapping[str, ArmErrors]  # The errors by block, without those of size zero.
     levels: FloatArray  # (r, 2) of the robots' noise beside them; see `Noise`.
     gain: float  # Twice the gain in log-likelihood over the nominal arm.
+    functions: JointFunctions | None = None  # Functions of the joints; None without any.
+
+
+def most_orders() -> int:
+    """Number of orders of harmonics, from 2 on, for the shortest length."""
+    return len(_variances(min(_LENGTHS_RAD))) - 1
+
+
+def _variances(length_rad: float) -> FloatArray:
+    """(k + 1,) variances of the harmonics of a process of unit size, from order 1 on."""
+    orders = np.arange(1, max(int(np.ceil(_CARRIED / length_rad)), 2) + 1)
+    return np.asarray(2.0 * ive(orders, length_rad**-2))
 
 
 def estimate_arm_sizes(
@@ -58,6 +97,7 @@ def estimate_arm_sizes(
     robot: str,
     bases: Mapping[str, FloatArray],
     torque_nm: float,
+    harmonics: FloatArray | None = None,
 ) -> ArmSizes | None:
     """Estimates the sizes of the errors of one robot's arm.
 
@@ -68,34 +108,69 @@ def estimate_arm_sizes(
         robot: The robot.
         bases: (s, 6, p) by stop, Jacobian of the flange by the errors of each block.
         torque_nm: The torque of a unit compliance [N m].
+        harmonics: (s, 6, 2 n k) the same for sine and cosine of each joint and order from 2 on, as
+            `Robot.harmonic_jacobian` has them; None to seek no functions of the joints.
 
     Returns:
-        The sizes; None where no errors have evidence.
+        The sizes; None where no errors have evidence, or with `harmonics` no functions.
 
     Raises:
         LinAlgError: The columns are so large that their squares are no numbers.
     """
     nominal = robot_likelihood(problem, state, noise)
-    arm = _Blocks(nominal, problem.robots.index(robot), bases, torque_nm)
-    best = arm.most_likely(arm.start())
-    # Where all blocks together have no evidence, none has.
-    if 2.0 * (nominal.white[1] - best.value) <= SIGNIFICANT:
-        return None
-    while (lesser := arm.without_least_likely(best)) is not None:
-        arm, best = lesser
-    # A joint does not bend against its torque; residuals have the opposite sign of the errors.
-    while COMPLIANCE in arm.bases and (
-        (negative := best.values[arm.slice_of(COMPLIANCE)] > 0.0).any()
-    ):
-        arm = replace(arm, bases={**arm.bases, COMPLIANCE: arm.bases[COMPLIANCE] * ~negative})
-        best = arm.most_likely(best.logs)
-    count, gain = nominal.before.size, 2.0 * (nominal.white[1] - best.value)
-    sigmas = np.exp(best.logs)
-    errors = {
-        name: ArmErrors(basis, sigma, gain, of_links=True)
-        for (name, basis), sigma in zip(arm.bases.items(), sigmas[count:].tolist(), strict=True)
-    }
-    return ArmSizes(errors, sigmas[:count].reshape(-1, 2), gain)
+    plain = _Blocks(nominal, problem.robots.index(robot), bases, torque_nm)
+    if harmonics is not None:
+        harmonics = harmonics.reshape(*harmonics.shape[:2], -1, most_orders(), 2)
+        second = harmonics[:, :, :, 0].reshape(len(harmonics), 6, -1)
+        plain = replace(plain, bases={**bases, _SECOND: second})
+    best = found = plain.most_likely(plain.start())
+    if harmonics is None:
+        # Where all blocks together have no evidence, none has.
+        return _sized(plain, found) if plain.gain(found) > SIGNIFICANT else None
+    arm, waves, worse = plain, None, -1
+    for length in _LENGTHS_RAD:
+        candidate = _Waves.of(harmonics, length)
+        every = {**plain.bases, HARMONICS: candidate.columns}
+        blocks = replace(plain, bases=every, low=tuple(_variances(length)[:2].tolist()))
+        tried = None
+        # Skips the search where the gain seems too small.
+        if 2.0 * found.likely_size(blocks.columns(HARMONICS), plain.mine)[1] > _LEAST_GAIN:
+            logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
+            tried = blocks.most_likely(logs, found.value - 0.5 * SIGNIFICANT)
+        if tried is not None and tried.value < best.value:
+            arm, best, waves, worse = blocks, tried, candidate, 0
+        else:
+            # The longest length has no longer one to compare with.
+            worse += 1
+        if worse == _WORSE:
+            break
+    is_likely = 2.0 * (found.value - best.value) > SIGNIFICANT
+    sizes = _sized(arm, best, waves) if is_likely else None
+    return sizes if sizes is not None and sizes.functions is not None else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Waves:
+    """The harmonics of a process as columns."""
+
+    columns: FloatArray  # (s, 6, q) Jacobian of the flange by q combinations, in units of s.
+    # (n, k, 2, q) each in terms of sine and cosine of each joint and order from 2 on; of order 2
+    # all are zero.
+    expanded: FloatArray
+    sizes: FloatArray  # (k,) sizes of the orders in units of s.
+    length_rad: float
+
+    @classmethod
+    def of(cls, harmonics: FloatArray, length_rad: float) -> Self:
+        """Chooses the columns of a process among (s, 6, n, k, 2) harmonics."""
+        sizes = np.sqrt(_variances(length_rad)[1:])
+        higher = harmonics[:, :, :, 1 : len(sizes)] * sizes[1:, None]
+        columns = higher.reshape(6 * len(higher), -1)
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        kept = vectors[:, values > _LEAST_MOTION**2]
+        expanded = np.zeros((harmonics.shape[2], len(sizes), 2, kept.shape[1]))
+        expanded[:, 1:] = kept.reshape(*higher.shape[2:], -1) * sizes[1:, None, None]
+        return cls((columns @ kept).reshape(len(higher), 6, -1), expanded, sizes, length_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,22 +181,32 @@ class _Blocks:
     robot: int  # Index of the robot.
     bases: Mapping[str, FloatArray]  # (s, 6, p) the columns of each of the g blocks.
     torque_nm: float  # The torque of a unit compliance [N m].
+    low: tuple[float, ...] = ()  # Variances of a process's orders 1 and 2; empty for none.
 
     @cached_property
-    def typical(self) -> FloatArray:
-        """(g,) typical sizes of the blocks [rad]."""
-        factors = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
-        return np.array([_TYPICAL[name] * factors.get(name, 1.0) for name in self.bases])
+    def shares(self) -> FloatArray:
+        """(q, g) variance of each error per unit variance of each block."""
+        counts = [basis.shape[2] for basis in self.bases.values()]
+        shares = np.repeat(np.eye(len(counts)), counts, axis=0)
+        for name, variance in zip(("eccentricity", _SECOND), self.low, strict=False):
+            if name in self.bases:
+                shares[self.slice_of(name), -1] = variance
+        return shares
 
     @cached_property
     def likelihood(self) -> RobotLikelihood:
         """That of the robots' levels, with the q errors of the arm as the last unknowns."""
         if not self.bases:
             return self.nominal
-        counts = [basis.shape[2] for basis in self.bases.values()]
-        shares = np.repeat(np.eye(len(counts)), counts, axis=0)
+        factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
+        typical = np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.bases])
         basis = np.concatenate(list(self.bases.values()), axis=2)
-        return self.nominal.beside(self.robot, basis, shares, np.log(self.typical))
+        return self.nominal.beside(self.robot, basis, self.shares, typical)
+
+    @cached_property
+    def mine(self) -> Mask:
+        """(u,) mask of the units of the robot: no other depends on its errors."""
+        return np.asarray((self.nominal.members == self.robot).any(axis=1))
 
     def slice_of(self, name: str) -> slice:
         """A block's place among the q errors, from the end of all unknowns."""
@@ -130,17 +215,27 @@ class _Blocks:
         start = sum(list(counts.values())[:before]) - sum(counts.values())
         return slice(start, start + counts[name] or None)
 
+    def columns(self, name: str) -> FloatArray:
+        """(m, 6 w, p) Jacobian of the robot's units by a block's errors."""
+        return np.asarray(self.likelihood.jacobian[self.mine][:, :, self.slice_of(name)])
+
     def start(self) -> FloatArray:
         """Logarithms (2 r + g,): sizes that explain all residuals, beside little noise.
 
         A search from much noise may stay there, with sizes of next to nothing.
         """
         rms = self.nominal.rms
-        levels = np.tile(np.maximum(_LITTLE_NOISE * rms, LEAST_SIGMA), len(self.nominal.before))
-        moved = (self.nominal.moved(self.robot, basis)[:, :6] for basis in self.bases.values())
-        motion = [np.sqrt(np.sum(np.mean(columns**2, axis=0))) for columns in moved]
-        sizes = np.linalg.norm(rms) / np.maximum(motion, LEAST_SIGMA)
-        return np.asarray(np.log(np.append(levels, np.maximum(self.typical, sizes))))
+        levels = np.maximum(_LITTLE_NOISE * rms, LEAST_SIGMA)
+        motion = [
+            np.sqrt(np.sum(np.mean(self.columns(name)[:, :6] ** 2, axis=0))) for name in self.bases
+        ]
+        typical = np.array([_TYPICAL[name] for name in self.bases])
+        sizes = np.maximum(typical, np.linalg.norm(rms) / np.maximum(motion, LEAST_SIGMA))
+        return np.asarray(np.log(np.append(np.tile(levels, len(self.nominal.before)), sizes)))
+
+    def gain(self, estimate: MixedEstimate) -> float:
+        """Twice the gain in log-likelihood over the nominal arm."""
+        return 2.0 * (self.nominal.white[1] - estimate.value)
 
     def most_likely(self, start: FloatArray, enough: float = np.inf) -> MixedEstimate:
         """Maximum-likelihood levels and sizes, from (2 r + g,) logarithms.
@@ -150,21 +245,77 @@ class _Blocks:
         low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
         return self.likelihood.model.maximised(start, low, high, 0.0, enough, _LITTLE)
 
+    def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
+        """The same without a block, and the logarithms of the other sizes."""
+        at = self.nominal.before.size + list(self.bases).index(name)
+        bases = {other: basis for other, basis in self.bases.items() if other != name}
+        low = () if name == HARMONICS else self.low
+        return replace(self, bases=bases, low=low), np.delete(logs, at)
+
     def without_least_likely(self, best: MixedEstimate) -> tuple[Self, MixedEstimate] | None:
         """Without the block that has the least evidence; None where all have enough."""
-        trials, first = [], self.nominal.before.size
-        for at, name in enumerate(self.bases):
-            bases = {other: basis for other, basis in self.bases.items() if other != name}
-            lesser, logs = replace(self, bases=bases), np.delete(best.logs, first + at)
+        # These are the first harmonics of the joints' functions.
+        fixed = {"eccentricity", _SECOND} if HARMONICS in self.bases else {_SECOND}
+        trials = [self.without(name, best.logs) for name in self.bases if name not in fixed]
+        # With the other sizes held, this is an upper bound of the gain.
+        values = []
+        for lesser, logs in trials:
+            values.append(np.inf)
             # Residuals that nothing else explains can make the likelihood singular.
             with suppress(LinAlgError):
-                # With the other sizes held, this is an upper bound of the gain.
-                value = lesser.likelihood.model.at(logs, is_sloped=False).value
-                trials.append((value, lesser, logs))
+                values[-1] = lesser.likelihood.model.at(logs, is_sloped=False).value
         enough = best.value + 0.5 * SIGNIFICANT
-        for _, lesser, logs in sorted(trials, key=lambda trial: trial[0]):
+        for index in np.argsort(values).tolist():
+            lesser, logs = trials[index]
             with suppress(LinAlgError):
                 found = lesser.most_likely(logs, enough)
                 if found.value < enough:
                     return lesser, found
         return None
+
+
+def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> ArmSizes:
+    """The sizes without blocks that have no evidence, and without negative compliances."""
+    while (lesser := arm.without_least_likely(best)) is not None:
+        arm, best = lesser
+    # Residuals have the opposite sign of the errors.
+    while COMPLIANCE in arm.bases and (
+        (negative := best.values[arm.slice_of(COMPLIANCE)] > 0.0).any()
+    ):
+        arm = replace(arm, bases={**arm.bases, COMPLIANCE: arm.bases[COMPLIANCE] * ~negative})
+        best = arm.most_likely(best.logs)
+    count, gain = arm.nominal.before.size, arm.gain(best)
+    levels = np.exp(best.logs[:count]).reshape(-1, 2)
+    sizes = np.sqrt(arm.shares @ np.exp(2.0 * best.logs[count:]))
+    errors = {
+        name: ArmErrors(
+            basis, float(sizes[arm.slice_of(name)][0]), gain / len(arm.bases), of_links=True
+        )
+        for name, basis in arm.bases.items()
+    }
+    if waves is None or HARMONICS not in errors:
+        return ArmSizes(errors, levels, gain)
+    # Combinations that the observations do not determine keep their prior.
+    block, second = errors[HARMONICS], errors.pop(_SECOND)
+    share = second.sigma / block.sigma
+    (units,) = arm.likelihood.model.units
+    weights = np.linalg.inv(units.total(best.logs)[arm.mine])
+    jacobian = np.concatenate([share * arm.columns(_SECOND), arm.columns(HARMONICS)], axis=2)
+    scaled = jacobian * block.sigma
+    values, vectors = np.linalg.eigh(gram(scaled, weights @ scaled))
+    determined = vectors[:, values > _INFORMATIVE]
+    basis = np.concatenate([share * second.basis, block.basis], axis=2)
+    errors[HARMONICS] = replace(block, basis=basis @ determined)
+    joints, orders = waves.expanded.shape[:2]
+    of_second = np.zeros((joints, orders, 2, 2 * joints))
+    of_second[:, 0] = share * np.eye(2 * joints).reshape(joints, 2, -1)
+    expanded = np.concatenate([of_second, waves.expanded], axis=3)
+    rest, logs = arm.without(HARMONICS, best.logs)
+    functions = JointFunctions(
+        np.tile(np.repeat([share, *waves.sizes[1:]], 2), joints),
+        expanded.reshape(2 * joints * orders, -1) @ determined,
+        block.sigma,
+        waves.length_rad,
+        2.0 * (rest.most_likely(logs).value - best.value),
+    )
+    return ArmSizes(errors, levels, gain, functions)

@@ -17,9 +17,25 @@ _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
 # Blocks that depend on a stop's loads and on the side of approach; the others are the same at all
 # stops.
 COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
+# Functions of the joints beyond their eccentricity.
+HARMONICS = "harmonics"
 RIGID = ("links", *_FUNCTIONS)
 # The mean of fewer twists does not show whether it is noise; chance of taking noise for a tool.
 _FEWEST_TWISTS, _BY_CHANCE = 6, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class JointFunctions:
+    """Estimated functions of an arm's n joints, by k harmonics from order 2 on."""
+
+    # (2 n k,) prior sizes of sine and cosine of each joint and order, relative to their block.
+    sizes: FloatArray
+    # (2 n k, r) Jacobian of these by the block's values: combinations that the observations
+    # determine. What it does not span keeps its prior.
+    directions: FloatArray
+    sigma_rad: float  # Their size [rad].
+    length_rad: float  # Their correlation length over the joint angle [rad].
+    gain: float  # Twice the gain in log-likelihood over the same arm without them.
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +47,8 @@ class ArmModel:
     flange_from_reported: FloatArray
     # The blocks by name with the size of their errors, relative to the first's: `offsets` of the
     # joints, `links` (each by six, behind its joint), `ratios` of the gears, `eccentricity` (sine
-    # and cosine of each joint), `compliance` and `backlash` of each joint, and `weight`
-    # (compliances times unknown link masses).
+    # and cosine of each joint), `compliance` and `backlash` of each joint, `weight` (compliances
+    # times unknown link masses), and `harmonics` of the joints' functions.
     weights: Mapping[str, float]
     # (p,) current values [rad], block after block, in units of the first block's size.
     values: FloatArray
@@ -41,6 +57,7 @@ class ArmModel:
     yielding: Mask | None = None  # (n,) mask of the joints that bend; None for all.
     # Bending functions of unknown link masses; None where masses are known.
     functions: WeightFunctions | None = None
+    waves: JointFunctions | None = None  # Functions of the joints; None without any.
 
     @classmethod
     def of(cls, nominal: Robot, q: FloatArray, reported: FloatArray) -> "ArmModel":
@@ -62,8 +79,13 @@ class ArmModel:
         greatest = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
         return replace(self, torque_nm=greatest or 1.0)
 
-    def with_errors(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
-        """Returns the arm with error blocks to be estimated, all zero."""
+    def with_errors(
+        self, errors: Mapping[str, ArmErrors], functions: JointFunctions | None = None
+    ) -> "ArmModel":
+        """Returns the arm with error blocks to be estimated, all zero.
+
+        `functions` are those of the joints, where `harmonics` is among the blocks.
+        """
         count = sum(error.basis.shape[2] for error in errors.values())
         first = next(iter(errors.values())).sigma
         compliance = errors.get(COMPLIANCE)
@@ -72,6 +94,7 @@ class ArmModel:
             weights={name: error.sigma / first for name, error in errors.items()},
             values=np.zeros(count),
             yielding=None if compliance is None else np.any(compliance.basis, axis=(0, 1)) > 0,
+            waves=functions,
         )
 
     def moved(self, step: FloatArray) -> "ArmModel":
@@ -88,7 +111,7 @@ class ArmModel:
     @cached_property
     def bare(self) -> Robot:
         """The arm with its errors, up to its own flange."""
-        return self.nominal.corrected(*self.changes(self.values))
+        return self.nominal.corrected(*self.changes(self.values), self.harmonics)
 
     @cached_property
     def compliance(self) -> FloatArray:
@@ -112,6 +135,8 @@ class ArmModel:
         """Number of values in a block."""
         if name == WEIGHT:
             return 0 if self.functions is None else self.functions.size
+        if name == HARMONICS:
+            return 0 if self.waves is None else int(self.waves.directions.shape[1])
         return block_size(name, self.nominal.joint_count)
 
     @cached_property
@@ -130,6 +155,36 @@ class ArmModel:
     def _slices(self) -> dict[str, slice]:
         ends = np.cumsum([self.size_of(name) for name in self.weights], dtype=int).tolist()
         return dict(zip(self.weights, map(slice, [0, *ends], ends), strict=True))
+
+    @property
+    def harmonics(self) -> FloatArray | None:
+        """(n, k, 2) harmonics of the joints' functions [rad]; None without any."""
+        if self.waves is None:
+            return None
+        waves = self.waves.directions @ self.values[self.columns_of(HARMONICS)]
+        return np.asarray(self.weights[HARMONICS] * waves.reshape(self.nominal.joint_count, -1, 2))
+
+    @property
+    def is_kept(self) -> Mask:
+        """(p,) mask of the values other than harmonics."""
+        kept = np.ones(len(self.values), dtype=bool)
+        kept[self.columns_of(HARMONICS)] = False
+        return kept
+
+    def undetermined_covariance(self, q: FloatArray) -> FloatArray:
+        """Flange covariance (m, 6, 6) by the undetermined part of the joints' functions.
+
+        It is that for errors of unit size.
+        """
+        if self.waves is None:
+            return np.zeros((len(q), 6, 6))
+        jacobian = self.weights[HARMONICS] * self._wave_jacobian(q, self.waves)
+        prior, known = jacobian * self.waves.sizes, jacobian @ self.waves.directions
+        return np.asarray(prior @ np.swapaxes(prior, 1, 2) - known @ np.swapaxes(known, 1, 2))
+
+    def _wave_jacobian(self, q: FloatArray, waves: JointFunctions) -> FloatArray:
+        orders = len(waves.sizes) // (2 * self.nominal.joint_count)
+        return self.robot.harmonic_jacobian(q, orders)
 
     def _joint_values(self, name: str) -> FloatArray:
         """Values (n,) of a block with one per joint; zeros where the arm lacks it."""
@@ -188,6 +243,8 @@ class ArmModel:
             # The last link's own twist acts on the flange, before what is mounted on it.
             jacobian[:, :, -6:] = adjoint(invert(self.flange_from_reported))
             return np.asarray(jacobian * units)
+        if name == HARMONICS and self.waves is not None:
+            return np.asarray(self._wave_jacobian(bent, self.waves) @ self.waves.directions)
         count = self.nominal.joint_count
         functions = self.robot.function_jacobian(bent).reshape(len(q), 6, count, 4)
         return np.concatenate([functions[..., function] for function in _FUNCTIONS[name]], axis=2)
@@ -197,6 +254,10 @@ class ArmModel:
         weights = self.weights.items()
         columns = [weight * self.columns(name, q, loads) for name, weight in weights]
         return np.concatenate(columns, axis=2)
+
+    def basis_without_harmonics(self, q: FloatArray) -> FloatArray:
+        """The columns of `basis` other than harmonics."""
+        return self.basis(q)[:, :, self.is_kept]
 
 
 def _is_noise(twists: FloatArray) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.armmodel import HARMONICS, ArmModel
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Noise, Observations, State
 from visioncal.robot import Loads
@@ -204,7 +204,39 @@ class ArmData:
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
-        by_chain = self.place_jacobian(q)[0]
+        by_chain, by_flange = self.place_jacobian(q)
         chain_covariance = self.covariance[np.ix_(self.chain, self.chain)]
+        undetermined = self.error_rad**2 * self.model.undetermined_covariance(q)
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
+        variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
         return np.asarray(np.sqrt(variances))
+
+    def function_errors(self, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Joint function errors (n, k) beyond offset and ratio, with standard deviations [rad].
+
+        They are those at (k,) angles of every joint [rad].
+        """
+        model = self.model
+        count, chain = model.nominal.joint_count, model.bare.chain
+        turned = np.repeat(angles[:, None], count, axis=1)
+        errors = chain.effective(turned) - chain.functions[:, 0] - chain.functions[:, 1] * turned
+        waves = model.waves
+        if waves is None:
+            return errors.T, np.zeros_like(errors.T)
+        orders = len(waves.sizes) // (2 * count)
+        phases = np.arange(1, orders + 2) * angles[:, None]
+        columns = np.stack([np.sin(phases), np.cos(phases)], axis=2)
+        higher = model.weights[HARMONICS] * columns[:, 1:].reshape(len(angles), -1)
+        eccentric, harmonic = (model.columns_of(name) for name in ("eccentricity", HARMONICS))
+        variances = np.zeros((count, len(angles)))
+        for joint in range(count):
+            rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
+            determined = higher @ waves.directions[rows]
+            jacobian = np.zeros((len(angles), len(model.values)))
+            jacobian[:, harmonic] = determined
+            first = [eccentric.start + joint, eccentric.start + count + joint]
+            jacobian[:, first] = model.weights["eccentricity"] * columns[:, 0]
+            prior = np.sum((higher * waves.sizes[rows]) ** 2, axis=1)
+            variances[joint] = np.einsum("kp,pq,kq->k", jacobian, self.arm_covariance, jacobian)
+            variances[joint] += self.error_rad**2 * (prior - np.sum(determined**2, axis=1))
+        return errors.T, np.sqrt(np.maximum(variances, 0.0))

@@ -53,7 +53,8 @@ class ArmErrors:
         `camera` is the (6 + k + m, 6 + k + m) covariance of the camera's edge and lens.
         """
         result, fit = calibration.arm, calibration.joint_fit
-        if fit is None or not calibration.arm_is_calibrated or result is None:
+        # The joint fit's covariance does not contain functions of the joints.
+        if fit is None or not calibration.arm_is_calibrated or result is None or result.functions:
             return None
         from visioncal.calibration.verification.calibration_prior import fitted_model
 
@@ -224,7 +225,7 @@ class CalibratedCamera:
         """
         basis, postures = np.zeros((6, self.arm_error_count)), self.posture_error_count
         if self.arm is not None and joints_rad is not None:
-            basis[:, postures:] = self.arm.model.basis(joints_rad[None])[0]
+            basis[:, postures:] = self.arm.model.basis_without_harmonics(joints_rad[None])[0]
         elif postures:
             basis[:, :postures] = self.arm_sigma * pose_basis(base_from_flange[None])[0]
         return basis

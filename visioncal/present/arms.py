@@ -24,6 +24,7 @@ LEVELS = {
     "geometry": "geometry of the links",
     "eccentricity": "geometry and eccentric gears",
     "elastic": "geometry, gears, and joints that bend",
+    "functions": "geometry, gears, gravity, and functions of the joints",
 }
 _SYMBOLS = {
     "theta": "\N{GREEK SMALL LETTER THETA}",

@@ -90,6 +90,24 @@ class WorkspacePlace:
     sigma_mm: float
 
 
+@dataclass(frozen=True)
+class JointFunction:
+    """Angle-dependent error of a joint, beyond offset and ratio."""
+
+    joint: str  # The joint's name.
+    error_mrad: tuple[float, ...]  # Error at equal steps of one turn from -180 degrees [mrad].
+    sigma_mrad: tuple[float, ...]  # Its standard deviation [mrad].
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFunctions:
+    """Angle-dependent errors of the joints, as functions with a Gaussian process prior."""
+
+    size_mrad: float  # Their standard deviation [mrad].
+    length_deg: float  # Their correlation length in the joint's angle [deg].
+    joints: tuple[JointFunction, ...]  # One entry for each joint.
+
+
 Region = Literal["box", "ahead", "beside", "behind"]
 _WHERE = {
     "box": "in the box of the stops",
@@ -200,6 +218,8 @@ class ArmResult(Section):
     # more than at other postures with the same flange position.
     measured_map: tuple[WorkspacePlace, ...] = ()
     carries_over: CarriesOver | None = None  # Comparison with the nominal arm over the workspace.
+    # Angle-dependent errors of the joints, at level `functions`.
+    functions: JointFunctions | None = None
     measured: tuple[JointRange, ...] = ()  # Ranges of the joints at the stops.
     observability: Observability | None = None  # Observability of the parameters at the stops.
     not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.

@@ -28,7 +28,8 @@ class Chain:
     The pose of the tip is `placement_1 M_1 placement_2 M_2 ... placement_{n+1}`, where M_i turns
     about (or moves along) axis i by the joint's effective position, a function of the encoder's q:
     `offset + ratio q + sine sin(q) + cosine cos(q)`, with gear ratio and encoder eccentricity
-    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration).
+    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration), and harmonics of
+    higher order.
     """
 
     joint_names: tuple[str, ...]  # The joints from the base to the tip.
@@ -41,6 +42,8 @@ class Chain:
     lower: FloatArray  # (n,) lower limits of q [rad or m]; -inf for a joint without limits.
     upper: FloatArray  # (n,) upper limits of q [rad or m]; inf for a joint without limits.
     functions: FloatArray  # (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
+    # (n, k, 2) sine and cosine [rad] of each joint at orders from 2 on; None for none.
+    harmonics: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.joint_names)
@@ -65,7 +68,7 @@ class Chain:
     @property
     def is_periodic(self) -> bool:
         """Whether joint functions have a periodic part."""
-        return bool(self.functions[:, 2:].any())
+        return bool(self._amplitudes.any())
 
     def effective(self, q: FloatArray) -> FloatArray:
         """Effective positions (m, n) of the joints at encoder positions (m, n) `q`."""
@@ -99,10 +102,20 @@ class Chain:
 
     def _periodic(self, q: FloatArray, derivative: int) -> FloatArray:
         """(m, n) periodic part of the joint functions, or one of its derivatives."""
+        amplitudes = self._amplitudes
+        orders = np.arange(1, amplitudes.shape[1] + 1)
         # A derivative advances the phase by a quarter turn.
-        phases = q + derivative * np.pi / 2
-        sine, cosine = np.where(self.prismatic[:, None], 0.0, self.functions[:, 2:]).T
-        return np.asarray(sine * np.sin(phases) + cosine * np.cos(phases))
+        phases = orders * q[..., None] + derivative * np.pi / 2
+        values = amplitudes[..., 0] * np.sin(phases) + amplitudes[..., 1] * np.cos(phases)
+        return np.asarray((values * orders**derivative).sum(axis=-1))
+
+    @property
+    def _amplitudes(self) -> FloatArray:
+        """(n, k, 2) sine and cosine amplitudes by order; zero for prismatic joints."""
+        amplitudes = self.functions[:, None, 2:]
+        if self.harmonics is not None:
+            amplitudes = np.concatenate([amplitudes, self.harmonics], axis=1)
+        return np.where(self.prismatic[:, None, None], 0.0, amplitudes)
 
     def with_offsets_placed(self) -> "Chain":
         """The same arm with the joint function offsets moved into the placements."""
@@ -128,6 +141,8 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
         limits = {"lower": chain.lower[place], "upper": chain.upper[place]}
         row |= {key: float(limit) for key, limit in limits.items() if np.isfinite(limit)}
         row |= dict(zip(FUNCTION_NAMES, chain.functions[place].tolist(), strict=True))
+        if chain.harmonics is not None:
+            row["harmonics"] = chain.harmonics[place].tolist()
         joints.append(row)
     return {
         "schema": 1,
@@ -163,6 +178,28 @@ def chain_from_document(table: DocumentTable) -> Chain:
         lower,
         upper,
         np.array([joint_function(row, FUNCTION_NAMES) for _, row in rows]),
+        _harmonics([row for _, row in rows]),
+    )
+
+
+def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
+    """(n, k, 2) harmonics of the joints; None where no row has any."""
+    given = [row.content.get("harmonics", []) for row in rows]
+    if not any(given):
+        return None
+    size = len(given[0]) if isinstance(given[0], Sequence) else 0
+    needed = f"{size} pairs of numbers, sine and cosine of the orders from 2 on [rad]"
+    for row, pairs in zip(rows, given, strict=True):
+        if not isinstance(pairs, Sequence) or len(pairs) != size or not size:
+            raise row.refuse("harmonics", pairs, needed)
+    return np.array(
+        [
+            [
+                DocumentTable({"harmonics": pair}, row.label).numbers("harmonics", 2)
+                for pair in pairs
+            ]
+            for row, pairs in zip(rows, given, strict=True)
+        ]
     )
 
 

@@ -259,10 +259,28 @@ class Robot:
         """Torques of weight, payload and force on the joints; see `loads.load_torques`."""
         return load_torques(self, q, loads)
 
+    def harmonic_jacobian(self, q: FloatArray, orders: int) -> FloatArray:
+        """Jacobian of the flange over the harmonics of the joint functions.
+
+        Args:
+            q: (m, n) joint angles [rad].
+            orders: The number k of orders, from 2 on.
+
+        Returns:
+            (m, 6, 2 n k) right perturbations of `base_from_flange` for each joint's sine and cosine
+            of each order [rad], as `chain.harmonics` has them; none for a prismatic joint.
+        """
+        axes = np.where(self.chain.prismatic, 0.0, self.axis_jacobian(q))
+        phases = np.arange(2, orders + 2) * np.asarray(q, dtype=float)[:, :, None]
+        waves = np.stack([np.sin(phases), np.cos(phases)], axis=-1)
+        columns = axes[:, :, :, None, None] * waves[:, None]
+        return np.asarray(columns.reshape(*axes.shape[:2], 2 * orders * self.joint_count))
+
     def corrected(
         self,
         placements: FloatArray | None = None,
         functions: FloatArray | None = None,
+        harmonics: FloatArray | None = None,
     ) -> "Robot":
         """Builds the robot with a changed geometry.
 
@@ -271,6 +289,8 @@ class Robot:
                 multiplied on the right by its exponential. None leaves them.
             functions: (n, 4) additions to each joint's offset [rad], ratio, sine and cosine [rad].
                 None leaves them.
+            harmonics: (n, k, 2) additions to each joint's sine and cosine [rad] of the orders from
+                2 on. None leaves them.
 
         Returns:
             The robot, with a self-contained document that recreates it exactly.
@@ -292,6 +312,15 @@ class Robot:
                     "zero are needed.",
                     culprits=[self.name],
                 )
+        if harmonics is not None:
+            known = chain.harmonics
+            if known is not None:
+                orders = max(known.shape[1], harmonics.shape[1])
+                known, harmonics = (
+                    np.pad(array, ((0, 0), (0, orders - array.shape[1]), (0, 0)))
+                    for array in (known, harmonics)
+                )
+            chain = replace(chain, harmonics=harmonics if known is None else known + harmonics)
         document = chain_document(self.name, self.tip, chain)
         for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
             row |= {key: known[key] for key in BODY_KEYS if key in known}

@@ -49,13 +49,18 @@ def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
 
 def unexportable_functions(robot: Robot) -> tuple[str, ...]:
     """Texts on joint functions of a corrected robot that other formats cannot hold."""
-    texts = []
-    for joint, function in zip(robot.joint_names, robot.chain.functions, strict=True):
+    texts, harmonics = [], robot.chain.harmonics
+    for index, (joint, function) in enumerate(
+        zip(robot.joint_names, robot.chain.functions, strict=True)
+    ):
         parts = [
             f"{name} {value:.9g}"
             for name, value, none in zip(FUNCTION_NAMES, function, IDENTITY_FUNCTION, strict=True)
             if name != "offset" and value != none
         ]
+        if harmonics is not None and harmonics[index].any():
+            rms_mrad = 1e3 * float(np.sqrt(np.sum(harmonics[index] ** 2) / 2))
+            parts.append(f"harmonics from order 2 on of {rms_mrad:.2g} mrad rms")
         texts += [f"{joint}: {', '.join(parts)}"] if parts else []
     return tuple(texts)
 
@@ -63,8 +68,8 @@ def unexportable_functions(robot: Robot) -> tuple[str, ...]:
 def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     """Writes a URDF without shapes: joints with axes and limits, links with inertias, the tip.
 
-    Joint offsets go into the origins. A URDF cannot hold gear ratio and eccentricity; a comment
-    lists those that are missing.
+    Joint offsets go into the origins. A URDF cannot hold gear ratio, eccentricity and harmonics; a
+    comment lists those that are missing.
     """
     chain = robot.chain.with_offsets_placed()
     links = ["base", *(f"link_{index}" for index in range(1, len(chain) + 1)), robot.tip]
@@ -204,7 +209,8 @@ def without_functions(robot: Robot) -> Robot:
     """The arm with offsets as its only joint functions."""
     functions = np.array(IDENTITY_FUNCTION) - robot.chain.functions
     functions[:, 0] = 0.0
-    return robot.corrected(functions=functions)
+    harmonics = robot.chain.harmonics
+    return robot.corrected(functions=functions, harmonics=None if harmonics is None else -harmonics)
 
 
 def fit_links(

@@ -24,6 +24,8 @@ from visioncal.session import Stream
 _QUARTER, _HALF_TURN = 0.5 * np.pi, np.pi
 # Ripples per turn of a strain-wave gear of ratio 100: two per turn of its wave generator.
 _TEETH = 200
+# Nodes per turn of the joints' error functions, which are linear in between.
+_NODES = 1440
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 # Iterations of deflection and torques: each changes the levers by about a hundredth.
 _ROUNDS = 8
@@ -86,6 +88,8 @@ class DhArm:
     # (4, n) periodic joint errors: sine and cosine amplitudes at the joint's angle, from
     # eccentricity, and of the gear's ripple [rad].
     waves: FloatArray
+    # (k, n) further joint errors at k angles over a turn [rad]; None for none.
+    beyond: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,9 @@ class ArmOptions:
     # Sine and cosine amplitudes of the joint errors at the joint's angle [rad].
     eccentricity_sigma_rad: float = 0.0
     ripple_sigma_rad: float = 0.0  # Likewise for the gear's ripple, many times per turn [rad].
+    # Further joint errors as arbitrary functions of the angle [rad].
+    function_sigma_rad: float = 0.0
+    function_length_rad: float = 0.06  # Correlation length of these functions [rad].
     robot: str = "ur10e"  # `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
     robot_sigma_m: float = 3e-5  # Repeatability of the flange's position, per axis [m].
     robot_sigma_rad: float = 5e-5  # Repeatability of its rotation, per axis [rad].
@@ -149,6 +156,15 @@ class ArmOptions:
         arm = arm_named(self.robot)
         draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
         sizes = np.repeat([self.eccentricity_sigma_rad, self.ripple_sigma_rad], 2)
+        beyond = arm.beyond
+        # Drawn only if needed, so that later draws do not change.
+        if self.function_sigma_rad:
+            # Smooth periodic functions: filtered white noise on a circle.
+            angles = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
+            kernel = np.exp(-2.0 * np.sin(0.5 * angles) ** 2 / self.function_length_rad**2)
+            power = np.sqrt(np.maximum(np.fft.rfft(kernel).real, 0.0))[:, None]
+            white = np.fft.rfft(rng.standard_normal((_NODES, arm.a.size)), axis=0)
+            beyond = self.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0)
         return replace(
             arm,
             a=arm.a + self.dh_sigma_m * draws[0],
@@ -157,6 +173,7 @@ class ArmOptions:
             beta=arm.beta + self.dh_sigma_rad * draws[3],
             offset=arm.offset + self.dh_sigma_rad * draws[4] + self.offset_sigma_rad * draws[5],
             waves=arm.waves + sizes[:, None] * waves,
+            beyond=beyond,
         )
 
     def flange_at(
@@ -374,6 +391,9 @@ def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     if arm.waves[:, i].any():
         phases = [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
         joint_angle = joint_angle + arm.waves[:, i] @ np.array(phases)
+    if arm.beyond is not None:
+        nodes = np.linspace(0.0, 2.0 * np.pi, len(arm.beyond), endpoint=False)
+        joint_angle = joint_angle + np.interp(angle, nodes, arm.beyond[:, i], period=2.0 * np.pi)
     cos_q, sin_q = np.cos(joint_angle), np.sin(joint_angle)
     cos_a, sin_a = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
     matrices = np.zeros((angle.size, 4, 4))

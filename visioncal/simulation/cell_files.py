@@ -188,7 +188,7 @@ class _Reader:
 
 def _number(table: DocumentTable, key: str) -> float:
     """A number, checked against the range of its field."""
-    value = table.number(key, positive=key == "scale")
+    value = table.number(key, positive=key in ("scale", "function_length_rad"))
     if key == "scale" and not 0.5 <= value <= 2.0:
         raise table.refuse(key, value, "a number from 0.5 to 2")
     if key == "bow_m" and abs(value) > _MOST_BOW_M:

@@ -341,6 +341,7 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
             workspace_mm=None if accuracy is None else accuracy.median,
             modelled=robot in modelled,
+            by_functions=arm.function_gain > 0.0,
             can_tilt=arm.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )

@@ -25,6 +25,7 @@ from visioncal.core.transforms import adjoint, apply, invert, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimation.arm import misfit_jacobian
+from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.problem_parts import State
 from visioncal.results import (
@@ -286,14 +287,16 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values)
-    loaded = bool(model.values_by_stop.any())
+    # Errors that are not part of its geometry, as functions of the joints are, depend on the loads
+    # of a stop.
+    loaded, kept = bool(model.values_by_stop.any()), model.is_kept
     functions = model.functions if loaded else None
     return FittedArm(
         of="model",
-        values=values,
-        weights=model.weights,
+        values=values[kept],
+        weights={name: size for name, size in model.weights.items() if name != HARMONICS},
         flange_from_reported=model.flange_from_reported,
-        by_stop=model.values_by_stop if loaded else None,
+        by_stop=model.values_by_stop[kept] if loaded else None,
         torque_nm=model.torque_nm if loaded else None,
         yielding=model.yielding if loaded else None,
         weight_functions=None if functions is None else functions.parts,
@@ -314,6 +317,7 @@ def _written_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
         for at in range(1, len(boards))
     ]
     of_errors = rows[problem.effect_columns.get(f"arm of {arm.robot}", slice(0, 0))]
+    of_errors = of_errors if arm.model is None else of_errors[arm.model.is_kept]
     optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
     written = np.concatenate([rows[:12], rows[optics], *further, of_errors])
     by_noise = answer.covariance - sum(answer.covariance_by_source.values(), np.zeros(()))
@@ -427,7 +431,7 @@ def _joint_fit_of_cell(run: RunState) -> CellJointFit:
         effect = answer.problem.effect_columns.get(f"arm of {arm.robot}")
         if fitted is not None and arm.model is not None and effect is not None:
             arms[robot or "robot"] = fitted
-            columns += range(effect.start, effect.stop)
+            columns += np.arange(effect.start, effect.stop)[arm.model.is_kept].tolist()
     covariance = answer.covariance[np.ix_(columns, columns)]
     return CellJointFit(cameras=cameras, targets=targets, arms=arms, covariance=covariance)
 

@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
     change_each,
+    joint_offsets,
     with_drifts,
     with_errors,
     with_pose_errors,
@@ -50,6 +51,7 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
+from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.session.frames import frame_name
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
@@ -127,6 +129,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
     # Misread poses determine neither the arm nor which views are outliers.
     cell_fit = cell_fit if observed.is_misread else _calibrate_arms(cell_fit, observed, final)
+    if level != "hand-eye" and not observed.is_misread:
+        cell_fit = _with_functions(cell_fit)
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     if observed.is_misread:
         return cell_fit
@@ -285,15 +289,34 @@ def _fit_lenses_and_frames(
     )
 
 
-def _choose_levels(cell_fit: CellFit) -> dict[str, RobotArm]:
-    """Selects the errors of each arm."""
-    part, fit, asked = cell_fit.inlier_problem, cell_fit.inlier_fit.fit, cell_fit.level
+def _choose_levels(cell_fit: CellFit, *, functions: bool = False) -> dict[str, RobotArm]:
+    """Selects the errors of each arm; functions of its joints only where asked for."""
+    part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        return arm.with_level(nominal, start, asked, views, fit.noise)
+        found = arm.with_level(
+            nominal, start, cell_fit.level, views, fit.noise, functions=functions
+        )
+        if not functions:
+            return found
+        # They also explain much of a slipped joint: where the slip explains more, they are left
+        # out.
+        gain = found.function_gain
+        joints = joints_of(part, joint_offsets({arm.robot: arm})) if gain else []
+        slips = any(step.gain > gain for step in find_steps(part, fit, joints))
+        return found if gain and not slips else arm
 
     return change_each(cell_fit.arms, part, fit, with_level)
+
+
+def _with_functions(cell_fit: CellFit) -> CellFit:
+    """Fits error functions of the joints of each arm that supports them."""
+    # Their many unknowns would slow each update of the inliers down, so that they come last.
+    arms = _choose_levels(cell_fit, functions=True)
+    if all(arms[name] is arm for name, arm in cell_fit.arms.items()):
+        return cell_fit
+    return _converge_arms(replace(cell_fit, arms=arms))
 
 
 def _converge_arms(cell_fit: CellFit) -> CellFit:

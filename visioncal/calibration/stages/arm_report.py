@@ -35,6 +35,8 @@ from visioncal.results.arm import (
     ArmSections,
     CarriedRegion,
     CarriesOver,
+    JointFunction,
+    JointFunctions,
     JointRange,
     Observability,
     Region,
@@ -43,8 +45,8 @@ from visioncal.results.arm import (
 )
 from visioncal.robot import convert_table, parallel_axes, table_from_document, table_of
 
-# Number of postures of a map of the accuracy.
-_PLACES = 200
+# Number of postures of a map of the accuracy, and of angles per turn of joint error functions.
+_PLACES, _ANGLES = 200, 180
 # Error of real arms between sessions (warm-up, wear, remounting), which one session does not show
 # [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.
 _SESSION_SHARE = 1.2e-4
@@ -85,6 +87,7 @@ def report_of(
         levels.result,
         robot=model.robot,
         backlash=elastic.plays_of(model, arm.arm_covariance),
+        functions=_functions_of(arm, levels),
         measured=tuple(
             JointRange(name, float(column.min()), float(column.max()))
             for name, column in zip(model.nominal.joint_names, arm.q.T, strict=True)
@@ -135,8 +138,9 @@ def add_parameters(
     near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
     with one_blas_thread():
         weight = arm.pair.weight(arm.noise, arm.measured)
+        columns = arm.columns[model.is_kept]
         by_stops = Jacobians.of_stops(
-            arm.problem, arm.state, arm.noise, arm.frames, arm.columns, arm.error_rad
+            arm.problem, arm.state, arm.noise, arm.frames, columns, arm.error_rad
         )
         by_errors = _error_jacobians(arm, anywhere, weight)
         units = [parameter.unit for parameter in parameters]
@@ -209,7 +213,7 @@ def add_parameters(
 
 def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Jacobians by frames and arm errors at (k, n) postures, weighted as for the stops' noise."""
-    columns = arm.model.basis(q) * arm.error_rad
+    columns = arm.model.basis_without_harmonics(q) * arm.error_rad
     return _pair_jacobians(arm.pair, arm.model.base_from_flange(q), columns, weight)
 
 
@@ -220,6 +224,22 @@ def _pair_jacobians(
     by_flange = weight @ pair.at(flange)[0].by_errors
     frames, arm = by_flange @ pair.frame_jacobian(flange), by_flange @ flange_jacobian
     return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, flange_jacobian.shape[2]))
+
+
+def _functions_of(arm: ArmData, levels: SelectedArmLevel) -> JointFunctions | None:
+    """Tables of an arm's joint error functions; None where none were found."""
+    if levels.functions is None:
+        return None
+    errors, sigmas = arm.function_errors(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False))
+    rows = zip(arm.model.nominal.joint_names, 1e3 * errors, 1e3 * sigmas, strict=True)
+    return JointFunctions(
+        size_mrad=1e3 * levels.functions.sigma_rad,
+        length_deg=float(np.rad2deg(levels.functions.length_rad)),
+        joints=tuple(
+            JointFunction(name, tuple(error.tolist()), tuple(sigma.tolist()))
+            for name, error, sigma in rows
+        ),
+    )
 
 
 def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:

@@ -11,6 +11,7 @@ from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import (
     SelectedArmLevel,
+    allows_functions,
     select_errors,
 )
 from visioncal.calibration.stages.reported_poses import move_to_arm
@@ -28,6 +29,7 @@ from visioncal.estimation.arm import (
     rows_of,
     stops_of,
 )
+from visioncal.estimation.arm_sizes import most_orders
 from visioncal.estimation.armmodel import ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Problem
@@ -106,6 +108,12 @@ class RobotArm:
     def can_tilt(self) -> bool:
         """Whether the flange turns about more than one direction; True without a model."""
         return self.matched is None or self.matched.robot.can_tilt
+
+    @property
+    def function_gain(self) -> float:
+        """Twice the gain in log-likelihood by joint error functions; zero without any."""
+        functions = None if self.kinematics is None else self.kinematics.functions
+        return 0.0 if functions is None else functions.gain
 
     def at(self, stops: IntArray) -> Self:
         """The arm at a subset (k,) of its stops."""
@@ -318,6 +326,8 @@ class RobotArm:
         asked: str,
         views: Sequence[int],
         noise: Noise,
+        *,
+        functions: bool = False,
     ) -> Self:
         """Selects the errors of the arm's model by the data.
 
@@ -327,16 +337,21 @@ class RobotArm:
             asked: A key of `stages.kinematics.ASKED`.
             views: (n,) view of each observation.
             noise: Noise levels to start from.
+            functions: Whether functions of the joints are among them, where stops suffice; where
+                none are significant, the arm stays as it is.
         """
         used = self.at(stops_of(problem, self.robot))
         q, every = used.joints_rad, self.joints_rad
         if self.matched is None or q is None or every is None or not len(q):
+            return self
+        if functions and not allows_functions(asked, len(q)):
             return self
         model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, used.loads)
         bases = {
             name: self._by_stop(model.columns(name, every, self.loads))
             for name in blocks_of(model.nominal, self.loads)
         }
+        harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         kinematics = select_errors(
             problem,
@@ -346,12 +361,15 @@ class RobotArm:
             model.torque_nm,
             asked,
             noise,
+            None if harmonics is None else self._by_stop(harmonics),
             self.with_nominal_zero(problem),
             tuple(views[index] for index in mine),
         )
+        if kinematics is None:
+            return self
         arm = replace(self, kinematics=kinematics)
         if kinematics.errors:
-            return arm._with_model(model.with_errors(kinematics.errors))
+            return arm._with_model(model.with_errors(kinematics.errors, kinematics.functions))
         if self.model is None:
             return arm
         # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
@@ -376,8 +394,9 @@ class RobotArm:
         """The arm with a calibrated model, and its errors linearised there."""
         if self.kinematics is None:
             return self
-        arm, first = replace(self, model=model), next(iter(self.kinematics.errors.values()))
-        return replace(arm, errors=replace(first, basis=arm.basis))
+        blocks = self.kinematics.errors.values()
+        arm, gain = replace(self, model=model), sum(block.gain for block in blocks)
+        return replace(arm, errors=ArmErrors(arm.basis, next(iter(blocks)).sigma, gain, True))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
         """(m, 6, p) spread over all stops, (s, 6, p): zero where the robot has no pose."""

@@ -14,7 +14,14 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
-from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, RIGID, WEIGHT
+from visioncal.estimation.armmodel import (
+    BACKLASH,
+    COMPLIANCE,
+    HARMONICS,
+    RIGID,
+    WEIGHT,
+    JointFunctions,
+)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import (
@@ -31,17 +38,19 @@ from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
 _ZERO_SIGMA_RAD = 5e-4
 # The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
 # the data determine.
-_ALL = (*RIGID, COMPLIANCE, WEIGHT, BACKLASH)
+_ALL = (*RIGID, COMPLIANCE, WEIGHT, BACKLASH, HARMONICS)
 ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets", BACKLASH),
-    "kinematics": (*RIGID, BACKLASH),
+    "kinematics": (*RIGID, BACKLASH, HARMONICS),
     "elastic": _ALL,
     "thermal": _ALL,
     "auto": _ALL,
 }
 # Requests that leave the level of the geometry to the data.
 _AUTOMATIC = ("auto", "thermal")
-# The name of a level by the block of errors that it has and the ones before it lack.
+# The name of a level by the block of errors that it has and the ones before it lack, and the fewest
+# stops for functions of the joints.
+FUNCTIONS, _FEWEST_FOR_FUNCTIONS = "functions", 20
 _LEVEL_OF = {
     BACKLASH: "backlash",
     "offsets": "offsets",
@@ -50,6 +59,7 @@ _LEVEL_OF = {
     "ratios": "eccentricity",
     COMPLIANCE: "elastic",
     WEIGHT: "elastic",
+    HARMONICS: FUNCTIONS,
 }
 
 
@@ -65,6 +75,7 @@ class LevelFit:
     # The errors by block; empty for the nominal arm.
     errors: Mapping[str, ArmErrors] = field(default_factory=dict)
     gain: float = 0.0  # Twice the gain in log-likelihood over the nominal arm.
+    functions: JointFunctions | None = None  # Functions of the joints; None without any.
 
     @classmethod
     def of(
@@ -88,7 +99,7 @@ class LevelFit:
         level = cls(fit, squares, has_rotation[rows])
         if sizes is None:
             return level
-        return replace(level, errors=sizes.errors, gain=sizes.gain)
+        return replace(level, errors=sizes.errors, gain=sizes.gain, functions=sizes.functions)
 
     @property
     def held_out_mm(self) -> float:
@@ -135,6 +146,11 @@ class SelectedArmLevel:
         """The arm's errors by block."""
         return self.fit.errors
 
+    @property
+    def functions(self) -> JointFunctions | None:
+        """Functions of the joints; None where these are not significant."""
+        return self.fit.functions
+
     def left_out(self) -> tuple[UnseenView, ...]:
         """Residuals of held-out stops with both arms, by view."""
         before, after = (np.sqrt(level.squares[:, 1]) for level in (self.nominal, self.fit))
@@ -176,9 +192,10 @@ def select_errors(
     torque_nm: float,
     asked: str,
     noise: Noise,
+    harmonics: FloatArray | None = None,
     stated: Problem | None = None,
     views: tuple[int, ...] = (),
-) -> SelectedArmLevel:
+) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
     Their sizes are estimated together; see `arm_sizes`. They must also predict left-out stops
@@ -192,17 +209,22 @@ def select_errors(
         torque_nm: The torque of a unit compliance [N m].
         asked: A key of `ASKED`.
         noise: The noise's levels to start from.
+        harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
         stated: The observations with zeros as in the model, where `problem` has a shifted zero
             corrected; None without one. Then offsets are the least level.
         views: The view of each of the robot's observations.
+
+    Returns:
+        The errors; with `harmonics` None where no functions of the joints are significant.
     """
     is_enough = len(stops_of(problem, robot)) >= FEWEST_STOPS
 
     def likely(blocks: Sequence[str]) -> ArmSizes | None:
         own = {name: bases[name] for name in bases if name in blocks}
+        waves = harmonics if HARMONICS in blocks else None
         with suppress(np.linalg.LinAlgError):
             if is_enough:
-                return estimate_arm_sizes(problem, state, noise, robot, own, torque_nm)
+                return estimate_arm_sizes(problem, state, noise, robot, own, torque_nm, waves)
         return None
 
     def fitted(sizes: ArmSizes | None) -> LevelFit:
@@ -215,6 +237,8 @@ def select_errors(
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
         sizes = likely(ASKED[asked])
+        if harmonics is not None and sizes is None:
+            return None
         nominal = start = LevelFit.of(problem, state, robot, noise, None)
         fit = beyond = fitted(sizes)
         if ASKED[asked] != _ALL:
@@ -232,6 +256,11 @@ def select_errors(
             fit = replace(fit, errors=fit.errors or {"offsets": least}, gain=fit.gain + gain)
     was_asked = asked not in _AUTOMATIC
     return SelectedArmLevel(nominal, fit, was_asked, views, beyond if is_beyond else None)
+
+
+def allows_functions(asked: str, stops: int) -> bool:
+    """Whether a level allows functions of the joints, and there are enough stops for them."""
+    return HARMONICS in ASKED.get(asked, ()) and stops >= _FEWEST_FOR_FUNCTIONS
 
 
 def check_level(asked: str) -> None:

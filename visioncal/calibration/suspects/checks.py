@@ -121,7 +121,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             until_mm=0.0,
         )
     ratio = _ratio(judged.held_out, judged.rms)
-    if ratio > _LIMITS.optimism[0]:
+    if ratio > _LIMITS.optimism[0] and not any(arm.by_functions for arm in judged.arms):
         yield Finding(
             "optimism",
             f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "

@@ -64,6 +64,7 @@ class JudgedArm:
     # nominal arm [mm].
     workspace_mm: float | None = None
     modelled: bool = False  # Whether its model is known.
+    by_functions: bool = False  # Whether joint error functions were fitted to the stops.
     can_tilt: bool = True  # Whether its flange turns about more than one direction.
     name: str = ""  # `Robot` and its name, for messages; empty for a single robot.
 

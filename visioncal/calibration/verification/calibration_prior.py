@@ -115,6 +115,11 @@ class CalibrationPrior:
             max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
         )
+        arm = self.calibration.arm
+        if arm is not None and arm.functions is not None:
+            # Functions of the joints have the error of a left-out stop at a new stop.
+            mm = max(mm, arm.chosen.held_out_mm / np.sqrt(3))
+            deg = max(deg, (arm.chosen.held_out_deg or 0.0) / np.sqrt(3))
         return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
 
     @property
