@@ -30,6 +30,7 @@ def settings():
     return cv2.getNumThreads(), blas
 
 
+@pytest.mark.slow
 def test_threads_write_what_one_alone_writes(tmp_path):
     threads = 2
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")

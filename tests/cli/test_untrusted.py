@@ -43,6 +43,7 @@ def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(
 STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
 
 
+@pytest.mark.slow
 def test_a_name_does_not_steer_the_terminal(tmp_path: Path) -> None:
     cell, out = tmp_path / "cell", tmp_path / "out"
     assert visioncal("simulate", cell, "--no-images", "--views", 12).status == 0

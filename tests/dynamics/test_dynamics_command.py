@@ -137,6 +137,7 @@ def told_of(tmp_path, robot, stream):
     return run("dynamics", "identify", tmp_path / robot)
 
 
+@pytest.mark.slow
 def test_slow_motions_are_told_to_tell_nothing_of_fast_ones(folder, tmp_path):
     done = told_of(tmp_path, "ur5e", Session.load(folder).streams["sweeps"])
     assert done.status == 0
@@ -145,12 +146,14 @@ def test_slow_motions_are_told_to_tell_nothing_of_fast_ones(folder, tmp_path):
     assert "visioncal dynamics plan" in done.out
 
 
+@pytest.mark.slow
 def test_another_robot_is_doubted(folder, tmp_path):
     done = told_of(tmp_path, "ur10e", Session.load(folder).streams["excite"])
     assert done.status == 0
     assert "Check whether it is the robot that was recorded" in done.out
 
 
+@pytest.mark.slow
 def test_a_robot_without_inertias_gets_base_parameters(folder, tmp_path):
     done = told_of(tmp_path, "irb120", Session.load(folder).streams["excite"])
     assert done.status == 0

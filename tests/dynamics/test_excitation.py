@@ -270,6 +270,7 @@ def test_missing_limits_are_named_and_can_be_given(robot, joints, option):
     assert values == pytest.approx(np.full(robot.joint_count, wanted))
 
 
+@pytest.mark.slow
 def test_limits_that_leave_nothing_are_named():
     with pytest.raises(DataError, match=r"joint_1 10\.0 deg are left"):
         motion_limits(small_arm(lower_deg=-5.0, upper_deg=5.0), MotionMargins(margin_rad=0.2))

@@ -167,6 +167,7 @@ def test_a_plan_has_tables_a_preview_and_all_of_it_as_json(tmp_path):
     assert abs(row[6 + fast["joint"]]) == pytest.approx(fast["speed_rad_s"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_a_preview_moves_the_arm_and_draws_its_curves(tmp_path):
     done = plan(

@@ -111,6 +111,7 @@ def sessions(tmp_path_factory):
     return places
 
 
+@pytest.mark.slow
 def test_late_torques_are_named_and_taken_earlier(sessions, tmp_path):
     results = {}
     for lag_s, place in sessions.items():

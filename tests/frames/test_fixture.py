@@ -111,7 +111,7 @@ def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features)
     assert np.abs(more[:3]).max() < 1e-12
 
 
-@pytest.mark.parametrize("features", [slow(False), True])
+@pytest.mark.parametrize("features", [slow(False), slow(True)])
 def test_the_error_over_its_sigma_is_as_it_should_be(features):
     squares = []
     noise = Noise.of_robot(1e-4, 3e-5)
@@ -138,6 +138,7 @@ def test_the_error_over_its_sigma_is_as_it_should_be(features):
     assert 4.6 < np.mean(squares) < 8.2
 
 
+@pytest.mark.slow
 def test_touches_that_scatter_by_the_tip_are_not_called_wrong():
     # Its error is known, and shows where the flange is turned about: here by ten times a touch.
     for seed in range(20):

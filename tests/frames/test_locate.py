@@ -206,6 +206,7 @@ def test_exact_sights_give_exact_places(exact_cell):
     np.testing.assert_allclose(centre.p_base, base_from_target[:3, 3], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

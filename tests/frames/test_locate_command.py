@@ -233,6 +233,7 @@ def test_options_and_sources_that_do_not_fit_are_named(tmp_path):
     refused(message, "fixture", part, **at, cad=cad, point="1,2,3")
 
 
+@pytest.mark.slow
 def test_markers_place_a_fixture_from_the_command_line(tmp_path):
     calibration, base_from_plate, sights = marked_plate()
     calibration.save(tmp_path / "calibration.json")

@@ -71,6 +71,7 @@ def away_mm(calibration, edge, millimetres):
     return np.linalg.norm(1e3 * calibration.transforms[edge].translation - millimetres)
 
 
+@pytest.mark.slow
 def test_industrial_calibration(real_data, calibrated):
     result, _ = calibrated(
         real_data / "ric_charuco_eye_to_hand",
@@ -156,6 +157,7 @@ def test_moveit_with_a_published_answer(real_data, calibrated, tmp_path):
     assert rms_mm == pytest.approx(4.60, abs=0.005)
 
 
+@pytest.mark.slow
 def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     folder = real_data / "pose_pairs_small/ethz_unsynchronised_streams"
     robot, camera = (
@@ -190,6 +192,7 @@ def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):
     assert np.mean([view.residual_deg for view in result.views]) < 1.2 * 0.046
 
 
+@pytest.mark.slow
 def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, tmp_path):
     (tmp_path / "positioner.toml").write_text(POSITIONER)
     source = real_data / "ric_positioner_camera_kinematics/measurements.yaml"

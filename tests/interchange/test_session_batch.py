@@ -170,6 +170,7 @@ def test_a_scheduler_needs_the_extra(fleet, tmp_path, monkeypatch):
     assert "visioncal[cluster]" in done.err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_the_page_shows_a_picture_of_each_session(tmp_path):
     session = write_session(simulate(CellOptions(views=6, seed=1)), tmp_path / "sessions" / "seen")

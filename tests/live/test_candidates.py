@@ -118,6 +118,7 @@ def test_a_box_in_the_way_is_gone_around():
     assert least_clearance(replace(cell, boxes=(wall,)), moved) >= cell.limits.clearance_m
 
 
+@pytest.mark.slow
 def test_a_stop_without_a_safe_way_is_named():
     cell = cell_of(CellOptions(robot="ur5e"))
     stops = candidates(cell, 12, seed=3).q
@@ -200,6 +201,7 @@ def test_the_arm_itself_does_not_hide_the_board():
                 assert lines_apart(eye, sight, p, q).min() > UR5E_RADIUS_M[link] - 1e-9
 
 
+@pytest.mark.slow
 def test_a_joint_that_stops_the_arm_is_named():
     cell = cell_of(CellOptions(robot="ur5e"))
     document = dict(cell.robot.document)
@@ -257,6 +259,7 @@ def test_guesses_spread_as_they_are_said_to():
         np.testing.assert_allclose(moves.std(axis=0), [0.03] * 3 + [0.01] * 3, rtol=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_from_a_bad_guess_nine_of_ten_stops_see_the_whole_board(mount):
     """Both edges are off by 5 cm and 10 degrees; what is said of the guesses is that."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.killed import kill_and_resume
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from support.marks import slow
 from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of, recorded
 
 from visioncal.calibration.run import run
@@ -74,7 +75,9 @@ def test_a_camera_that_stands_still_is_recorded_likewise(tmp_path):
     assert len(session.views) == 3
 
 
-@pytest.mark.parametrize("hidden", [False, True], ids=["told by the arm", "seen in the image"])
+@pytest.mark.parametrize(
+    "hidden", [False, slow(True)], ids=["told by the arm", "seen in the image"]
+)
 def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     arm, camera = fake_devices(plan, trembling_s=0.8, tremble_rad=4e-3, hidden=hidden)
     steps = recorded(tmp_path / "live", plan, arm, camera, CaptureOptions())
@@ -98,6 +101,7 @@ def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):
     assert not (tmp_path / "live" / "session.toml").exists()
 
 
+@pytest.mark.slow
 def test_a_knock_between_frames_throws_all_of_them_away(plan, tmp_path):
     arm, camera = fake_devices(plan)
     frame, knocks = camera.frame, []

@@ -158,6 +158,7 @@ def test_the_same_seed_gives_the_same_plan(document, tmp_path):
     assert json.loads(done.out) | {"created": ""} == document | {"created": ""}
 
 
+@pytest.mark.slow
 def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_path):
     """Plan, record, calibrate anew: all through the command line, the recording simulated."""
     done = visioncal("plan", one_axis, "--add", 5, "-o", tmp_path, "--candidates", 100)
@@ -293,6 +294,7 @@ def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):
     assert short["need"]["probability"] <= met["need"]["probability"]
 
 
+@pytest.mark.slow
 def test_what_keeps_picks_from_a_need_is_named(tmp_path):
     words = {
         ("--noise-mm", "0.08"): "In the way is the robot's own noise at look and pick (",
@@ -306,6 +308,7 @@ def test_what_keeps_picks_from_a_need_is_named(tmp_path):
         assert short["need"]["probability"] <= short["need"]["probability_of_all_candidates"] < 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_what_was_recorded_meets_a_need_as_its_calibration_says(mount, tmp_path):
     options = CellOptions(robot="ur5e", views=10, mount=mount, seed=3)

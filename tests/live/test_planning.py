@@ -184,6 +184,7 @@ def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
     assert wider[1] > 3.0 * far
 
 
+@pytest.mark.slow
 def test_the_few_stops_that_a_recorded_cell_allows_are_added():
     """As before a fixed camera: of a guessed cell so few say that it is guessed wrong."""
     begun = start_from_session(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))

@@ -175,6 +175,7 @@ def test_a_dry_run_moves_nothing_and_writes_nothing(planned, cell, tmp_path):
     assert not (tmp_path / "live").exists()
 
 
+@pytest.mark.slow
 def test_a_recording_that_failed_is_resumed(planned, cell, tmp_path, monkeypatch):
     arm, camera = cell
     camera.unplugged_at = 4

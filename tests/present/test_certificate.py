@@ -40,6 +40,7 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
     assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
 
 
+@pytest.mark.slow
 def test_the_certificate_of_a_whole_cell_names_all_that_is_in_it(tmp_path):
     session = recorded(simulate(replace(OPTIONS, stops=10)))
     page = tmp_path / "certificate.html"

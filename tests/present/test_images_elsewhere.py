@@ -72,6 +72,7 @@ def test_a_run_without_searches_keeps_all_images(cell, tmp_path):
     assert found.images.read(name) == session.images.read(name)
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_recording_that_gives_the_same_result_and_no_folder(cell, tmp_path):
     session, _ = cell
     assert visioncal("calibrate", session.images.folder, "-o", tmp_path).status == 0

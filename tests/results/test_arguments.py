@@ -89,6 +89,7 @@ def is_refused(function: Callable[..., Any], given: dict[str, Any]) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused = 0

@@ -59,6 +59,7 @@ def test_noise_is_no_change(mount: Mount) -> None:
     assert abs(np.mean(p_values < 0.5) - 0.5) < 0.36
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_camera_moved_by_five_sigma_is_found(mount: Mount) -> None:
     for seed in range(2):

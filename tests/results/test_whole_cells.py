@@ -108,6 +108,7 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
     assert f"95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):
     session = Session.load(folder / "session")
     stop = 7
@@ -201,6 +202,7 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
     assert len(found.of("right").views) == len(session.of("right").views)
 
 
+@pytest.mark.slow
 def test_a_stated_camera_of_measured_poses_is_kept(cell):
     whole = package.calibrate(cell_session(cell, "poses", seen="poses"), need_mm=0.1)
     found = whole.of("left", "b")
@@ -308,6 +310,7 @@ def test_what_a_whole_cell_does_not_have_is_refused(cell):
         package.calibrate(part(recorded(cell), 0, LATER), solver="park")
 
 
+@pytest.mark.slow
 def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     cell = simulate(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
     session = recorded(cell)
@@ -318,6 +321,7 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     assert set(check.predicted.observed.reasons) < set(cell.wrong_views)
 
 
+@pytest.mark.slow
 def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():
     robots = tuple(replace(robot, offset_sigma_rad=3e-3) for robot in OPTIONS.robots)
     cell = simulate(replace(OPTIONS, robots=robots, stops=LATER + 8, seed=4))

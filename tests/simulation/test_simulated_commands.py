@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.marks import slow
 from support.moved_arms import true_base
 
 from visioncal import simulation
@@ -117,7 +118,7 @@ def test_cells_that_come_with_visioncal_are_calibrated(name, place):
         assert misfit(item, truth, among) < MOST, edge
 
 
-@pytest.mark.parametrize("read", ["point", "probe"])
+@pytest.mark.parametrize("read", [slow("point"), "probe"])
 def test_readings_of_a_tracker_are_calibrated(read, place):
     folder, out = place / read, place / f"{read}-out"
     errs = ("--arm-sigma-mm", 0.3, "--arm-sigma-mrad", 0.3) if read == "point" else ()
@@ -131,6 +132,7 @@ def test_readings_of_a_tracker_are_calibrated(read, place):
     assert misfit(probe, edges["flange_from_probe"], among) < MOST
 
 
+@pytest.mark.slow
 def test_torques_are_identified_and_a_load_is_weighed(place):
     empty, loaded, out = place / "empty", place / "loaded", place / "dynamics"
     done("simulate", empty, "--torques", "--robot", "ur5e")
@@ -199,7 +201,7 @@ def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_kn
     assert after["moved"] == [{"frame": "cam_left", "from_stop": 0}]
 
 
-@pytest.mark.parametrize("read", ["points", "probe"])
+@pytest.mark.parametrize("read", ["points", slow("probe")])
 def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
     folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
     done(
@@ -261,6 +263,7 @@ from_stop = 4
 """
 
 
+@pytest.mark.slow
 def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     (place / "swept.toml").write_text(OWN.replace("stops = 6", "stops = 12") + SWEPT)
     folder = place / "swept-cell"

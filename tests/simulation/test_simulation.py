@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.cells import exact
+from support.marks import slow
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log, rotation_angle
@@ -294,9 +295,9 @@ def detection_errors(options: CellOptions) -> np.ndarray:
     [
         CellOptions(),
         CellOptions(camera=fisheye_camera(), tilt_rad=(0.1, 0.5)),
-        CellOptions(target=BOARDS["checkerboard"], blur_px=1.0),
+        slow(CellOptions(target=BOARDS["checkerboard"], blur_px=1.0)),
         CellOptions(target=dataclasses.replace(BOARDS["charuco"], legacy=True)),
-        CellOptions(board_scale=1.01, board_bow_m=0.003),
+        slow(CellOptions(board_scale=1.01, board_bow_m=0.003)),
         CellOptions(mount="eye-to-hand", distance_m=(0.5, 0.8)),
     ],
     ids=["charuco", "fisheye", "checkerboard", "legacy", "bowed", "to-hand"],

@@ -72,11 +72,11 @@ def test_a_wrong_field_is_named(change, words):
 @pytest.mark.parametrize(
     ("shot", "most_px"),
     [
-        (SHOT, 0.01),
-        (replace(SHOT, square_px=25), 0.015),
+        slow(SHOT, 0.01),
+        slow(replace(SHOT, square_px=25), 0.015),
         (replace(SHOT, disc_px=2), 0.015),
         (replace(SHOT, tilt_deg=60), 0.015),
-        (replace(SHOT, gamma=0.45, bend=0.1), 0.015),
+        slow(replace(SHOT, gamma=0.45, bend=0.1), 0.015),
         (replace(SHOT, bayer=True), 0.03),
     ],
 )
@@ -96,9 +96,9 @@ def test_corners_are_as_exact_as_the_image(shot, most_px):
     [
         ({"columns": 6}, "do not lie as the target describes"),
         ({"rows": 2}, "the grid has tag 1[0-4] besides the target's 5 x 2"),
-        ({"rows": 4}, "the grid ends before the target's 5 x 4"),
+        slow({"rows": 4}, "the grid ends before the target's 5 x 4"),
         ({"spacing": 0.25}, "are 0.30 of their side apart, and the target says spacing = 0.25"),
-        ({"border": 1}, "have a border of 2 modules, and the target says border = 1"),
+        slow({"border": 1}, "have a border of 2 modules, and the target says border = 1"),
         ({"marker_id": 30}, r"most tags seen \(0, 1, 2, 3, 4\) are none of the target's"),
     ],
 )
@@ -131,6 +131,7 @@ def test_a_cell_is_calibrated_with_it(tmp_path, mount):
     assert error @ np.linalg.solve(result.joint_covariance, error) < 32.9
 
 
+@pytest.mark.slow
 def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     side, pitch = 0.03, 0.04
     tags = [(5 + 4 * row + column, column, 3 - row) for row in range(4) for column in range(4)]

@@ -68,9 +68,9 @@ def test_circles_that_touch_are_refused():
     ("shot", "most_px"),
     [
         (SHOT, 0.008),
-        (replace(SHOT, disc_px=3), 0.015),
+        slow(replace(SHOT, disc_px=3), 0.015),
         (replace(SHOT, tilt_deg=60, square_px=40), 0.01),
-        (replace(SHOT, bend=0.15, ink_px=1), 0.01),
+        slow(replace(SHOT, bend=0.15, ink_px=1), 0.01),
         (replace(SHOT, bayer=True), 0.025),
     ],
 )
@@ -85,7 +85,7 @@ def test_centres_are_as_exact_as_the_image(target, shot, most_px):
     assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
 
 
-@pytest.mark.parametrize("table", [30, slow(220)])
+@pytest.mark.parametrize("table", [slow(30), slow(220)])
 def test_light_circles_on_dark_are_as_exact(table):
     """A board printed in negative lies on a dark or a light table."""
     shot = Shot(square_px=60, uneven=0.3)
@@ -131,7 +131,7 @@ def test_another_page_is_named(change, words):
     ("target", "mount"),
     [
         (BOARDS["circles"], "eye-to-hand"),
-        (BOARDS["symmetric-circles"], "eye-in-hand"),
+        slow(BOARDS["symmetric-circles"], "eye-in-hand"),
         slow(BOARDS["circles"], "eye-in-hand"),
         slow(BOARDS["symmetric-circles"], "eye-to-hand"),
     ],

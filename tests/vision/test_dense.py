@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.boards import charuco, checkerboard
+from support.marks import slow
 from support.rendered import Shot, photograph
 
 from visioncal.vision.dense import find_densely
@@ -16,9 +17,9 @@ SHOT = Shot(square_px=32, noise=2)
 @pytest.mark.parametrize(
     ("target", "shot"),
     [
-        (CHECKERBOARD, replace(SHOT, motion_px=20)),
+        slow(CHECKERBOARD, replace(SHOT, motion_px=20)),
         (CHECKERBOARD, replace(SHOT, disc_px=9, uneven=0.3)),
-        (CHARUCO, replace(SHOT, disc_px=8)),
+        slow(CHARUCO, replace(SHOT, disc_px=8)),
     ],
 )
 def test_corners_of_smeared_images_are_within_their_sigmas(target, shot):
@@ -39,6 +40,7 @@ def test_corners_of_smeared_images_are_within_their_sigmas(target, shot):
         assert 0.4 * shot.disc_px < found.width_px < shot.disc_px
 
 
+@pytest.mark.slow
 def test_another_board_or_none_gives_no_corners():
     image = photograph(CHARUCO, replace(SHOT, motion_px=14), 1)[0]
     assert find_densely(image, charuco(6, 5, "DICT_4X4_50")) is None

@@ -163,6 +163,7 @@ def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
     assert list(refused.corners) == [1]
 
 
+@pytest.mark.slow
 def test_all_corners_of_the_smallest_boards_suffice():
     charuco = replace(BOARDS["charuco"], columns=3, rows=3, square_m=0.06, marker_m=0.045)
     tag = replace(BOARDS["aprilgrid"], columns=1, rows=1, square_m=0.06)

@@ -201,6 +201,7 @@ def photo(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_check_prints_a_description_and_writes_it(photo, tmp_path):
     done = run(photo)
     assert done.status == 0, done.said

@@ -75,6 +75,7 @@ def test_noise_gives_the_standard_deviation(target):
     assert 0.4 < np.mean(scaled**2) < 1.6
 
 
+@pytest.mark.slow
 def test_blur_is_measured_along_both_families_of_lines():
     image, truth = photograph(CHECKERBOARD, replace(SMALL, square_px=40, disc_px=4), 1)
     # A disc has half its radius as its standard deviation; the lens and the pixels add a little.
@@ -244,6 +245,7 @@ def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
         assert rms(found.px - truth) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
 def test_a_smear_in_one_direction_counts_as_blur(target):
     # A line of 8 px has a standard deviation of 2.3 px; the sharp direction stays sharp.
@@ -276,11 +278,11 @@ def outward(error, truth):
     ("dictionary", "shot", "white"),
     [
         ("DICT_6X6_50", Shot(square_px=60, bend=0), 1.0),
-        ("DICT_6X6_50", Shot(square_px=100, bend=0), 0.4),
+        slow("DICT_6X6_50", Shot(square_px=100, bend=0), 0.4),
         ("DICT_6X6_50", Shot(square_px=80, bend=0, disc_px=2), 1.0),
         ("DICT_APRILTAG_36h11", Shot(square_px=100, bend=0, tilt_deg=60), 1.0),
-        ("DICT_APRILTAG_36h11", Shot(square_px=120, bend=0, uneven=0.3), 1.0),
-        ("DICT_6X6_50", Shot(square_px=150, bend=0.005), 1.0),
+        slow("DICT_APRILTAG_36h11", Shot(square_px=120, bend=0, uneven=0.3), 1.0),
+        slow("DICT_6X6_50", Shot(square_px=150, bend=0.005), 1.0),
     ],
 )
 def test_the_corners_of_a_single_marker_are_not_drawn_inwards(dictionary, shot, white):
