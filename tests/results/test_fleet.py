@@ -72,15 +72,12 @@ def test_the_odd_robot_comes_first(changes, words):
     assert not any("focal" in outlier.stands_out for outlier in with_outliers(other))
 
 
-def test_another_model_comes_first_and_robots_are_compared_with_their_own():
+def test_robots_are_compared_with_their_own_model():
     other = {"robot": "ur5e", "noise_mm": 0.3}
     rows = [replace(item, **other) if item.group == "robot_2" else item for item in fleet(3)]
     failed = FleetRow(name="robot_4/week_99", session="", state="failed", words="<no> table")
     found = with_outliers([*rows, failed])
-    assert {item.group for item in found[:20]} == {"robot_2"}
-    assert found[0].stands_out == "its robot is a ur5e, where 180 of 200 are ur10e"
+    assert not any(item.stands_out for item in found if item.group == "robot_2")
     page = fleet_page(found)
-    assert page.index("robot_2") < page.index("robot_4/week_99")
-    assert "20 of 20 sessions" in page
     assert "&lt;no&gt; table" in page
     assert 'href="robot_2/week_00/calibration.json"' in page

@@ -25,15 +25,13 @@ def batch_command(options: BatchOptions) -> None:
             need_mm=options.need.need_mm,
             need_deg=options.need.need_deg,
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
-            against=options.against,
             progress=progress,
         )
     counts = found.counts
-    named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
+    named = ("good", "check", "bad", "failed", "kept", "standing out")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
     answer(f"{len(found.rows)} sessions: {words}")
     lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
-    lines += [f"{row.name}: {row.change}" for row in found.rows if row.changed][:_MOST_NAMED]
     failed = [
         f"{row.name}: {row.words} {row.next_step}".rstrip()
         for row in found.rows

@@ -121,9 +121,6 @@ class BatchOptions:
         "the extra cluster.",
         metavar="ADDRESS",
     )
-    against: Path | None = option(
-        "An earlier batch: which results changed by more than their sigmas."
-    )
     level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
     no_report: bool = flag(f"Leave each {REPORT} out.")
     recordings: bool = flag("Also write each recording, with all images.")

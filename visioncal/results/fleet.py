@@ -1,16 +1,14 @@
-"""Results of many sessions as rows: outliers among them, and changes since earlier results."""
+"""Results of many sessions as rows, and outliers among them."""
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from visioncal.core.number_format import figure
-from visioncal.core.transforms import pose_difference
-from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.results.result import Calibration
 
 State: TypeAlias = Literal["done", "kept", "failed"]
@@ -24,9 +22,6 @@ _LIMIT = 3.5
 _SPREAD, _LENS_SPREAD = 0.2, 0.01
 # Ratio of standard deviation to median absolute deviation of a normal distribution.
 _MAD = 1.4826
-# Largest share of an outlying robot model, smallest share of the usual one, and the former's score.
-_FEW, _MOST = 0.2, 0.5
-_MODEL_SCORE = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +62,6 @@ class FleetRow:
     has_report: bool = False  # Whether its folder has a report.
     score: float = 0.0  # Largest robust standard score among its fleet; 0 within the limit.
     stands_out: str = ""  # What the score is of, in words.
-    # Whether its result differs from an earlier one by more than that one's sigmas.
-    changed: bool | None = None
-    change: str = ""  # What differs, in words.
 
     @property
     def group(self) -> str:
@@ -117,26 +109,15 @@ def row_of(name: str, session: str, calibration: Calibration, version: str) -> F
     )
 
 
-@dataclass(frozen=True)
-class _Measure:
-    """Figure that is compared among the sessions of a fleet."""
-
-    words: str  # Its name in messages.
-    unit: str  # Its unit.
-    spread: float = _SPREAD  # Smallest standard deviation of its logarithm.
-    is_worse_above: bool = True  # Whether only large values are outliers.
-    most: float = math.inf  # Largest value that is possible, whatever the rest of the fleet has.
-
-
-_MEASURES: Mapping[str, _Measure] = {
-    # A robot with more than a refused result's sigma is one whose poses are misread.
-    "noise_mm": _Measure("noise of the robot", "mm", most=1e3 * SIGMA_LIMIT_M),
-    "noise_deg": _Measure("noise of its rotation", "deg", most=math.degrees(SIGMA_LIMIT_RAD)),
-    "noise_px": _Measure("noise of the corners", "px"),
-    "residual_mm": _Measure("residual", "mm"),
-    "arm_mm": _Measure("errors of the arm", "mm"),
-    "drift_mm": _Measure("drift of the arm", "mm"),
-    "focal_px": _Measure("focal length", "px", _LENS_SPREAD, is_worse_above=False),
+# Figures that are compared among the sessions of a fleet, in words, with their units.
+_MEASURES = {
+    "noise_mm": ("noise of the robot", "mm"),
+    "noise_deg": ("noise of its rotation", "deg"),
+    "noise_px": ("noise of the corners", "px"),
+    "residual_mm": ("residual", "mm"),
+    "arm_mm": ("errors of the arm", "mm"),
+    "drift_mm": ("drift of the arm", "mm"),
+    "focal_px": ("focal length", "px"),
 }
 
 
@@ -145,11 +126,10 @@ def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
 
     Sessions of one robot model are compared (lenses also of one image size): the score is that of
     each figure's logarithm by median and median absolute deviation, robust to half of a fleet.
-    Noise that no robot has is an outlier in any fleet.
     """
     scores: dict[str, float] = defaultdict(float)
     words: dict[str, list[str]] = defaultdict(list)
-    for name, score, sentence in [*_model_outliers(rows), *_figure_outliers(rows)]:
+    for name, score, sentence in _outliers(rows):
         scores[name] = max(scores[name], score)
         words[name].append(sentence)
     scored = [replace(row, score=scores[row.name], stands_out="; ".join(words[row.name]))
@@ -158,92 +138,23 @@ def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
     return sorted(scored, key=lambda value: (-value.score, order.get(value.verdict, 0), value.name))
 
 
-def _model_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
-    counts = Counter(row.robot for row in rows if row.robot)
-    if not counts:
-        return []
-    usual, most = counts.most_common(1)[0]
-    total = sum(counts.values())
-    if total < FEWEST or most < _MOST * total:
-        return []
-    return [
-        (row.name, _MODEL_SCORE, f"its robot is a {row.robot}, where {most} of {total} are {usual}")
-        for row in rows
-        if row.robot and row.robot != usual and counts[row.robot] <= _FEW * total
-    ]
-
-
-def _figure_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
-    outliers: list[tuple[str, float, str]] = []
-    for field, measure in _MEASURES.items():
-        groups: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
+def _outliers(rows: Sequence[FleetRow]) -> Iterator[tuple[str, float, str]]:
+    """Names of outlying rows with their scores, and what these are of, in words."""
+    for field, (words, unit) in _MEASURES.items():
+        is_lens, groups = field == "focal_px", defaultdict[tuple[str, str], list[FleetRow]](list)
         for row in rows:
-            value = getattr(row, field)
-            if value is not None and value > measure.most:
-                words = f"{measure.words} {figure(value)} {measure.unit}, where no robot has more "
-                reason = f"{words}than {figure(measure.most)} {measure.unit}: {row.words}"
-                outliers.append((row.name, _MODEL_SCORE * value / measure.most, reason))
-            elif value is not None and value > 0.0:
-                camera = row.camera if field == "focal_px" else ""
-                groups[row.robot, camera].append((row.name, value))
+            if (getattr(row, field) or 0.0) > 0.0:
+                groups[row.robot, row.camera if is_lens else ""].append(row)
         for members in groups.values():
             if len(members) < FEWEST:
                 continue
-            logs = np.log([value for _, value in members])
+            logs = np.log([getattr(row, field) for row in members])
             median = float(np.median(logs))
-            spread = max(_MAD * float(np.median(np.abs(logs - median))), measure.spread)
-            scores = (logs - median) / spread
-            scores = scores if measure.is_worse_above else np.abs(scores)
-            usual = f"where {figure(math.exp(median))} {measure.unit} is usual"
-            outliers += [
-                (name, score, f"{measure.words} {figure(value)} {measure.unit}, {usual}")
-                for (name, value), score in zip(members, scores.tolist(), strict=True)
-                if score > _LIMIT
-            ]
-    return outliers
-
-
-def with_changes(
-    rows: Sequence[FleetRow],
-    before: Callable[[str], Calibration | None],
-    after: Callable[[str], Calibration | None],
-) -> list[FleetRow]:
-    """The rows with each result's difference from an earlier one of the same session.
-
-    `before` and `after` give the earlier and the present result by name, None where there is none.
-    """
-    compared = []
-    for row in rows:
-        old, new = before(row.name), after(row.name)
-        if old is None and new is None:
-            compared.append(row)
-            continue
-        change = _change(old, new)
-        compared.append(replace(row, changed=bool(change), change=change))
-    return compared
-
-
-def _change(old: Calibration | None, new: Calibration | None) -> str:
-    """Differences larger than the earlier result's sigmas, in words; empty for none."""
-    if old is None:
-        return "there was no result"
-    if new is None:
-        return "there is no result any more"
-    words = []
-    if old.verdict.status != new.verdict.status:
-        words.append(f"verdict {new.verdict.status}, was {old.verdict.status}")
-    gone = [edge for edge in old.edges if edge not in new.edges]
-    words += [f"{name} is gone" for name in gone]
-    for name, edge in old.edges.items():
-        if name in gone:
-            continue
-        moved_mm, moved_deg = pose_difference(edge.matrix, new.edges[name].matrix)
-        for moved, sigma, unit in (
-            (moved_mm, edge.sigma_mm, "mm"),
-            (moved_deg, edge.sigma_deg if edge.oriented else math.inf, "deg"),
-        ):
-            if moved > sigma:
-                words.append(
-                    f"{name} moved by {figure(moved)} {unit} (sigma {figure(sigma)} {unit})"
-                )
-    return "; ".join(words)
+            spread = _MAD * float(np.median(np.abs(logs - median)))
+            scores = (logs - median) / max(spread, _LENS_SPREAD if is_lens else _SPREAD)
+            # Of noise and errors, only large ones are outliers.
+            for row, score in zip(members, (np.abs(scores) if is_lens else scores), strict=True):
+                if score > _LIMIT:
+                    value, usual = figure(getattr(row, field)), figure(math.exp(median))
+                    reason = f"{words} {value} {unit}, where {usual} {unit} is usual"
+                    yield row.name, float(score), reason

@@ -33,7 +33,7 @@ from visioncal.core.types import Progress
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
-from visioncal.results.fleet import FleetRow, row_of, with_changes, with_outliers
+from visioncal.results.fleet import FleetRow, row_of, with_outliers
 from visioncal.session import Session
 
 ROW, PICTURE = "row.json", "picture.jpg"
@@ -232,10 +232,9 @@ class Batch:
 
     @property
     def counts(self) -> Counter[str]:
-        """Numbers of sessions by verdict or failure, and of kept, changed and outlying ones."""
+        """Numbers of sessions by verdict or failure, and of kept and outlying ones."""
         counts = Counter(row.verdict or row.state for row in self.rows)
         counts["kept"] = sum(row.state == "kept" for row in self.rows)
-        counts["changed"] = sum(row.changed is True for row in self.rows)
         counts["standing out"] = sum(row.score > 0.0 for row in self.rows)
         return counts
 
@@ -256,7 +255,6 @@ def batch(
     need_mm: float | None = None,
     need_deg: float | None = None,
     without: Iterable[str] = (),
-    against: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Batch:
     """Calibrates many sessions, each into a folder of its own.
@@ -275,22 +273,18 @@ def batch(
         need_mm: As in `calibrate`.
         need_deg: As in `calibrate`.
         without: `report.html` or `recording.rrd`, to leave out.
-        against: The folder of an earlier batch to compare with.
         progress: Called after each session.
 
     Returns:
         The rows, and their files.
 
     Raises:
-        DataError: There are no sessions, the folder cannot be written, there is no batch in
-            `against`, or no scheduler answers.
+        DataError: There are no sessions, the folder cannot be written, or no scheduler answers.
     """
     folder = Path(out)
     given = [sessions] if isinstance(sessions, Path | str) else list(sessions)
     options = Options(level, need_mm, need_deg, tuple(sorted(without)))
     jobs = jobs_of(given, folder, options)
-    if against is not None and not Path(against).is_dir():
-        raise DataError(f"{against} is no folder of results.", culprits=["--against"])
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -302,13 +296,6 @@ def batch(
     for row in _rows(jobs, workers, scheduler):
         rows.append(row)
         progress("batch", len(rows), len(jobs))
-    if against is not None:
-        earlier, failed = Path(against), {row.name for row in rows if row.state == "failed"}
-        rows = with_changes(
-            rows,
-            lambda name: _result(earlier / name),
-            lambda name: None if name in failed else _result(folder / name),
-        )
     results = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
     import pyarrow as pa
     from pyarrow import parquet
@@ -341,13 +328,6 @@ def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> It
         else:
             yield row
     yield from rows_of(waiting, workers, scheduler)
-
-
-def _result(folder: Path) -> Calibration | None:
-    try:
-        return Calibration.load(folder / CALIBRATION)
-    except DataError:
-        return None
 
 
 # Timeout of the scheduler [s].

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 
 from visioncal.core.number_format import significant
 from visioncal.present.report.templates import template
-from visioncal.present.tables import Table, TableRow
 from visioncal.results.fleet import FEWEST, FleetRow
 
 _ICONS = {"good": "good", "check": "check"}
@@ -28,12 +27,6 @@ def fleet_page(rows: Sequence[FleetRow]) -> str:
             for count in Counter(row.robot for row in rows if row.state != "failed").values()
         ),
         states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
-        changes=Table(
-            ("", ""),
-            tuple(TableRow((row.name, row.change), "look") for row in rows if row.changed),
-            (0, 1),
-        ),
-        is_compared=any(row.changed is not None for row in rows),
         icon_of=lambda value: _ICONS.get(value.verdict, "bad"),
         figure=_figure,
     )
