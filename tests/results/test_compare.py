@@ -94,19 +94,15 @@ def test_a_turn_is_a_change_of_rotation() -> None:
     assert edge.moved_deg == pytest.approx(np.rad2deg(3e-3), abs=0.07)
 
 
-@pytest.mark.parametrize(
-    ("by", "words"),
-    [(1.01, "The intrinsics differ: another camera"), (1.2, "The focal length differs by 20 %")],
-)
-def test_a_change_of_the_lens_is_found(by, words) -> None:
+def test_a_change_of_the_lens_is_found() -> None:
     first, second = pair("eye-in-hand", 0)
     assert second.camera is not None
     camera = second.camera.camera
-    longer = replace(camera, matrix=camera.matrix * [by, by, 1.0, 1.0])
+    longer = replace(camera, matrix=camera.matrix * [1.01, 1.01, 1.0, 1.0])
     comparison = compare(first, replace(second, camera=replace(second.camera, camera=longer)))
     assert comparison.lens is not None
     assert comparison.lens.is_change
-    assert sum(finding.startswith(words) for finding in comparison.findings) == 1
+    assert "The intrinsics differ: another camera, focus or zoom." in comparison.findings
     same = compare(first, second).lens
     assert same is not None
     assert same.names == ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

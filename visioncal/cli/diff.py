@@ -67,8 +67,8 @@ def diff_command(options: DiffOptions) -> None:
         ]
         print_table(("lens", "first", "second", "difference", "sigma"), changes, caption=caption)
     noise = [
-        (change.name, *("" if value is None else f"{value:.3g}" for value in (change.a, change.b)))
-        for change in comparison.noise
+        (name, *("" if level is None else f"{level:.3g}" for level in levels))
+        for name, levels in comparison.noise.items()
     ]
     print_table(("noise, per axis", "first", "second"), noise)
 

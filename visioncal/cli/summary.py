@@ -6,11 +6,11 @@ import numpy as np
 
 from visioncal.cli.console import answer, print_table
 from visioncal.core.number_format import figure
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
 from visioncal.present.facts import solver_table
 from visioncal.results import Calibration, CellResult, Remedy, Verdict, ViewResult
-from visioncal.results.compare import edge_errors
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 # Larger predicted errors are meaningless, and not shown [px].
@@ -106,11 +106,9 @@ def truth_rows(
     calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
 ) -> Iterator[tuple[str, str, str, str]]:
     """Errors against the truth in mm, deg and px, their sigmas, and the ratios of both."""
-    for name, edge_error in edge_errors(calibration, transforms).items():
-        for error, sigma, unit in (
-            (edge_error.mm, edge_error.sigma_mm, "mm"),
-            (edge_error.deg, edge_error.sigma_deg, "deg"),
-        ):
+    for name, edge in calibration.edges.items():
+        mm, deg = pose_difference(transforms[name], edge.matrix)
+        for error, sigma, unit in ((mm, edge.sigma_mm, "mm"), (deg, edge.sigma_deg, "deg")):
             yield name, f"{error:.3f} {unit}", f"{sigma:.3f} {unit}", f"{error / sigma:.2f}"
     if calibration.camera is not None and calibration.camera.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.camera.covariance))[:4]

@@ -22,8 +22,6 @@ FALSE_ALARMS = 0.01
 # Smallest standard deviation in a test [rad, m], for exact data.
 _LEAST_SIGMA = 1e-9
 _NOTHING = "No transform changed: noise explains what differs."
-# Largest relative change of the focal length by focusing.
-_OTHER_LENS = 0.05
 
 
 @dataclass(frozen=True)
@@ -79,15 +77,6 @@ class LensChange:
         return self.significance.is_change
 
 
-@dataclass(frozen=True)
-class NoiseChange:
-    """One noise level in both calibrations; None where absent."""
-
-    name: str
-    a: float | None
-    b: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Comparison of two calibrations."""
@@ -101,7 +90,8 @@ class Comparison:
     only_in_b: tuple[str, ...]  # Names of transforms that only the second has.
     # The intrinsics, where both cameras have the same model and resolution.
     lens: LensChange | None
-    noise: tuple[NoiseChange, ...]  # The noise levels.
+    # The noise levels in both, by name; None where absent.
+    noise: Mapping[str, tuple[float | None, float | None]]
     findings: tuple[str, ...]  # Conclusions, in sentences.
 
     @property
@@ -170,10 +160,9 @@ def compare(
         only_in_a=tuple(name for name in a.edges if name not in b.edges),
         only_in_b=tuple(name for name in b.edges if name not in a.edges),
         lens=lens,
-        noise=tuple(
-            NoiseChange(name, levels[0].get(name), levels[1].get(name))
-            for name in {**levels[0], **levels[1]}
-        ),
+        noise={
+            name: (levels[0].get(name), levels[1].get(name)) for name in {**levels[0], **levels[1]}
+        },
         findings=tuple(_findings(a, b, edges, lens)),
     )
 
@@ -270,22 +259,15 @@ def _findings(
             "Both come from the same session and share its noise: their sigmas say nothing about "
             "the difference."
         )
-    doubts = {
-        f"The {name} has the verdict {verdict.status}, to be cleared up before anything is made "
-        f"of the difference: {next(iter(verdict.reasons), verdict.headline)}": verdict.status
+    bad = [
+        f"The {name} has the verdict bad, to be cleared up before anything is made of the "
+        f"difference: {next(iter(verdict.reasons), verdict.headline)}"
         for name, verdict in (("first", a.verdict), ("second", b.verdict))
-        if verdict.status != "good"
-    }
-    yield from (words for words, status in doubts.items() if status == "bad")
+        if verdict.status == "bad"
+    ]
+    yield from bad
     changed = [edge.name for edge in edges if edge.is_change]
-    ratio = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
-    is_other_lens = abs(ratio - 1.0) > _OTHER_LENS
-    if is_other_lens:
-        yield (
-            f"The focal length differs by {100.0 * abs(ratio - 1.0):.0f} %: another camera, lens "
-            "or zoom. Where they are is then compared below, and nothing need have moved."
-        )
-    if "bad" in doubts.values():
+    if bad:
         yield "Whether camera or board moved, a bad result does not tell."
     elif a.cell is not None:
         frames = some_of([name.partition("_from_")[2] for name in changed])
@@ -298,7 +280,7 @@ def _findings(
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
         yield _edge_finding(a.mount, changed)
-    if lens is not None and lens.is_change and not is_other_lens:
+    if lens is not None and lens.is_change:
         yield (
             "The intrinsics differ: another camera, focus or zoom."
             if lens.significance is not None
@@ -306,36 +288,25 @@ def _findings(
         )
     if lens is None and a.camera is not None and b.camera is not None:
         yield "The cameras differ in model or resolution; their intrinsics were not compared."
-    yield from (words for words, status in doubts.items() if status != "bad")
-
-
-_CAMERA_MOVED = {
-    "eye-in-hand": "The camera moved on the flange, or the controller's tool frame was redefined",
-    "eye-to-hand": "The camera moved in the cell, or the controller's base frame was redefined",
-    "instrument": "The instrument was set up elsewhere, or the controller's base frame was "
-    "redefined",
-}
-_BOARD_MOVED = {
-    "eye-in-hand": "The board was moved in the cell, or the controller's base frame was redefined",
-    "eye-to-hand": "The board was moved on the flange, or the controller's tool frame was "
-    "redefined",
-    "instrument": "The probe was moved on the flange, or the controller's tool frame was redefined",
-}
 
 
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
     """Sentence that says whether camera, board or both moved."""
-    ends = [name.rpartition("_from_")[2] for name in changed]
-    camera = any(end.startswith(("cam", "instrument")) for end in ends)
-    board = any(end.startswith(("target", "probe")) for end in ends)
     sensor, seen = ("instrument", "probe") if mount == "instrument" else ("camera", "board")
-    if camera and board:
-        both = f"{sensor.capitalize()} and {seen} both moved."
-        return f"{both} {_CAMERA_MOVED[mount]}. {_BOARD_MOVED[mount]}."
-    if camera:
-        return f"{_CAMERA_MOVED[mount]}; the {seen} did not: use the second calibration."
-    if board:
-        return f"{_BOARD_MOVED[mount]}; the {sensor} did not: its calibration still holds."
+    in_cell = " in the cell, or the controller's base frame was redefined"
+    on_flange = " on the flange, or the controller's tool frame was redefined"
+    if mount != "eye-in-hand":
+        in_cell, on_flange = on_flange, in_cell
+    sensor_moved, seen_moved = f"The {sensor} moved{on_flange}", f"The {seen} was moved{in_cell}"
+    ends = [name.rpartition("_from_")[2] for name in changed]
+    is_sensor = any(end.startswith(("cam", "instrument")) for end in ends)
+    is_seen = any(end.startswith(("target", "probe")) for end in ends)
+    if is_sensor and is_seen:
+        return f"{sensor.capitalize()} and {seen} both moved. {sensor_moved}. {seen_moved}."
+    if is_sensor:
+        return f"{sensor_moved}; the {seen} did not: use the second calibration."
+    if is_seen:
+        return f"{seen_moved}; the {sensor} did not: its calibration still holds."
     return _NOTHING
 
 
@@ -357,7 +328,14 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         },
         "only_in_first": list(comparison.only_in_a),
         "only_in_second": list(comparison.only_in_b),
-        "noise": {level.name: _written(level) for level in comparison.noise},
+        "noise": {
+            name: {
+                key: level
+                for key, level in zip(("first", "second"), levels, strict=True)
+                if level is not None
+            }
+            for name, levels in comparison.noise.items()
+        },
     }
     return (
         document if comparison.lens is None else {**document, "camera": _written(comparison.lens)}
@@ -376,24 +354,3 @@ def _written(value: Any) -> Any:  # noqa: ANN401 - a field of any of the datacla
         if key is not None and content is not None:
             written[key] = _written(content)
     return written
-
-
-@dataclass(frozen=True)
-class EdgeError:
-    """True error of an edge, and the calibration's sigma."""
-
-    mm: float  # Error of its translation [mm].
-    deg: float  # Error of its rotation [deg].
-    sigma_mm: float  # Sigma of its translation [mm].
-    sigma_deg: float  # Sigma of its rotation [deg].
-
-
-def edge_errors(
-    calibration: Calibration, transforms: Mapping[str, FloatArray]
-) -> dict[str, EdgeError]:
-    """True error of each edge, by the true transforms (4, 4) by name."""
-    errors = {}
-    for name, edge in calibration.edges.items():
-        mm, deg = pose_difference(transforms[name], edge.matrix)
-        errors[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
-    return errors
