@@ -3,7 +3,6 @@
 import ast
 import json
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from support.samples import made_up
 
 import visioncal
 from visioncal.core.errors import DataError
-from visioncal.present.report.drawing import FIGURES
 
 NOTEBOOK = Path(__file__).with_name("cookbook") / "a_notebook.ipynb"
 # A notebook shows a value's first lines; nobody reads more.
@@ -36,13 +34,13 @@ def values_of(notebook: Path) -> list[object]:
 
 def test_the_cells_of_the_example_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    session, checkup, calibration, verdict, place, table, _, again, by_corners, holds = values_of(
+    session, checkup, calibration, verdict, place, views, again, by_corners, holds = values_of(
         NOTEBOOK
     )
     assert checkup.is_sound
     assert verdict is calibration.verdict
     assert (verdict.status, by_corners, holds) == ("good", "good", True)
-    assert len(table) == len(session.views)
+    assert len(views) == len(session.views)
     # The same images and lens; without joint angles the poses are those that were reported, and the
     # place is known to some 0.1 mm.
     assert np.linalg.norm(again.transforms["flange_from_cam"].translation - place) < 2e-4
@@ -75,41 +73,6 @@ def test_a_name_that_is_not_there_suggests_the_nearest():
     with pytest.raises(DataError, match="base_from_target"):
         made_up().calibration.covariance("base_from_board")
     assert transforms.get("flange_from_camera") is None
-
-
-def test_figures_of_the_report_are_drawn_on_their_own(tmp_path):
-    calibration = made_up().calibration
-    drawing = calibration.plot()
-    drawing.save(tmp_path / "residuals.svg")
-    text = (tmp_path / "residuals.svg").read_text("utf-8")
-    assert text.startswith("<svg ")
-    assert 'xmlns="http://www.w3.org/2000/svg"' in text
-    # Each view's bar, in two panels at least.
-    bars = [
-        element.get("d", "")
-        for element in ElementTree.fromstring(text).iter()
-        if element.tag.endswith("path")
-    ]
-    assert sum(bar.count("z") for bar in bars) >= 2 * sum(view.used for view in calibration.views)
-    assert "--ink:" in drawing._repr_html_()
-    with pytest.raises(DataError, match="no figure 'colours'") as caught:
-        calibration.plot("colours")
-    assert all(figure in caught.value.next_step for figure in FIGURES)
-
-
-def test_views_are_a_frame_of_pandas():
-    pytest.importorskip("pandas", reason="the extra pandas is not installed")
-    calibration = made_up().calibration
-    table = calibration.views_table()
-    assert [*table.index] == [view.view for view in calibration.views]
-    assert [*table[table.used].rms_px] == [view.rms_px for view in calibration.views if view.used]
-
-
-def test_views_are_records_where_pandas_is_not_installed(monkeypatch):
-    calibration = made_up().calibration
-    monkeypatch.setattr("visioncal.results.result.find_spec", lambda _: None)
-    table = calibration.views_table()
-    assert [value["view"] for value in table] == [view.view for view in calibration.views]
 
 
 def test_arrays_that_do_not_match_are_refused():

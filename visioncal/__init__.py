@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from visioncal.interchange.exports import export
     from visioncal.interchange.formats import convert
     from visioncal.live.planning.plan import make_plan
-    from visioncal.present.report.drawing import Drawing
     from visioncal.present.report.page import write_report
     from visioncal.results import Calibration, Verdict
     from visioncal.results.compare import compare
@@ -59,7 +58,6 @@ _HOMES = {
     "Corrected": "visioncal.results.compensation",
     "DataError": "visioncal.core.errors",
     "DegenerateError": "visioncal.core.errors",
-    "Drawing": "visioncal.present.report.drawing",
     "DriverError": "visioncal.core.errors",
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.locate",
@@ -102,7 +100,6 @@ __all__ = [
     "Corrected",
     "DataError",
     "DegenerateError",
-    "Drawing",
     "DriverError",
     "Loads",
     "Located",

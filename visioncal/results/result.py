@@ -2,12 +2,10 @@
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -41,9 +39,6 @@ from visioncal.robot import Loads, Robot, deflected_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.frames import CELL
 from visioncal.session.selecting import PARTS, Choice, Part
-
-if TYPE_CHECKING:
-    from visioncal.present.report.drawing import Drawing
 
 # Number of transforms in a card.
 _SHOWN = 8
@@ -253,32 +248,6 @@ class Calibration(CalibrationSections):
                 for name, edge in [*self.placed.items()][:_SHOWN]
             },
         }
-
-    def views_table(self) -> Any:  # noqa: ANN401 - a frame of pandas, or records
-        """Table of the views' results: a pandas.DataFrame with the extra pandas, else records.
-
-        Columns are the attributes of `ViewResult`; what was not computed is None (NaN in a frame).
-        """
-        records = [asdict(view) for view in self.views]
-        if find_spec("pandas") is None:
-            return records
-        return import_module("pandas").DataFrame.from_records(records, index="view")
-
-    @typed
-    def plot(self, what: str = "residuals") -> "Drawing":
-        """Draws a figure of the report, for a notebook; its `save` writes an .svg.
-
-        Args:
-            what: `residuals` of each view, the `budget` of a pick's error, or the sigmas of the
-                principal `directions` of the transforms.
-
-        Raises:
-            DataError: There is no such figure.
-        """
-        # Imported here, since figures depend on results.
-        from visioncal.present.report.drawing import draw
-
-        return draw(self, what)
 
     @property
     def noise_dof(self) -> float:
