@@ -129,14 +129,18 @@ def test_an_arm_that_cannot_tilt_is_asked_for_its_lens(tmp_path):
 def test_a_table_of_corners_that_was_cut_off_is_named(tmp_path):
     stops = looks(16)
     most = write(tmp_path / "most", stops, has_corners=lambda view: view < 10)
-    first = visioncal.calibrate(most).verdict.findings[0]
-    assert first.kind == "lost_rows"
-    assert first.views == tuple(range(10, 16))
-    assert visioncal.doctor(most).findings[0].kind == "lost_rows"
+    lost = visioncal.calibrate(most)
+    assert lost.verdict.status == "check"
+    (found,) = (found for found in lost.verdict.findings if found.kind == "lost_views")
+    assert found.views == tuple(range(10, 16))
+    assert found.words.startswith("6 of 16 rows of views.csv have neither an image nor rows in")
+    assert visioncal.doctor(most).findings[0].kind == "lost_views"
     # A single row without corners is named, and the others are as good as they were.
     one = visioncal.calibrate(write(tmp_path / "one", stops, has_corners=lambda view: view != 4))
     assert one.verdict.status == "good"
-    assert one.verdict.top[0].endswith("neither an image nor rows in corners.csv: view 4.")
+    (lost,) = (view for view in one.views if not view.used)
+    assert lost.view == 4
+    assert "it has neither image nor rows in corners.csv" in lost.reason
 
 
 def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path, monkeypatch):

@@ -51,9 +51,7 @@ def test_a_board_does_not_shrink_until_cameras_with_wrong_lenses_agree():
             break
         state = stage.run(state)
     start = find_start(read_cell(state), state)
-    inliers, sizes = initial_inliers(start)
-    # The lenses' errors pass for a size of a few percent at most.
-    assert np.abs([*sizes.values()]).max() < max(np.abs(WRONG))
+    inliers = initial_inliers(start)
     left_out = {start.cell.rows[row].view for row in np.flatnonzero(~inliers.used)}
     assert set(cell.wrong_views) <= left_out
     assert inliers.used.mean() > 0.75

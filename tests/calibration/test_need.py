@@ -14,7 +14,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import PointAccuracy
-from visioncal.core.finding_kinds import EMPTY_IMAGE, GOOD_FOR
+from visioncal.core.finding_kinds import GOOD_FOR, REPEATED_READINGS
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
@@ -319,8 +319,8 @@ def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
 
 
 @pytest.mark.parametrize("need", [None, NEED])
-def test_a_part_of_the_image_without_corners_is_a_hint_and_no_doubt(need) -> None:
-    empty = Finding(EMPTY_IMAGE, "No corner was ever seen in the upper left.", Remedy("Move it."))
+def test_repeated_readings_are_a_hint_and_no_doubt(need) -> None:
+    empty = Finding(REPEATED_READINGS, "A place was read twice.", Remedy("Read others."))
     verdict = judge(replace(SOUND, warnings=(empty,), picks=(of_size(0.1),), need=need))
     assert verdict.status == "good"
     assert verdict.good_for_mm == pytest.approx(0.28, rel=0.01)

@@ -251,7 +251,7 @@ def test_views_that_do_not_serve_are_left_out_by_name(cube):
     (cube / "corners.csv").write_text("\n".join(kept) + "\n")
     reasons = {view.view: view.reason for view in calibrate(cube).views if not view.used}
     assert reasons.keys() == {1, 2, 3, 4}
-    assert "has 3 of 37, needs 4" in reasons[1]
+    assert "3 of 37, needs 4" in reasons[1]
     assert "neither image nor rows in corners.csv" in reasons[2]
     assert "on one line" in reasons[3]
     assert f"point {point} at ({float(u_px):g}, 4000) px lies far outside" in reasons[4]

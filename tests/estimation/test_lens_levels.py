@@ -106,5 +106,6 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
         joints=False,
         session=replace(session, document=session.document | {"camera": camera}),
     )
-    (levels,) = fixed.cell_fit.camera_parameters.levels.values()
+    (problem,) = fixed.cell_fit.camera_parameters.problems.values()
+    levels = problem.levels
     assert (levels.breathing, levels.jitter) == (0.0, 0.0)

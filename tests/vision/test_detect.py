@@ -178,16 +178,13 @@ def test_all_corners_of_the_smallest_boards_suffice():
         assert len(seen.corners) == 2
 
 
-@pytest.mark.parametrize(
-    ("declared", "fix"),
-    [({"legacy": True}, "legacy = false"), ({"columns": 6, "rows": 9}, "exchange columns")],
-)
-def test_another_layout_than_declared_is_named_with_its_fix(charuco, declared, fix):
+@pytest.mark.parametrize("declared", [{"legacy": True}, {"columns": 6, "rows": 9}])
+def test_another_layout_than_declared_is_named(charuco, declared):
     cell, images = charuco
     files = {f"{at}.png": encoded(image) for at, image in enumerate(images)}
     with pytest.raises(DataError, match="another board") as refused:
         detect(session_of(files, replace(cell.options.target, **declared)))
-    assert fix in refused.value.next_step
+    assert "correct columns, rows, and legacy" in refused.value.next_step
 
 
 @pytest.mark.parametrize("declared", [{}, {"columns": 18}, {"legacy": True}])

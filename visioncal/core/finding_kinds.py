@@ -7,8 +7,8 @@ from dataclasses import dataclass
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # The arm was calibrated: what a result is good for depends on how its targets are sent.
 CALIBRATED_ARM = "calibrated_arm"
-MISSING, EMPTY_ROWS = "missing_images", "empty_rows"
-EMPTY_IMAGE, REPEATED_READINGS = "empty_image", "repeated_readings"
+MISSING = "missing_images"
+REPEATED_READINGS = "repeated_readings"
 EXCHANGED, ARM_ERRORS, UNEXPLAINED = "exchanged_views", "arm_errors", "unexplained"
 LENS_CHANGED, MOVED_FRAME, BOARD_CHANGED = "lens_changed", "moved_at_once", "board_changed"
 # Misfits that a cause may explain: views disagree or the flange is off; corners; the intrinsics.
@@ -67,12 +67,7 @@ _BY_CHAIN = (
 _KINDS = (
     # What was seen and read.
     Kind(MISSING, is_doubt=False, is_unusable=True),
-    Kind(EMPTY_ROWS, is_doubt=False, is_unusable=True),
-    # Few robots fill all of a fixed camera's image, and picks are where the views looked.
-    Kind(EMPTY_IMAGE, is_doubt=False),
     Kind(REPEATED_READINGS, is_doubt=False),
-    Kind("lost_rows", FACT),
-    Kind("shared_image", FACT),
     Kind("repeated_views", FACT),
     Kind("corner_numbers", FACT),
     Kind("rig_points", FACT),

@@ -207,7 +207,7 @@ def compress(
         levels: Levels of lens errors beyond the model; None for no such errors.
     """
     shape = basis[stack.ids]
-    bent = stack.with_points(stack.points + shape @ appearance.board)
+    bent = replace(stack, points=stack.points + shape @ appearance.board)
     compressed = compress_points(
         bent, appearance.camera, starts, shape, shares=shares, levels=levels
     )

@@ -61,12 +61,12 @@ class CornerStack:
         stated = {view.stated_px for view in views}
         return cls(
             tuple(corners),
-            tuple(view_corners.blur_px for view_corners in corners.values()),
+            tuple(view.blur_px for view in views),
             np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
             np.repeat(np.arange(len(counts)), counts),
-            np.concatenate([view_corners.ids for view_corners in corners.values()]),
-            np.concatenate([positions[view_corners.ids] for view_corners in corners.values()]),
-            np.concatenate([view_corners.px for view_corners in corners.values()]),
+            np.concatenate([view.ids for view in views]),
+            np.concatenate([positions[view.ids] for view in views]),
+            np.concatenate([view.px for view in views]),
             None if all(view.weights is None for view in views) else np.concatenate(weights),
             stated.pop() if len(stated) == 1 else None,
         )
@@ -74,22 +74,18 @@ class CornerStack:
     def keep(self, mask: Mask) -> "CornerStack":
         """Returns the stack of the corners in an (n,) mask, without views that have none."""
         kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
-        return CornerStack(
-            tuple(self.views[at] for at in kept_views),
-            tuple(self.blurs[at] for at in kept_views),
-            np.searchsorted(view_of, np.arange(len(kept_views))),
-            view_of,
-            self.ids[mask],
-            self.points[mask],
-            self.px[mask],
-            None if self.weights is None else self.weights[mask],
-            self.stated_px,
-            None if self.zooms is None else self.zooms[mask],
+        return replace(
+            self,
+            views=tuple(self.views[at] for at in kept_views),
+            blurs=tuple(self.blurs[at] for at in kept_views),
+            starts=np.searchsorted(view_of, np.arange(len(kept_views))),
+            view_of=view_of,
+            ids=self.ids[mask],
+            points=self.points[mask],
+            px=self.px[mask],
+            weights=None if self.weights is None else self.weights[mask],
+            zooms=None if self.zooms is None else self.zooms[mask],
         )
-
-    def with_points(self, points: FloatArray) -> "CornerStack":
-        """Returns the stack with other (n, 3) positions of its corners on the target [m]."""
-        return replace(self, points=points)
 
     def weighed(self, residuals: FloatArray) -> "CornerStack":
         """Returns the stack with views reweighted by their residuals, if noise is not stated.

@@ -115,7 +115,6 @@ def fit_jointly(
     model: FrameModel,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
-    before: LinearisedCorners | None = None,
 ) -> ConvergedFit:
     """Alternates linearisation of the corners and the frame fit until the values converge.
 
@@ -124,13 +123,12 @@ def fit_jointly(
         model: Frame part of the fit.
         frames: Initial poses of the unknown frames.
         others: Initial values of all other effects; their linearisation point if None.
-        before: Previous linearisation of the corners; see `CameraParameters.linearised`.
 
     Raises:
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
-        return _settled(model, _fitted(model, optics.linearised(before), frames, others))
+        return _settled(model, _fitted(model, optics.linearised(), frames, others))
 
 
 @contextmanager
@@ -182,7 +180,8 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     for _ in range(_HALVINGS):
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
-        if candidate.has_lenses:
+        # Focal lengths are positive.
+        if all(candidate.values[at][:2].min() > 0.0 for at in candidate.lenses.values()):
             corners = candidate.linearised()
             if all(sigma <= limit for sigma, limit in zip(corners.sigmas_px, limits, strict=True)):
                 return corners
@@ -242,9 +241,10 @@ def measured_scale(
     covariance = covariance_among(information, widened.moving)
     total, scale, stated = np.zeros(widened.size), 0.0, 0.0
     total[-1] = 1.0
-    if board in optics.printed and optics.scale_of(board)[0] in fitted.linearised.free:
-        place = optics.scale_of(board)
-        scale, stated = float(optics.values[place[0]]), optics.stated_scale_sigma(board)
+    if board in optics.printed and optics.shape_of(board)[0] in fitted.linearised.free:
+        place, corners = optics.shape_of(board)[:1], next(iter(optics.problems.values()))
+        scale = float(optics.values[place[0]])
+        stated = float(corners.stated_sigma[corners.scale_of(board)][0])
         total[fitted.columns_of(place)] = 1.0
     scale -= float(total @ covariance @ gradient)
     sigma = float(total @ covariance @ total) ** 0.5

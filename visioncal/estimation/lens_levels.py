@@ -41,20 +41,22 @@ from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import ratio_prior
 from visioncal.estimation.scene import BoardSizes, CornerProblem
 
-# Candidate correlation lengths of the field, as shares of the image's width; index of the first
-# that is tried, and least gain in log-likelihood of a change to another one.
-_LENGTHS, _FIRST, _GAIN = (0.07, 0.12, 0.2), 2, 0.5
-# Upper bounds of the field [px], of breathing and of jitter (relative changes of focus): autofocus
-# repeats to some 0.1 %. The corner noise lies between the residuals with lens, board and field all
-# free and those with lens and board alone, times these factors.
-_MOST = (1.0, 0.02, 5e-3)
+# Correlation lengths of the field that are tried, as shares of the image's width, and least gain in
+# log-likelihood of the next one.
+_LENGTHS, _GAIN = (0.2, 0.12, 0.07), 0.5
+# The corner noise lies between the residuals with lens, board and field all free and those with
+# lens and board alone, times these factors.
 _NOISE_RANGE = (0.7, 3.0)
 # Residuals above this with lens, board and field all free are wrong corners, not noise [px].
 _WRONG_PX = 10.0
-# Lower bounds of field (in units of the corner noise), breathing and jitter, at which they count
-# as zero, and start values of the search.
-_LEAST, _START = (1e-3, 1e-6, 1e-6), (0.3, 1e-3, 3e-4)
-_FLANGE_RANGE = (1e-7, 1e-1)
+# Lower bounds, at which sizes count as zero, upper bounds and starts: of the field (in units of the
+# corner noise, but for the upper bound [px]), breathing and jitter (autofocus repeats to some
+# 0.1 %), errors of a given lens [px], of a board's scale, plane (shares of its size) and bend [m],
+# and of flanges.
+_BEYOND = ((1e-3, 1.0, 0.3), (1e-6, 0.02, 1e-3), (1e-6, 5e-3, 3e-4))
+_LENS_ERRORS = (1e-3, 1e2, 1.0)
+_BOARD_ERRORS = ((1e-6, 0.2, 1e-3), (1e-6, 2e-2, 3e-4), (1e-7, 5e-2, 1e-4))
+_FLANGE_ERRORS = (1e-7, 1e-1, 1e-6)
 # Likelihood-ratio limit with a false alarm in one session of ten thousand; half of the
 # chi-square's mass is at zero, as a level cannot be negative.
 SIGNIFICANT = float(chi2_limit(2e-4, 1))
@@ -63,12 +65,6 @@ _FEWEST_STOPS = 6
 # Indices of the sizes: corner noise, field, breathing, jitter, one that is not estimated, three of
 # a given lens; then three of each printed board, and two of each flange.
 _NOISE, _FIELD, _BREATHING, _JITTER, _ONE, _FOCAL, _CENTRE, _SHAPE, _BOARDS = range(9)
-# Lower and upper bounds and start values of errors of a given lens [px], and of a board's scale,
-# plane (shares of its size) and bend [m].
-_LENS_ERRORS, _BOARD_ERRORS = (
-    (1e-3, 1e2, 1.0),
-    ((1e-6, 0.2, 1e-3), (1e-6, 2e-2, 3e-4), (1e-7, 5e-2, 1e-4)),
-)
 # Share of boards whose size is not within what is stated; of boards that are not flat, or not drawn
 # to one scale, and of given lenses that have errors.
 _WRONG_SIZE, _WRONG_SHAPE = 1e-2, 0.1
@@ -140,39 +136,28 @@ class _Likelihood:
             return upper_bound
         return 2.0 * (self.minimised(without, (*closed, level)).value - found.value)
 
-    def share(
-        self, found: MixedEstimate, closed: tuple[int, ...], size: int, uneven: float
-    ) -> float:
-        """Share of the variance of a size of lens or board, averaged over a size of zero, too."""
-        gain = self.gain(found, closed, size)
-        if _is_scale(size):
-            weight = level_weight(gain / uneven**2, _WRONG_SIZE)
-        else:
-            weight = level_weight(gain, _WRONG_SHAPE)
-        return weight if weight > _NO_WEIGHT else 0.0
-
     def limits(self, closed: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the levels' logarithms."""
-        low = np.repeat([_FLANGE_RANGE[0]], len(self.counts))
-        high = np.repeat([_FLANGE_RANGE[1]], len(low))
-        low[_ONE] = high[_ONE] = 1.0
-        low[_FOCAL:_BOARDS], high[_FOCAL:_BOARDS] = _LENS_ERRORS[:2]
-        for at in range(_BOARDS, self.flanges):
-            low[at], high[at] = _BOARD_ERRORS[(at - _BOARDS) % 3][:2]
-        low[_NOISE], high[_NOISE] = np.multiply(_NOISE_RANGE, self.noise_px)
-        low[_FIELD : _JITTER + 1] = np.multiply(_LEAST, (self.noise_px[0], 1.0, 1.0))
-        high[_FIELD : _JITTER + 1] = _MOST
-        high[[*closed]] = low[[*closed]]
+        low, high, _ = self.bounds.T
+        high = np.where(np.isin(np.arange(len(high)), closed), low, high)
         return np.log(low), np.log(high)
 
-
-@dataclass(frozen=True)
-class CameraSizes:
-    """Sizes of the errors that one camera's corners and motion show."""
-
-    levels: LensLevels  # Of its lens, beyond the model.
-    lens: LensSizes  # Of its intrinsics, if given, beyond what is stated.
-    boards: tuple[BoardSizes, ...]  # Of the printed boards, beyond what is stated.
+    @property
+    def bounds(self) -> FloatArray:
+        """(k, 3) lower bounds, upper bounds and starts of the levels."""
+        left_px, alone_px = self.noise_px
+        bounds = np.array(
+            [
+                (_NOISE_RANGE[0] * left_px, _NOISE_RANGE[1] * alone_px, alone_px),
+                *_BEYOND,
+                (1.0, 1.0, 1.0),
+                *[_LENS_ERRORS] * 3,
+                *_BOARD_ERRORS * ((self.flanges - _BOARDS) // 3),
+                *[_FLANGE_ERRORS] * (len(self.counts) - self.flanges),
+            ]
+        )
+        bounds[_FIELD, [0, 2]] *= left_px
+        return bounds
 
 
 def estimate_sizes(
@@ -183,7 +168,7 @@ def estimate_sizes(
     noise: Noise,
     camera: str,
     uneven: float = 1.0,
-) -> CameraSizes:
+) -> tuple[LensLevels, LensSizes, tuple[BoardSizes, ...]]:
     """Estimates the sizes of errors of one camera's lens and of the boards.
 
     Args:
@@ -195,59 +180,61 @@ def estimate_sizes(
         camera: Name of the camera.
         uneven: Factor by which errors of arms that look like a board's scale may be larger than
             their size says.
+
+    Returns:
+        Sizes of errors of the lens beyond the model, of its intrinsics, if given, and of the
+        printed boards, both beyond what is stated.
     """
     mine, count = seen.camera_parameters.problems[camera], len(noise.robots)
     linearised = _rows(seen, problem, rows, state, noise, camera)
     closed = _closed(mine, len(np.unique(linearised.chained)))
     before = mine.levels
-    at = _FIRST if before is None else _LENGTHS.index(before.length)
-    likelihood = _assembled(linearised, _LENGTHS[at], count)
+    length = _LENGTHS[0] if before is None else before.length
+    likelihood = _assembled(linearised, length, count)
     left_px, noise_px = likelihood.noise_px
     if left_px > _WRONG_PX:
-        return CameraSizes(LensLevels(), mine.lens_sizes, mine.board_sizes)
-    sizes = np.array([noise_px, _START[0] * left_px, *_START[1:]])
+        return LensLevels(), mine.lens_sizes, mine.board_sizes
+    starts = likelihood.bounds[:, 2].copy()
     if before is not None:
-        stated = [1.0, before.field, before.breathing, before.jitter]
-        sizes = np.maximum(noise_px * np.array(stated), np.array([0.0, 0.1, 0.1, 0.1]) * sizes)
-    starts = [1.0, *[_LENS_ERRORS[2]] * 3]
-    starts += [error[2] for _ in mine.board_sizes for error in _BOARD_ERRORS]
-    logs = np.log(np.concatenate([sizes, starts, np.maximum(noise.robots, 1e-6).ravel()]))
+        stated = noise_px * np.array([before.field, before.breathing, before.jitter])
+        starts[_FIELD:_ONE] = np.maximum(stated, 0.1 * starts[_FIELD:_ONE])
+    starts[likelihood.flanges :] = np.maximum(starts[likelihood.flanges :], noise.robots.ravel())
+    logs = np.log(starts)
     found = likelihood.minimised(logs, closed)
-    if before is None and found.logs[_JITTER] > np.log(2.0 * _LEAST[-1]):
+    if before is None and found.logs[_JITTER] > np.log(2.0 * likelihood.bounds[_JITTER, 0]):
         # A focus that varies may have been taken for errors of the flange: then these are far
         # smaller from above. Else it would only stand in for whatever corners have in common.
-        logs[[_BREATHING, _JITTER]] = np.log(0.5 * np.array(_MOST[1:]))
+        logs[_BREATHING:_ONE] = np.log(0.5 * likelihood.bounds[_BREATHING:_ONE, 1])
         above, flanges = likelihood.minimised(logs, closed), slice(likelihood.flanges, None)
         if above.value < found.value and np.any(above.logs[flanges] < found.logs[flanges] - 1.0):
             found = above
     # The length was sought before, near another fit.
-    for step in (1, -1) if _FIELD not in closed and before is None else ():
-        while 0 <= at + step < len(_LENGTHS):
-            candidate = _assembled(linearised, _LENGTHS[at + step], count)
-            other = candidate.minimised(found.logs, closed, found.value - _GAIN)
-            if other.value > found.value - _GAIN:
-                break
-            found, at, likelihood = other, at + step, candidate
+    for shorter in _LENGTHS[1:] if _FIELD not in closed and before is None else ():
+        candidate = _assembled(linearised, shorter, count)
+        other = candidate.minimised(found.logs, closed, found.value - _GAIN)
+        if other.value > found.value - _GAIN:
+            break
+        found, length, likelihood = other, shorter, candidate
     low = np.exp(likelihood.limits(closed)[0])
     sizes = np.where(np.exp(found.logs) > 2.0 * low, np.exp(found.logs), 0.0)
     field, breathing, jitter = sizes[_FIELD : _JITTER + 1] / np.exp(found.logs[_NOISE])
     gains = [likelihood.gain(found, closed, index) for index in (_FIELD, _BREATHING, _JITTER)]
     for index in range(_FOCAL, likelihood.flanges):
         if sizes[index]:
-            sizes[index] *= likelihood.share(found, closed, index, uneven) ** 0.5
-    return CameraSizes(
-        LensLevels(
-            float(field),
-            _LENGTHS[at],
-            float(breathing),
-            float(jitter),
-            (gains[0], gains[1], gains[2]),
-        ),
+            gain, wrong = likelihood.gain(found, closed, index), _WRONG_SHAPE
+            if _is_scale(index):
+                gain, wrong = gain / uneven**2, _WRONG_SIZE
+            # Averaged over a size of zero, too.
+            weight = level_weight(gain, wrong)
+            sizes[index] *= weight**0.5 if weight > _NO_WEIGHT else 0.0
+    levels = LensLevels(
+        float(field), length, float(breathing), float(jitter), (gains[0], gains[1], gains[2])
+    )
+    boards = sizes[_BOARDS : likelihood.flanges].reshape(-1, 3).tolist()
+    return (
+        levels,
         LensSizes(*sizes[_FOCAL:_BOARDS].tolist()),
-        tuple(
-            BoardSizes(*sizes[first : first + 3].tolist())
-            for first in range(_BOARDS, likelihood.flanges, 3)
-        ),
+        tuple(BoardSizes(*at) for at in boards),
     )
 
 
@@ -285,8 +272,8 @@ def _rows(
     of_camera = optics.rows(camera)
     corners, poses = optics.problems[camera], optics.poses[of_camera]
     shape = corners.basis[corners.stack.ids]
-    stack = corners.stack.with_points(corners.stack.points + shape @ optics.values[optics.boards])
-    stack, lens = replace(stack, zooms=None), optics.camera(camera)
+    bent = corners.stack.points + shape @ optics.values[optics.boards]
+    stack, lens = replace(corners.stack, points=bent, zooms=None), optics.camera(camera)
     now = reproject(stack, lens, poses)
     focus = zooms(now.px, lens)
     breath = distances(stack, poses)[stack.view_of][:, None] * focus

@@ -4,8 +4,6 @@ The poses are eliminated view by view, and a step of the focal length and of the
 tested at each view (Rao's score test), beside the lens common to all.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from visioncal.core.quantiles import f_limit
@@ -22,25 +20,14 @@ _FALSE_ALARM = 1e-4
 _SAME_WITHIN, _MOST_STARTS = 2, 300
 
 
-@dataclass(frozen=True)
-class LensStep:
-    """A step of a lens."""
-
-    first: int  # Index of the first view after it, in the order of the views.
-    zoom: float  # Relative increase of the focal length.
-    centre_px: tuple[float, float]  # (x, y) displacement of the principal point [px].
-    sigmas: tuple[float, float, float]  # Standard deviations of these three.
-    gain: float  # Twice the gain in log-likelihood.
-
-
 def lens_step(
     stack: CornerStack,
     camera: Camera,
     cam_from_target: FloatArray,
     beyond: FloatArray,
     order: IntArray,
-) -> LensStep | None:
-    """The most significant step of a lens; None if noise or other parts of the session show more.
+) -> tuple[int, FloatArray, FloatArray, float] | None:
+    """The most significant step of a lens.
 
     Args:
         stack: The corners of v views.
@@ -48,6 +35,11 @@ def lens_step(
         cam_from_target: (v, 4, 4) the views' poses.
         beyond: (n, 2) displacements of the corners beyond the lens's model [px].
         order: (v,) the views by their time.
+
+    Returns:
+        Index in `order` of the first view after the step, (3,) relative increase of the focal
+        length and displacement of the principal point [px], their (3,) standard deviations, and
+        twice the gain in log-likelihood; None if noise or other parts of the session show more.
     """
     count, tried = len(order), len(order) + 1 - 2 * _FEWEST
     if tried < 1:
@@ -78,15 +70,8 @@ def lens_step(
     if len(rotations) and _tested(products[rotations], steps)[0].max() > gain:
         return None
     # Residuals are predicted minus observed: the step has the opposite sign.
-    zoom, *centre = (-changes[0, index]).tolist()
-    sigmas = np.sqrt(noise * np.diag(covariance[0, index])).tolist()
-    return LensStep(
-        first,
-        zoom,
-        (centre[0], centre[1]),
-        (sigmas[0], sigmas[1], sigmas[2]),
-        freedom * float(np.log(squares / (squares - gain))),
-    )
+    sigmas = np.sqrt(noise * np.diag(covariance[0, index]))
+    return first, -changes[0, index], sigmas, freedom * float(np.log(squares / (squares - gain)))
 
 
 def _tested(products: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -321,7 +321,7 @@ BROKEN: Mapping[str, Mistake] = {
     ),
     "no number (NaN)": Mistake(_cell("x_m", (5,), "nan"), "view 5|line 7"),
     "a view's number twice": Mistake(_cell("view", (5,), "4"), "already|twice"),
-    "an image twice": Mistake(_cell("image", (5,), "images/004.png"), "share|same image"),
+    "an image twice": Mistake(_cell("image", (5,), "images/004.png"), "view 5"),
     # session.toml.
     "[cam] for [camera]": Mistake(_toml("[camera]", "[cam]"), "cam"),
     "a misspelt board": Mistake(_toml("charuco_9x6_30mm", "charuco_9x6_30"), "charuco_9x6_30mm"),

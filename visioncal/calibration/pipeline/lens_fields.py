@@ -130,8 +130,9 @@ def lens_changes(cell_fit: CellFit) -> Iterator[Finding]:
     for which, (name, problem) in enumerate(optics.problems.items()):
         # Images for the intrinsics alone have no time.
         timed = np.array([view in stations for view in problem.stack.views])
-        stack = replace(problem.stack, zooms=None)
-        stack = stack.with_points(optics.points[stack.ids]).keep(timed[stack.view_of])
+        points = optics.points[problem.stack.ids]
+        stack = replace(problem.stack, points=points, zooms=None)
+        stack = stack.keep(timed[stack.view_of])
         order = np.argsort([stations[view] for view in stack.views], kind="stable")
         compressed, camera = seen.compressed[which], optics.camera(name)
         poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
@@ -142,19 +143,20 @@ def lens_changes(cell_fit: CellFit) -> Iterator[Finding]:
         step = lens_step(stack, camera, poses, beyond, order)
         if step is None:
             continue
-        first, (x, y) = stations[stack.views[int(order[step.first])]], step.centre_px
+        at, change, sigmas, gain = step
+        first, (zoom, x, y) = stations[stack.views[int(order[at])]], change.tolist()
         yield Finding(
             LENS_CHANGED,
             f"{_named(name, len(optics.problems))} changed: {cell_fit.cell.start_words(first)}, "
-            f"its focal length is {figure(100.0 * abs(step.zoom))} % "
-            f"{'longer' if step.zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * step.sigmas[0])} "
+            f"its focal length is {figure(100.0 * abs(zoom))} % "
+            f"{'longer' if zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * float(sigmas[0]))} "
             f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
-            f"{figure(max(step.sigmas[1:]))} px), by the corners alone; the result is between both "
-            "lenses.",
+            f"{figure(float(sigmas[1:].max()))} px), by the corners alone; the result is between "
+            "both lenses.",
             cell_fit.cell.or_separately(
                 "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
             ),
-            mahalanobis_sq=step.gain,
+            mahalanobis_sq=gain,
         )
 
 

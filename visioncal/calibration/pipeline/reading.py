@@ -6,7 +6,7 @@ from dataclasses import replace
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import pair_edges
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
-from visioncal.calibration.stages.image_checks import pairing
+from visioncal.calibration.stages.image_checks import empty_rows, missing_images
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
@@ -48,7 +48,8 @@ def read_cell_inputs(run: RunState) -> RunState:
             "dynamics identify.",
         )
     warnings = map(_suspicious, session.warnings)
-    run = run.noting((), (*pairing(session), *warnings, *_not_used(run)))
+    lost = [found for found in (missing_images(session), empty_rows(session)) if found is not None]
+    run = run.noting((), (*lost, *warnings, *_not_used(run)))
     run = replace(run, notes=(*run.notes, *session.declaration.corrected))
     if len(run.held_back) == len(session.views):
         raise all_held_back(run)

@@ -52,13 +52,10 @@ from visioncal.estimation.solve import (
     starting_noise,
 )
 from visioncal.estimation.steps import find_steps, joints_of
-from visioncal.session.frames import frame_name
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
 _ROUNDS, _CONVERGED_RAD = 4, 1e-7
-# Where the fit diverges, boards whose size is off by a larger share start at the estimated size.
-_FAR_SIZE = 5e-3
 # A focal length with a larger relative sigma by the corners needs an arm that tilts.
 _UNDETERMINED_FOCAL = 0.02
 # Prior sigma of targets' sizes in the search for inliers, as a share: prints are scaled to fit a
@@ -107,23 +104,22 @@ def solve(
 def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
-    sizes: Mapping[str, float] = {}
     if observed.is_misread:
         inliers = all_as_inliers(start.problem, start.state)
     else:
-        inliers, sizes = initial_inliers(start)
+        inliers = initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
     initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)
-    cell_fit = _fit_with_inliers(initial, observed, sizes)
+    cell_fit = _fit_with_inliers(initial, observed)
     cell_fit = replace(
         cell_fit,
         arms=with_drifts(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit, level),
     )
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
-        cell_fit = _fit_with_inliers(cell_fit, observed, sizes)
+        cell_fit = _fit_with_inliers(cell_fit, observed)
     if not observed.is_misread and (found := _random_effects(cell_fit)):
         effects = (*clock_errors, *found)
-        cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed, sizes)
+        cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
@@ -224,7 +220,7 @@ def _by_closed_form(cell_fit: CellFit, solver: str) -> CellFit:
     return replace(cell_fit, inlier_fit=replace(inliers, fit=Solution(state, noise)), solver=solver)
 
 
-def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, float]) -> CellFit:
+def _fit_with_inliers(start: CellFit, observed: Observed) -> CellFit:
     """Fits lenses, boards and frames, and updates the inliers until they do not change."""
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
@@ -233,7 +229,7 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
         # Errors of an arm are sought beside the stated lenses and boards, which may hide them.
         if any(arm.errors and arm.errors.is_significant for arm in cell_fit.arms.values()):
             cell_fit = replace(cell_fit, linearised_corners=None)
-        cell_fit = _fit_lenses_and_frames(replace(cell_fit, arms=start.arms), observed, sizes)
+        cell_fit = _fit_lenses_and_frames(replace(cell_fit, arms=start.arms), observed)
         if cell_fit.cell.mount is None or observed.is_misread:
             break
         before = cell_fit.inlier_fit.used
@@ -243,11 +239,7 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
     return cell_fit
 
 
-def _fit_lenses_and_frames(
-    cell_fit: CellFit,
-    observed: Observed,
-    sizes: Mapping[str, float],
-) -> CellFit:
+def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
     cell_fit = replace(
         cell_fit, arms={name: arm.with_found_errors(None) for name, arm in cell_fit.arms.items()}
@@ -262,18 +254,11 @@ def _fit_lenses_and_frames(
         if (corners := cell_fit.linearised_corners) is not None:
             # Where other inliers are too far from the last fit, it starts anew.
             with suppress(ConvergenceError):
-                fitted, model = refine_jointly(model, corners.camera_parameters, frames, corners)
+                fitted, model = refine_jointly(
+                    model, corners.camera_parameters, frames, is_sized=True
+                )
                 return cell_fit.with_joint_fit(model, fitted)
-        try:
-            fitted, model = refine_jointly(model, optics, frames)
-        except ConvergenceError:
-            names = next(iter(observed.scenes.values())).names
-            targets = [frame_name("target", name) for name in names]
-            size_errors = {index: sizes.get(targets[index], 0.0) for index in optics.printed}
-            far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
-            if not far:
-                raise
-            fitted, model = refine_jointly(model, optics.with_scales(far), frames)
+        fitted, model = refine_jointly(model, optics, frames)
         return cell_fit.with_joint_fit(model, fitted)
     cell_fit = replace(cell_fit, linearised_corners=None)
     if drifts := tuple(arm_effects(cell_fit.arms)):
@@ -335,7 +320,7 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
             cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
         else:
             model, corners = cell_fit.frame_model, cell_fit.linearised_corners
-            fitted = fit_jointly(corners.camera_parameters, model, cell_fit.frames, None, corners)
+            fitted = fit_jointly(corners.camera_parameters, model, cell_fit.frames)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 fitted, _ = with_sizes(model, fitted)
             cell_fit = cell_fit.with_joint_fit(model, fitted)
@@ -376,15 +361,11 @@ def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, I
     start = find_start(cell, observed)
     words = chain_words(start.problem, mount)
     check_determined(start.problem, start.state, starting_noise(start.problem), words)
-    return start.cell, initial_inliers(start)[0]
+    return start.cell, initial_inliers(start)
 
 
-def initial_inliers(start: Start) -> tuple[InlierFit, Mapping[str, float]]:
-    """Finds the inliers, and the priors that they do not contradict.
-
-    Returns:
-        The inliers, and a rough relative size error of each printed target of a whole cell.
-    """
+def initial_inliers(start: Start) -> InlierFit:
+    """Finds the inliers, and the priors that they do not contradict."""
     cell, problem, state = start.cell, start.problem, start.state
     movable, observations = _movable_frames(cell, problem), problem.observations
     stated_levels = len(starting_noise(problem).sensors)
@@ -401,18 +382,15 @@ def initial_inliers(start: Start) -> tuple[InlierFit, Mapping[str, float]]:
         loose = replace(problem, priors=with_loose_positions(cell.priors))
         inliers = _with_priors(cell, inliers_and_moves(loose, state, movable)).refitted()
     # Sizes are estimated from the corners, with the lenses, and the cameras' noise beside them.
-    edges, sizes = inliers.fit.state.edges, inliers.fit.state.values.tolist()
-    noise = inliers.fit.noise
-    noise = replace(noise, sensors=noise.sensors[:stated_levels])
-    fit = replace(inliers.fit, state=State(edges, np.zeros(0)), noise=noise)
+    noise = replace(inliers.fit.noise, sensors=inliers.fit.noise.sensors[:stated_levels])
+    fit = replace(inliers.fit, state=State(inliers.fit.state.edges, np.zeros(0)), noise=noise)
     observations = replace(inliers.problem.observations, sensors=observations.sensors)
     problem = replace(
         inliers.problem.with_effects(()),
         observations=observations,
         least_levels=start.problem.least_levels,
     )
-    inliers = replace(inliers, problem=problem, fit=fit)
-    return inliers, dict(zip(printed, sizes, strict=True))
+    return replace(inliers, problem=problem, fit=fit)
 
 
 def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:

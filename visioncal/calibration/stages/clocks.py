@@ -370,7 +370,7 @@ def _with_shutter(sweep: _Sweep, clocked: ClockedViews, fit: ClockFit) -> Clocke
         found = compress_delayed(stack, camera, twists, readout_s, frames.cam_from_target)
         sigma_px = floored_sigma_px(stack.sigma_px(found.residuals, 6 * len(views) + 1))
         plain = replace(stack, weights=None)
-        delayed = plain.with_points(delayed_points(stack, camera, twists, readout_s)[0])
+        delayed = replace(plain, points=delayed_points(stack, camera, twists, readout_s)[0])
         at_stamp_px, delayed_px = (
             reproject(corners, camera, found.cam_from_target, lens=False).residuals
             for corners in (plain, delayed)

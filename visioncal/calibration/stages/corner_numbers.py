@@ -75,7 +75,7 @@ def _outside(corners: Corners, size: FloatArray) -> Mask:
 def _usable(
     corners: Corners, target: Target, outside: Mask, resolution: tuple[int, int]
 ) -> Corners | Rejection:
-    positions = corner_positions(target)
+    reason = lack_of_corners(corners, target, _FEWEST)
     if outside.any():
         at = int(np.argmax(outside))
         u_px, v_px = corners.px[at].tolist()
@@ -83,16 +83,17 @@ def _usable(
             f"corners.csv: point {point_numbers(target)[corners.ids[at]]} at ({u_px:g}, "
             f"{v_px:g}) px lies far outside the image of {resolution[0]} x {resolution[1]} px"
         )
-    elif len(corners.ids) < _FEWEST:
-        reason = (
-            f"too few corners: corners.csv has {len(corners.ids)} of {len(positions)}, needs "
-            f"{_FEWEST}"
-        )
-    elif not determines_pose(positions[corners.ids]):
-        reason = f"corners on one line: all {len(corners.ids)} of corners.csv, or all but one"
-    else:
-        return corners
-    return Rejection(corners.view, reason)
+    return Rejection(corners.view, reason) if reason else corners
+
+
+def lack_of_corners(corners: Corners, target: Target, needed: int) -> str:
+    """Why a view's corners determine no pose; empty where they do."""
+    positions, count = corner_positions(target), len(corners.ids)
+    if count < needed:
+        return f"too few corners: {count} of {len(positions)}, needs {needed}"
+    if not determines_pose(positions[corners.ids]):
+        return f"corners on one line: all {count}, or all but one, lie in one row of the target"
+    return ""
 
 
 def _misnumbered(views: Sequence[Corners], target: Target) -> list[int]:

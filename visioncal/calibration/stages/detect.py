@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 
-from visioncal.calibration.stages.corner_numbers import usable_corners
+from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
 from visioncal.core.types import Corners, Image, Progress, Rejection, Searched, Target
-from visioncal.estimation.poses import determines_pose
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import NotFound, find_target, kind_of
-from visioncal.vision.boards.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.boards.imaging import (
     blur_at_corners,
     decode_image,
@@ -101,7 +99,8 @@ def detect(
 def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Searched]) -> Size:
     """The stated (width, height) of one camera's images [px], else the most common one."""
     names = {name_of(session.declaration, "camera", view) for view in views}
-    stated = next((session.cameras[name].size for name in names & session.cameras.keys()), None)
+    of_cameras = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
+    stated = of_cameras.pop() if len(of_cameras) == 1 else None
     sizes = {view: searched.size for view, searched in found.items() if searched.size is not None}
     if stated is not None and not sizes:
         return stated
@@ -209,17 +208,11 @@ def find_corners(
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
-    positions = corner_positions(target)
-    needed, count = min(kind_of(target).fewest, len(positions)), len(seen.ids)
-    if count < needed:
-        reason = f"too few corners: {count} of {len(positions)}, needs {needed}"
-    elif not determines_pose(positions[seen.ids]):
-        reason = f"corners on one line: all {count}, or all but one, lie in one row of the board"
-    elif seen.blur_px > MAX_BLUR_PX:
+    needed = min(kind_of(target).fewest, len(corner_positions(target)))
+    reason = lack_of_corners(seen, target, needed)
+    if not reason and seen.blur_px > MAX_BLUR_PX:
         reason = f"blurred: edges are {seen.blur_px:.1f} px wide (limit {MAX_BLUR_PX:.1f})"
-    else:
-        return seen, False
-    return Rejection(view, reason), False
+    return (Rejection(view, reason) if reason else seen), False
 
 
 def _check_layout(target: Target, searches: Mapping[int, Searched]) -> None:
@@ -234,19 +227,10 @@ def _check_layout(target: Target, searches: Mapping[int, Searched]) -> None:
         return
     reasons = [*misfits.values()]
     usual = max(set(reasons), key=reasons.count)
-    step = "Mend the target's .toml, or name another: visioncal target check IMAGE says what is "
-    step += "printed."
-    if usual.startswith(LACKS_SQUARES):
-        step = free_tags_step(target)
-    elif kind_of(target).marks_squares:
-        usual += f" ({target.columns} x {target.rows} squares, legacy = {target.legacy})".lower()
-        step = (
-            f"In the target's .toml, write legacy = {str(not target.legacy).lower()}; or exchange "
-            "columns and rows, or count the squares on the print."
-        )
     raise DataError(
         f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another board "
         f"is seen: {usual}.",
         culprits=[f"view {view}" for view in misfits],
-        next_step=step,
+        next_step="In the target's .toml, correct columns, rows, and legacy or spacing, or name "
+        "another target: visioncal target check IMAGE says what is printed.",
     )

@@ -73,17 +73,17 @@ def lens_and_board_findings(
         if board not in optics.printed:
             if stated is not None:
                 measured = scale_by_stated_arms(fitted, stated, frame) or measured
-            yield from _point_findings(target, optics.moved_points(board))
+            yield from _point_findings(target, optics.values[optics.shape_of(board)])
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
                 yield _rig_size_finding(target, measured)
             continue
-        (place,) = optics.scale_of(board)
+        place = optics.shape_of(board)[0]
         if measured.is_another and place in fitted.linearised.moving:
             (at,) = fitted.columns_of(np.array([place]))
             sigma = float(covariance[at, at] ** 0.5)
             written = replace(measured, scale=float(optics.values[place]), sigma=sigma)
             yield scale_finding(called, target, measured, written)
-        if _has_changed(fitted, optics.shape_of(board)):
+        if _has_changed(fitted, optics.shape_of(board)[1:]):
             yield _shape_finding(fitted, board, called)
 
 
@@ -163,7 +163,7 @@ def _rig_size_finding(target: Target, measured: MeasuredScale) -> Finding:
 def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
     """Finding on a bent, stretched or sheared board; a note within the accuracy of printing."""
     optics = fitted.camera_parameters
-    shape = optics.shape_of(board)
+    shape = optics.shape_of(board)[1:]
     aspect, *bends, shear = shape
     drawn = optics.with_values(shape, np.zeros(len(shape))).corners[board]
     largest_mm = 1e3 * float(np.linalg.norm(optics.corners[board] - drawn, axis=1).max())
@@ -242,7 +242,8 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         else:
             allowed = "within what is stated, or by less than images show"
             yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
-    if fitted.linearised.holds_lens(camera):
+    seen = fitted.linearised
+    if np.isin(lens, seen.free[seen.held]).any():
         at = fitted.columns_of(lens[:4])
         moves = held_shift(fitted.problem, fitted.fit)[at]
         covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]

@@ -1,15 +1,15 @@
 """Checks of a session's rows, images and board before any fit, and what to type."""
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.finding_kinds import EMPTY_ROWS, MISSING
+from visioncal.core.finding_kinds import MISSING
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
@@ -17,7 +17,7 @@ from visioncal.vision.boards import kind_of
 from visioncal.vision.boards.identify import describe, identify
 from visioncal.vision.boards.identity import Identity
 from visioncal.vision.boards.imaging import decode_image
-from visioncal.vision.targets import board_words, load_target, target_names
+from visioncal.vision.targets import board_words
 
 # Names that are listed, and images that are searched for any board.
 _LISTED, _LOOKED_AT = 6, 3
@@ -27,29 +27,8 @@ _COMPARED = ("kind", "columns", "rows", "legacy", "marker_id")
 _LEAST_CORNERS = 0.2
 
 
-def pairing(session: Session) -> Iterator[Finding]:
-    """Reports rows without image or any observation, and rows that share an image."""
-    if (missing := _missing_images(session)) is not None:
-        yield missing
-    yield from _empty_rows(session)
-    first: dict[tuple[str, str], View] = {}
-    for view in session.views:
-        # One image may show several targets, in a row for each.
-        earlier = first.setdefault((view.image, view.text.get("target", "")), view)
-        if view.image and earlier is not view:
-            yield Finding(
-                "shared_image",
-                f"Views {earlier.number} and {view.number} share the same image {view.image}.",
-                Remedy(
-                    "In views.csv, give each row its own image; or delete the row of view "
-                    f"{view.number}."
-                ),
-                (earlier.number, view.number),
-                until_mm=LEAST_NEED_MM,
-            )
-
-
-def _missing_images(session: Session) -> Finding | None:
+def missing_images(session: Session) -> Finding | None:
+    """Finding on images that rows name and that are not there."""
     searched = [view for view in session.views if view.image and not view.has_corners]
     missing = [view for view in searched if session.images.absence(view.image) == "is missing"]
     if not missing:
@@ -68,22 +47,22 @@ def _missing_images(session: Session) -> Finding | None:
     )
 
 
-def _empty_rows(session: Session) -> Iterator[Finding]:
-    """Reports rows of one camera and one robot that observe nothing, where others do."""
-    # In a whole cell, a row may state only where a robot was.
+def empty_rows(session: Session) -> Finding | None:
+    """Finding on rows of one camera and one robot that observe nothing, where these are many."""
     views = tuple(
         view.number
         for view in session.views
         if not (is_camera_observation(view) or is_instrument_reading(view))
     )
     count = len(session.views)
-    if is_whole_cell(session) or len(views) in (0, count):
-        return
-    rows = some_of([*map(str, views)], _LISTED)
-    yield Finding(
-        "lost_rows" if len(views) > CalibrationLimits().lost_share[0] * count else EMPTY_ROWS,
+    # In a whole cell, a row may state only where a robot was.
+    is_many = CalibrationLimits().lost_share[0] * count < len(views) < count
+    if is_whole_cell(session) or not is_many:
+        return None
+    return Finding(
+        "lost_views",
         f"{len(views)} of {count} rows of views.csv have neither an image nor rows in corners.csv: "
-        f"view {rows}.",
+        f"view {some_of([*map(str, views)], _LISTED)}.",
         Remedy("In views.csv, fill in column image of these rows, or delete them."),
         views,
         until_mm=0.0,
@@ -97,7 +76,7 @@ def unseen_cause(observed: Observed) -> Finding | None:
     unseen = [view for view in searched if view.number not in with_target]
     if not searched or 3 * len(unseen) < len(searched):
         return None
-    missing = _missing_images(observed.session)
+    missing = missing_images(observed.session)
     if missing is not None and 2 * len(missing.views) > len(unseen):
         return missing
     return _other_board(observed.session, unseen)
@@ -125,24 +104,17 @@ def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     if not found:
         return None
     view, identity = max(found, key=lambda pair: (pair[1].whole, pair[1].corners_seen))
-    if _matches(identity, declared):
+    board, dictionaries = identity.board, ("", identity.board.dictionary, *identity.larger)
+    is_same = all(getattr(board, name) == getattr(declared, name) for name in _COMPARED)
+    if is_same and declared.dictionary in dictionaries:
         return None
-    # The declared size is that of another board; only a print of the same squares confirms it.
-    matching = min(
-        (target for target in map(load_target, target_names()) if _matches(identity, target)),
-        key=lambda target: abs(target.square_m - declared.square_m),
-        default=None,
-    )
-    side = kind_of(identity.board).side
-    if matching is not None:
+    counts = f"columns = {board.columns} and rows = {board.rows}"
+    step = Remedy(f"In the target's .toml, write {counts}, or name another target.")
+    if board.dictionary:
         step = Remedy(
-            f'In session.toml, write target = "{matching.name}", if the {side} is '
-            f"{1e3 * matching.square_m:g} mm: measure it."
-        )
-    else:
-        step = Remedy(
-            f'Measure the {side}. In session.toml, write target = "seen.toml", which this command '
-            "makes with the measured figure [mm] in the place of MEASURED.",
+            f"Measure the {kind_of(board).side}. In session.toml, write target = "
+            '"seen.toml", which this command makes with the measured figure [mm] in the place of '
+            "MEASURED.",
             f"visioncal target check SESSION/{shlex.quote(view.image)} --square-mm MEASURED "
             "-o SESSION/seen.toml",
         )
@@ -175,9 +147,3 @@ def _identified(image: Image, declared: Target) -> Identity | None:
     if identity.is_single and declared.kind != "marker" and declared.dictionary in dictionaries:
         return None
     return identity if identity.corners_seen >= _LEAST_CORNERS * identity.corners else None
-
-
-def _matches(identity: Identity, target: Target) -> bool:
-    """Whether the seen board is the target, except for its size."""
-    is_same = all(getattr(identity.board, name) == getattr(target, name) for name in _COMPARED)
-    return is_same and target.dictionary in ("", identity.board.dictionary, *identity.larger)

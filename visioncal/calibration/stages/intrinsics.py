@@ -7,15 +7,14 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
-from visioncal.core.finding_kinds import EMPTY_IMAGE
-from visioncal.core.number_format import counted, listed
+from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.bundle import BundleFit, fit_bundle
-from visioncal.estimation.corners import CornerStack, mean_square_by_view
+from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.gating import gate
-from visioncal.estimation.poses import fit_poses, planar_poses
+from visioncal.estimation.poses import planar_poses
 from visioncal.vision.targets import numbered_positions
 
 # Two views of a plane determine fx, fy, cx, cy in theory (Zhang 2000, section 3.1); a third gives
@@ -24,12 +23,8 @@ _FEWEST_VIEWS = 3
 _ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
-# Least relative gain of the rational model, of views in the fit and of held-out ones.
-_LEAST_GAIN, _FOLDS = 0.02, 5
-# Limits of the warnings: the focal length as a share, the principal point [px], tilt [deg] and
-# ratio of distances of the views; the parts of the image along each side.
+# Limits of the warning: relative sigma of the focal length, and that of the principal point [px].
 _FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
-_TILT_SPREAD_DEG, _DISTANCE_SPREAD, _GRID = 10.0, 1.2, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +46,7 @@ def estimate_intrinsics(
 ) -> Intrinsics:
     """Estimates the intrinsics from views of targets (Zhang 2000 for planar ones).
 
-    Brown's model has 5 coefficients of distortion, or 8 where these predict held-out views better;
-    a fisheye has 4.
+    Brown's model has 5 coefficients of distortion, a fisheye 4.
 
     Args:
         corners: The corners by view.
@@ -75,18 +69,16 @@ def estimate_intrinsics(
             culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )
-    full = CornerStack.of(corners, numbered_positions(targets))
+    stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
-        stack, fit, reasons = _gated(full, _first_fit(full, model, resolution))
+        fit, reasons = _gated(stack, _first_fit(stack, model, resolution))
         if reasons:
             # With a wrong initial focal length a pose may tilt the other way and stay there: the
             # most tilted views, which determine the lens best, then seem outliers.
             plain = replace(fit.camera, distortion=np.zeros_like(fit.camera.distortion))
-            restarted = _gated(full, _fit(full, plain, planar_poses(full, plain).first))
-            if len(restarted[2]) < len(reasons):
-                stack, fit, reasons = restarted
-        if model == "brown":
-            fit = _with_rational_terms(stack, fit)
+            restarted = _gated(stack, _fit(stack, plain, planar_poses(stack, plain).first))
+            if len(restarted[1]) < len(reasons):
+                fit, reasons = restarted
     relative = np.sqrt(np.diag(fit.covariance)[:2]) / fit.camera.matrix[:2]
     if not fit.settled or not np.all(np.isfinite(relative)) or np.any(fit.camera.matrix[:2] <= 0):
         raise ConvergenceError(
@@ -99,11 +91,11 @@ def estimate_intrinsics(
             next_step="Add views tilted by 30 to 45 degrees, or give matrix and distortion.",
         )
     rejections = tuple(Rejection(*item) for item in reasons.items())
-    warnings = tuple(_warnings(stack, fit))
+    warnings = tuple(_warnings(fit))
     return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections, warnings)
 
 
-def _gated(stack: CornerStack, fit: BundleFit) -> tuple[CornerStack, BundleFit, dict[int, str]]:
+def _gated(stack: CornerStack, fit: BundleFit) -> tuple[BundleFit, dict[int, str]]:
     """Refits without outlier corners and views; reasons by view."""
     reasons: dict[int, str] = {}
     for _ in range(_ROUNDS):
@@ -114,7 +106,7 @@ def _gated(stack: CornerStack, fit: BundleFit) -> tuple[CornerStack, BundleFit, 
         kept = stack.keep(gated.mask)
         poses = fit.cam_from_target[np.isin(stack.views, kept.views)]
         stack, fit = kept, _fit(kept, fit.camera, poses)
-    return stack, fit, reasons
+    return fit, reasons
 
 
 def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
@@ -150,67 +142,18 @@ def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int
     return best
 
 
-def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
-    """Takes 8 coefficients instead of 5 where held-out views are predicted better."""
-    # Starts from the polynomial: from zero, a pole and a zero may cancel inside the image.
-    camera = fit.camera
-    padded = replace(camera, distortion=np.concatenate([camera.distortion, np.zeros(3)]))
-    wider = _fit(stack, padded, fit.cam_from_target)
-    gain = 1.0 - float(np.sum(wider.residuals**2) / np.sum(fit.residuals**2))
-    if not wider.settled or gain < _LEAST_GAIN or len(stack.views) < 2 * _FOLDS:
-        return fit
-    # The median, because where a fold leaves out an edge of the image, the wider model may diverge
-    # there, which it does not with all views.
-    ratio = float(np.median(_held_out(stack, wider) / _held_out(stack, fit)))
-    return wider if ratio < 1.0 - _LEAST_GAIN else fit
-
-
-def _held_out(stack: CornerStack, fit: BundleFit) -> FloatArray:
-    """(v,) mean squared error [px^2] of held-out views."""
-    fold = np.arange(len(stack.views)) % _FOLDS
-    squares = np.zeros(len(stack.views))
-    for left_out in range(_FOLDS):
-        inside = fold[stack.view_of] != left_out
-        fitted = _fit(stack.keep(inside), fit.camera, fit.cam_from_target[fold != left_out])
-        rest = stack.keep(~inside)
-        poses = fit_poses(rest, fitted.camera, fit.cam_from_target[fold == left_out])
-        squares[fold == left_out] = mean_square_by_view(rest, poses.residuals)
-    return squares
-
-
-def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
-    """States what the views do not determine, and why."""
-    sigma, poses = np.sqrt(np.diag(fit.covariance)), fit.cam_from_target
+def _warnings(fit: BundleFit) -> Iterator[Finding]:
+    """States what the views do not determine."""
+    sigma = np.sqrt(np.diag(fit.covariance))
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
-    tilt_deg = np.rad2deg(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0.0, 1.0))).max()
-    distances = np.linalg.norm(poses[:, :3, 3], axis=1)
-    spread = distances.max() / distances.min()
-    words, step = [], Remedy("Add views, tilted and near the image's edges.")
-    if focal > _FOCAL_LIMIT:
-        words.append(f"The corners alone determine the focal length to {100 * focal:.1f} % only.")
-    if centre > _CENTRE_LIMIT_PX:
-        words.append(f"The corners alone determine the image centre to {centre:.1f} px only.")
-    is_flat = not stack.points[:, 2].any()
-    if is_flat and spread < _DISTANCE_SPREAD and tilt_deg < 2 * _TILT_SPREAD_DEG:
-        words.append(f"All views are from one distance (within {100 * (spread - 1):.0f} %).")
-        step = Remedy("Vary the distance of the views.")
-    if is_flat and tilt_deg < _TILT_SPREAD_DEG:
-        words.append(f"All views are frontal (tilted by at most {tilt_deg:.0f} degrees).")
-        step = Remedy("Add views tilted by 30 to 45 degrees.")
-    if words:
-        yield Finding("weak_lens", " ".join(words), step, until_mm=0.0)
-    cell = np.minimum((stack.px / np.array(fit.camera.resolution) * _GRID).astype(int), _GRID - 1)
-    visited, ends = set(map(tuple, cell.tolist())), (0, _GRID - 1)
-    empty = [
-        f"{edge} {side}"
-        for y, edge in zip(ends, ("upper", "lower"), strict=True)
-        for x, side in zip(ends, ("left", "right"), strict=True)
-        if (x, y) not in visited
-    ]
-    if empty:
+    if focal > _FOCAL_LIMIT or centre > _CENTRE_LIMIT_PX:
         yield Finding(
-            EMPTY_IMAGE,
-            f"No corner was ever seen in the {listed(empty)} of the image, so the lens is "
-            "extrapolated there.",
-            Remedy(f"In some views, move the target into the {listed(empty)} of the image."),
+            "weak_lens",
+            f"The corners alone determine the focal length to {100 * focal:.1f} % only, and the "
+            f"image centre to {centre:.1f} px.",
+            Remedy(
+                "Add views tilted by 30 to 45 degrees, at different distances, and near the "
+                "image's edges."
+            ),
+            until_mm=0.0,
         )

@@ -8,14 +8,9 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import adjoint, invert, rotation_angle
-from visioncal.core.types import Camera, Corners, FloatArray, Mask, Rejection, Target
+from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.corners import (
-    CornerStack,
-    floored_sigma_px,
-    mean_square_by_view,
-    reproject,
-)
+from visioncal.estimation.corners import CornerStack, floored_sigma_px, mean_square_by_view
 from visioncal.estimation.gating import gate
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
@@ -32,9 +27,6 @@ from visioncal.vision.targets import (
 _RIVAL_RATIO = 2.0
 # ... or while the difference in squared error is within 6 sigma.
 _RIVAL_CHI2 = 36.0
-# The closed form's mirrored pose is refined while its rms [px] is within this ratio of the better
-# pose's, plus about a pixel: the fit reduces it by a factor of two at most.
-_PROMISING_RATIO = 5.0
 # Smaller differences of rotation [rad] are one pose that was reached from both starts.
 _SAME_RAD = 1e-5
 _ROUNDS = 3
@@ -182,35 +174,31 @@ def _with_rivals(
     targets: Sequence[Target],
 ) -> tuple[ViewPoses, ...]:
     """Collects each view's candidates: rival planar solutions, in all turns of the target."""
-    best, other = _by_residual(stack, fit, _mirrored_fit(stack, camera, fit, mirrored))
-    mean_squares = [mean_square_by_view(stack, pose_fit.residuals) for pose_fit in (best, other)]
-    turns_of = [rotation_transforms(target) for target in targets]
-    adjoints = [adjoint(invert(turn)) for turn in turns_of]
+    fits, each = (fit, fit_poses(stack, camera, mirrored)), np.arange(len(stack.views))
+    squares = np.array([mean_square_by_view(stack, at.residuals) for at in fits])
+    order = np.argsort(squares, axis=0, kind="stable")
+    (best, worse), variance = squares[order, each], floored_sigma_px(sigma_px) ** 2
+    poses = np.array([at.cam_from_target for at in fits])[order, each]
+    information = np.array([at.information for at in fits])[order, each]
+    # Elsewhere the mirrored pose has no minimum of its own, and the fit reaches the first one.
+    differ = np.abs(poses[0] - poses[1])[:, :3, :3].max(axis=(1, 2)) > _SAME_RAD
+    mahalanobis_sq = stack.counts * (worse - best) / variance
+    rivals = differ & ((worse < _RIVAL_RATIO**2 * best) | (mahalanobis_sq < _RIVAL_CHI2))
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
-    covariances_of = [
-        floored_sigma_px(sigma_px) ** 2 * covariance_from(pose_fit.information)
-        for pose_fit in (best, other)
-    ]
-    differ = np.abs(best.cam_from_target - other.cam_from_target)[:, :3, :3].max(axis=(1, 2))
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
-        turns, by_turn = turns_of[board], adjoints[board]
-        square, rival = (values[at] for values in mean_squares)
-        has_rival = differ[at] > _SAME_RAD and _is_rival(square, rival, stack.counts[at], sigma_px)
-        fits = (best, other) if has_rival else (best,)
-        covariances = [
-            by_turn @ covariance[at] @ np.swapaxes(by_turn, 1, 2)
-            for covariance in covariances_of[: len(fits)]
-        ]
+        count, turns = 1 + int(rivals[at]), rotation_transforms(targets[board])
+        by_turn = adjoint(invert(turns))
+        covariance = variance * covariance_from(information[:count, at])[:, None]
         views.append(
             ViewPoses(
                 view,
                 _inlier_corners(stack, at),
-                np.concatenate([pose_fit.cam_from_target[at] @ turns for pose_fit in fits]),
-                tuple(range(len(turns))) * len(fits),
-                np.concatenate(covariances),
-                np.zeros((len(turns) * len(fits), 6, 0)),
+                (poses[:count, at, None] @ turns).reshape(-1, 4, 4),
+                tuple(range(len(turns))) * count,
+                (by_turn @ covariance @ np.swapaxes(by_turn, 1, 2)).reshape(-1, 6, 6),
+                np.zeros((len(turns) * count, 6, 0)),
                 board,
                 int(firsts[board]),
             )
@@ -235,51 +223,6 @@ def stated_poses(session: Session) -> dict[int, ViewPoses]:
         for view, pose in given
         if pose is not None
     }
-
-
-def _mirrored_fit(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
-    """Refines the mirrored planar solution in the views where it may be a rival."""
-    # Elsewhere it has no minimum of its own, and a fit from there would reach the first one, which
-    # stands in for it.
-    squares = mean_square_by_view(stack, reproject(stack, camera, starts).residuals)
-    promising = squares < _PROMISING_RATIO**2 * mean_square_by_view(stack, fit.residuals) + 1.0
-    corner_mask = promising[stack.view_of]
-    if not promising.any():
-        return fit
-    refined = fit_poses(stack.keep(corner_mask), camera, starts[promising])
-    return PoseFit(
-        _replaced(fit.cam_from_target, promising, refined.cam_from_target),
-        _replaced(fit.information, promising, refined.information),
-        _replaced(fit.residuals, corner_mask, refined.residuals),
-    )
-
-
-def _replaced(values: FloatArray, rows: Mask, new: FloatArray) -> FloatArray:
-    changed = values.copy()
-    changed[rows] = new
-    return changed
-
-
-def _by_residual(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFit, PoseFit]:
-    """Sorts the two fits of each view by their residuals."""
-    squares = [mean_square_by_view(stack, fit.residuals) for fit in (first, second)]
-    swap = squares[1] < squares[0]
-    corner_mask = swap[stack.view_of]
-
-    def pick(a: PoseFit, b: PoseFit) -> PoseFit:
-        return PoseFit(
-            np.where(swap[:, None, None], b.cam_from_target, a.cam_from_target),
-            np.where(swap[:, None, None], b.information, a.information),
-            np.where(corner_mask[:, None], b.residuals, a.residuals),
-        )
-
-    return pick(first, second), pick(second, first)
-
-
-def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
-    """Whether the mirrored pose explains a view's corners about as well as the better one."""
-    mahalanobis_sq = corners * (other - best) / floored_sigma_px(sigma_px) ** 2
-    return bool(other < _RIVAL_RATIO**2 * best or mahalanobis_sq < _RIVAL_CHI2)
 
 
 def _inlier_corners(stack: CornerStack, at: int) -> Corners:

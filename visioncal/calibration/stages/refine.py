@@ -53,7 +53,8 @@ def refine_jointly(
     model: CellFrameModel,
     optics: CameraParameters,
     frames: Mapping[str, FloatArray],
-    before: LinearisedCorners | None = None,
+    *,
+    is_sized: bool = False,
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits lenses, boards and frames to all corners together, with the sizes of their errors.
 
@@ -63,16 +64,16 @@ def refine_jointly(
 
     Args:
         model: Frame part of the fit.
-        optics: Stated lenses and boards, or those of `before`.
+        optics: Lenses and boards, stated or of a fit with other inliers or effects.
         frames: Initial poses of unknown frames.
-        before: The corners of a fit with other inliers or effects, from which to start, if any.
+        is_sized: Whether they are of such a fit, whose sizes are the start.
 
     Returns:
         The fit, and the model with the errors of its arms.
     """
     with diverging():
-        if before is not None:
-            stated = fit_jointly(optics, model, frames, None, before)
+        if is_sized:
+            stated = fit_jointly(optics, model, frames)
         else:
             # Sizes are estimated from above: near a wrong size, lines of sight restrain another.
             wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
@@ -103,7 +104,7 @@ def _beside_arms(
     """
 
     def beside(other: FrameModel, fit: ConvergedFit) -> ConvergedFit:
-        return fit_jointly(fit.camera_parameters, other, fit.frames, before=fit.linearised)
+        return fit_jointly(fit.camera_parameters, other, fit.frames)
 
     under_stated = model.with_errors(stated)
     freeing = (under_stated if under_stated.errors else after).freed(freely=True)
@@ -138,8 +139,8 @@ def with_sizes(
     if follows is None or posture or not model.arms_without_joints:
         return follows or fitted, posture
     sized = follows.camera_parameters
-    scales = [item.scale for item in sized.board_sizes]
-    if not any((*scales, *(item.focal for item in sized.lens_sizes.values()))):
+    zooms = (problem.lens_sizes.focal for problem in sized.problems.values())
+    if not any((*(item.scale for item in sized.board_sizes), *zooms)):
         return follows, posture
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
     posture = model.pose_errors(follows)
@@ -155,7 +156,7 @@ def _follows(
     # Cameras that disagree about a stop agree once the board has shrunk to nothing, or the lenses
     # image nothing: such a fit may converge, but no corner is where it was seen.
     def refitted(optics: CameraParameters) -> ConvergedFit:
-        return fit_jointly(optics, model, fitted.frames, fitted.others, fitted.linearised)
+        return fit_jointly(optics, model, fitted.frames, fitted.others)
 
     try:
         refit = refitted(sized)
@@ -172,7 +173,7 @@ def _follows(
 def _is_shrunk(fitted: ConvergedFit) -> bool:
     """Whether a board's size is farther from the stated one than any board's."""
     optics = fitted.camera_parameters
-    scales = [float(optics.values[optics.scale_of(board)[0]]) for board in optics.printed]
+    scales = [float(optics.values[optics.shape_of(board)[0]]) for board in optics.printed]
     return any(abs(scale) > _FARTHEST for scale in scales)
 
 
@@ -206,9 +207,10 @@ def _estimated(
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
         rows, uneven = model.rows(seen), UNEVEN_LINKS if model.has_links else 1.0
-        sizes = estimate_sizes(seen, problem, rows, state, noise, name, uneven)
         # What other cameras tell of the boards is known to each.
-        levels[name], lenses[name], boards = sizes.levels, sizes.lens, sizes.boards
+        levels[name], lenses[name], boards = estimate_sizes(
+            seen, problem, rows, state, noise, name, uneven
+        )
     # Errors of links look like a scale, too.
     holds = bool(model.arms_without_joints) or model.has_links
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)

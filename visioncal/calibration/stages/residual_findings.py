@@ -30,20 +30,14 @@ from visioncal.estimation.steps import (
     sizes_of,
 )
 
-_THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 # Fewest stops whose residuals can be tested, and most steps that are fitted.
 _FEWEST_STOPS, _MOST_FITTED = 6, 6
 # Largest ratio of the residuals beside a step to others.
 _ALIKE = 3.0
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
 _CLEARLY = 2.0 * float(np.log(100.0))
-# Kinds of findings by what changed, and what to look after.
-_KINDS = {
-    FRAME: MOVED_FRAME,
-    JOINT: "joint_slipped",
-    SIZE: BOARD_CHANGED,
-    DRIFT: "moved_slowly",
-}
+# Kinds of findings by what changed.
+_KINDS = {FRAME: MOVED_FRAME, JOINT: "joint_slipped", SIZE: BOARD_CHANGED, DRIFT: "moved_slowly"}
 
 
 def likely_steps(
@@ -110,23 +104,28 @@ def arm_findings(arm: ArmErrors, *, calibrated: bool) -> Iterator[Finding]:
     """Findings on significant posture-dependent errors of an arm, `calibrated` or not."""
     if not arm.is_significant:
         return
+    likely = f"(likelihood ratio {arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f})"
+    found = list[tuple[str, Remedy]]()
     if not calibrated and arm.of_links:
         size = mm_and_deg(1e3 * LEVER_M * arm.sigma, float(np.rad2deg(arm.sigma)))
-        yield Finding(
-            "arm_errors",
-            f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
-            f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
-            "they were estimated along. What of them looks the same in all views is in no "
-            "residual, and counts in the covariance.",
-            Remedy(
-                "Add stops all over the workspace, so that the arm can be calibrated along.",
-                f"{PLAN} --for kinematics",
-            ),
-            until_mm=0.0,
-            mahalanobis_sq=arm.gain,
+        words = (
+            f"Residuals follow the arm's posture {likely}: its links are off from the model by "
+            f"typically {size}; they were estimated along."
         )
+        step = "Add stops all over the workspace, so that the arm can be calibrated along."
+        found.append((words, Remedy(step, f"{PLAN} --for kinematics")))
     if arm.fit_sigmas is not None:
-        yield _arm_errors_finding(arm, *(np.sqrt(3.0) * arm.fit_sigmas).tolist())
+        turn_rad, shift_m = (np.sqrt(3.0) * arm.fit_sigmas).tolist()
+        words = (
+            f"Residuals follow the arm's posture, or last from stop to stop {likely}: a look near "
+            f"the views errs by {mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))} (rms). "
+            "More views will not help: joint angles or a kinematic calibration of the arm will."
+        )
+        found.append((words, NO_JOINTS))
+    same = "What of these errors looks the same in all views is in no residual, and counts in the"
+    for words, do in found:
+        all_words = f"{words} {same} covariance."
+        yield Finding("arm_errors", all_words, do, until_mm=0.0, mahalanobis_sq=arm.gain)
 
 
 def step_finding(
@@ -145,23 +144,25 @@ def step_finding(
     if steps[1:]:
         instead = f" Or else, as these views leave it open: {_step_words(steps[1], cell, joint)}."
     thing = _thing(step)
-    between, do = {
-        FRAME: ("both places", f"Fasten {thing[0].lower()}{thing[1:]}"),
-        JOINT: ("before and after", "Look whether the joint keeps its zero"),
-        SIZE: ("both boards", "Measure both prints, take one of them for all views"),
-        DRIFT: ("begin and end", "Fasten base and target, let the arm warm up"),
+    do = {
+        FRAME: f"Fasten {thing[0].lower()}{thing[1:]}",
+        JOINT: "Look whether the joint keeps its zero",
+        SIZE: "Measure both prints, take one of them for all views",
+        DRIFT: "Fasten base and target, let the arm warm up",
     }[step.kind]
-    remedy = Remedy(f"{do}, and record again.")
+    is_drift = step.kind == DRIFT
     yield Finding(
         _KINDS[step.kind],
-        f"{_step_words(step, cell, joint)}; the result is between {between}.{instead}",
-        remedy if step.kind == DRIFT else cell.or_separately(do, step.stop),
-        mahalanobis_sq=step.gain * (step.kind != DRIFT),
+        f"{_step_words(step, cell, joint)}; the result is between before and after.{instead}",
+        Remedy(f"{do}, and record again.") if is_drift else cell.or_separately(do, step.stop),
+        mahalanobis_sq=0.0 if is_drift else step.gain,
     )
 
 
 def _thing(step: Step) -> str:
-    return _THINGS.get(step.of, step.of)
+    return {"cam": "The camera", "target": "The target", "instrument": "The instrument"}.get(
+        step.of, step.of
+    )
 
 
 def _step_words(step: Step, cell: Cell, joint: Callable[[Step], str]) -> str:
@@ -169,12 +170,11 @@ def _step_words(step: Step, cell: Cell, joint: Callable[[Step], str]) -> str:
     when = cell.start_words(step.stop)
     if step.kind == JOINT:
         # The reading's change is opposite to the correction that gives the joint's angle.
-        sign = "+" if first < 0.0 else "-"
+        changed_deg, sigma_deg = np.rad2deg([abs(first), sigma]).tolist()
         return (
-            f"The offset of {joint(step)} steps: {when}, it reads "
-            f"{sign}{figure(float(np.rad2deg(abs(first))))} deg (sigma "
-            f"{figure(float(np.rad2deg(sigma)))}) from what it read before, as where an encoder "
-            "slipped or a zero was lost"
+            f"The offset of {joint(step)} steps: {when}, it reads {'+' if first < 0.0 else '-'}"
+            f"{figure(changed_deg)} deg (sigma {figure(sigma_deg)}) from what it read before, as "
+            "where an encoder slipped or a zero was lost"
         )
     if step.kind == SIZE:
         return (
@@ -182,32 +182,10 @@ def _step_words(step: Step, cell: Cell, joint: Callable[[Step], str]) -> str:
             f"{'larger' if first > 0.0 else 'smaller'} (sigma {figure(100.0 * sigma)} %) than "
             "before, by the robot's motion"
         )
+    moved = mm_and_deg(*pose_difference(np.eye(4), exp(step.value)))
     if step.kind == DRIFT:
         return (
             "Residuals drift with time: from the first stop to the last, base or target moved by "
-            f"{_size(float(np.linalg.norm(step.value[3:])), float(np.linalg.norm(step.value[:3])))}"
+            f"{moved}"
         )
-    shift_mm, turn_deg = pose_difference(np.eye(4), exp(step.value))
-    return (
-        f"{_thing(step)} moved at once: {when}, it is {mm_and_deg(shift_mm, turn_deg)} from where "
-        "it was"
-    )
-
-
-def _size(shift_m: float, turn_rad: float) -> str:
-    return mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))
-
-
-def _arm_errors_finding(arm: ArmErrors, turn_rad: float, shift_m: float) -> Finding:
-    """Finding on an arm whose joints are not known, with the rms error of a look [rad, m]."""
-    return Finding(
-        "arm_errors",
-        "Residuals follow the arm's posture, or last from stop to stop (likelihood ratio "
-        f"{arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f}): a look near the views errs by "
-        f"{_size(shift_m, turn_rad)} (rms). More views will not help: joint angles or a kinematic "
-        "calibration of the arm will. What of its errors looks the same in all views is in no "
-        "residual, and counts in the covariance.",
-        NO_JOINTS,
-        until_mm=0.0,
-        mahalanobis_sq=arm.gain,
-    )
+    return f"{_thing(step)} moved at once: {when}, it is {moved} from where it was"

@@ -1,13 +1,12 @@
 """Cross-validation: each observation is predicted by a fit without its stop."""
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply_each, distances
+from visioncal.core.transforms import apply, distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
@@ -108,19 +107,11 @@ def chain_rms_px(
         positions: (c, 3) all corners, each on its target [m].
     """
     rms = np.full(len(poses), np.nan)
-    by_camera = defaultdict[int, list[tuple[int, Camera, Corners]]](list)
-    for at, (camera, corners) in enumerate(zip(cameras, seen, strict=True)):
-        if camera is not None and corners is not None:
-            by_camera[id(camera)].append((at, camera, corners))
-    for views in by_camera.values():
-        camera, rows = views[0][1], [at for at, _, _ in views]
-        counts = [len(corners.ids) for _, _, corners in views]
-        view_of = np.repeat(rows, counts)
-        points = positions[np.concatenate([corners.ids for _, _, corners in views])]
-        observed = np.concatenate([corners.px for _, _, corners in views])
-        residuals = project(camera, apply_each(poses[view_of], points)) - observed
+    for at, (corners, camera) in enumerate(zip(seen, cameras, strict=True)):
+        if camera is None or corners is None:
+            continue
+        residuals = project(camera, apply(poses[at], positions[corners.ids])) - corners.px
         # A corner behind the camera counts as a whole image width of error.
         residuals = np.nan_to_num(residuals, nan=float(max(camera.resolution)))
-        squares = np.bincount(view_of, np.sum(residuals**2, axis=1), minlength=len(poses))
-        rms[rows] = np.sqrt(squares[rows] / counts)
+        rms[at] = np.sqrt(np.mean(np.sum(residuals**2, axis=1)))
     return rms

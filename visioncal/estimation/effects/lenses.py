@@ -69,17 +69,9 @@ class CameraParameters:
         """Indices of the printed boards; see `CornerProblem.printed`."""
         return self._one.printed
 
-    def scale_of(self, board: int) -> IntArray:
-        """Index (1,) of one printed board's scale."""
-        return self._here(self._one.scale_of(board))
-
-    def shape_of(self, board: int) -> IntArray:
-        """Indices (9,) of one printed board's aspect, shear and bend."""
-        return self._here(self._one.shape_of(board))
-
-    def moved_points(self, rig: int) -> FloatArray:
-        """(3 n,) deviations of a rig's points from its table [m]; empty for an exact rig."""
-        return self.values[self._here(self._one.points_of(rig))]
+    def shape_of(self, target: int) -> IntArray:
+        """Indices of the values of one target's shape; of a printed board the scale comes first."""
+        return self.places(next(iter(self.problems)))[self._one.points_of(target)]
 
     @property
     def corners(self) -> tuple[FloatArray, ...]:
@@ -93,10 +85,6 @@ class CameraParameters:
         """Corners of the first camera; as to boards, all cameras are alike."""
         return next(iter(self.problems.values()))
 
-    def _here(self, places: IntArray) -> IntArray:
-        """Converts indices of board values among one camera's columns to those among all values."""
-        return np.asarray(places - len(self._one.lens) + self.boards.start)
-
     @cached_property
     def prior_information(self) -> FloatArray:
         """(k, k) information on the values by what is stated and the sizes of their errors."""
@@ -109,18 +97,14 @@ class CameraParameters:
     @cached_property
     def free(self) -> IntArray:
         """(f,) indices of the uncertain values, whether fitted or held."""
-        return self._chosen({name: item.is_uncertain for name, item in self.problems.items()})
+        problems = self.problems.items()
+        return np.unique(np.concatenate([self.places(at)[of.is_uncertain] for at, of in problems]))
 
     @cached_property
     def held(self) -> IntArray:
         """Indices of the values that no fit moves."""
-        return self._chosen({name: item.is_held for name, item in self.problems.items()})
-
-    def _chosen(self, masks: Mapping[str, Mask]) -> IntArray:
-        chosen = np.zeros(len(self.values), dtype=bool)
-        for name, mask in masks.items():
-            chosen[self.places(name)[mask]] = True
-        return np.flatnonzero(chosen)
+        problems = self.problems.items()
+        return np.unique(np.concatenate([self.places(at)[of.is_held] for at, of in problems]))
 
     @cached_property
     def stated(self) -> FloatArray:
@@ -129,14 +113,9 @@ class CameraParameters:
             self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
         ).values
 
-    def stated_scale_sigma(self, board: int) -> float:
-        """Relative standard deviation of the stated size of a printed board."""
-        target = self._one.scene.targets[board]
-        return target.square_sigma_m / target.square_m
-
     def lens_of(self, name: str) -> IntArray:
         """Indices of one camera's intrinsics."""
-        return np.arange(self.lenses[name].start, self.lenses[name].stop)
+        return np.asarray(np.r_[self.lenses[name]])
 
     def with_sizes(
         self,
@@ -169,23 +148,9 @@ class CameraParameters:
         return replace(sized, values=values)
 
     @property
-    def lens_sizes(self) -> dict[str, LensSizes]:
-        """Sizes of the errors of the lenses, by camera."""
-        return {name: problem.lens_sizes for name, problem in self.problems.items()}
-
-    @property
     def board_sizes(self) -> tuple[BoardSizes, ...]:
         """Sizes of the errors of the printed boards."""
         return self._one.board_sizes
-
-    def with_scales(self, scales: Mapping[int, float]) -> "CameraParameters":
-        """Returns them with scales of printed boards far from the stated ones."""
-        sizes = tuple(
-            replace(item, scale=abs(scales[board])) if board in scales else item
-            for board, item in zip(self.printed, self.board_sizes, strict=True)
-        )
-        places = np.array([int(self.scale_of(board)[0]) for board in scales])
-        return self.with_sizes({}, {}, sizes).with_values(places, np.array([*scales.values()]))
 
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
         """Returns them with views reweighted by the residuals of all corners."""
@@ -197,23 +162,9 @@ class CameraParameters:
         }
         return replace(self, problems=problems)
 
-    @property
-    def levels(self) -> dict[str, LensLevels]:
-        """Levels of lens errors beyond the models, of cameras for which they were estimated."""
-        return {
-            name: problem.levels
-            for name, problem in self.problems.items()
-            if problem.levels is not None
-        }
-
     def camera(self, name: str) -> Camera:
         """A camera with its present intrinsics."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
-
-    @property
-    def has_lenses(self) -> bool:
-        """Whether the focal lengths of all cameras are positive."""
-        return all(self.values[place][:2].min() > 0 for place in self.lenses.values())
 
     @property
     def points(self) -> FloatArray:
@@ -226,18 +177,13 @@ class CameraParameters:
         values[free] = found
         return replace(self, values=values)
 
-    def linearised(self, before: "LinearisedCorners | None" = None) -> "LinearisedCorners":
-        """Compresses all corners.
-
-        `before` is a previous linearisation, reused for cameras whose lens, boards, poses and
-        weights have not changed since.
-        """
+    def linearised(self) -> "LinearisedCorners":
+        """Compresses all corners."""
         by_camera, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
         gradient = np.zeros(len(self.values))
         for name, problem in self.problems.items():
-            compressed = None if before is None else before.still(self, name)
-            compressed, places = compressed or self.compressed(name), self.places(name)
+            compressed, places = self.compressed(name), self.places(name)
             sigma = problem.sigma_px(compressed)
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
@@ -264,19 +210,13 @@ class CameraParameters:
 
     def rows(self, name: str) -> slice:
         """Slice of one camera's views among all views."""
-        names, counts = (
-            list(self.problems),
-            [len(problem.stack.views) for problem in self.problems.values()],
-        )
-        first = sum(counts[: names.index(name)])
-        return slice(first, first + counts[names.index(name)])
+        names = list(self.problems)
+        ends = np.cumsum([0, *(len(problem.stack.views) for problem in self.problems.values())])
+        return slice(*ends[names.index(name) : names.index(name) + 2].tolist())
 
     def places(self, name: str) -> IntArray:
         """Indices of the values that one camera's corners depend on: its lens and all boards."""
-        lens, boards = self.lenses[name], self.boards
-        return np.concatenate(
-            [np.arange(lens.start, lens.stop), np.arange(boards.start, boards.stop)]
-        )
+        return np.asarray(np.r_[self.lenses[name], self.boards])
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +246,6 @@ class LinearisedCorners:
         """Indices of the values that a fit moves."""
         return self.free[~self.held]
 
-    def holds_lens(self, name: str) -> bool:
-        """Whether the intrinsics of a camera are uncertain but held."""
-        optics = self.camera_parameters
-        if name not in optics.lenses:
-            return False
-        return bool(np.isin(optics.lens_of(name), self.free[self.held]).any())
-
     @property
     def known(self) -> PriorInformation:
         """Information on the free values from corners and priors, without any robot."""
@@ -323,18 +256,6 @@ class LinearisedCorners:
         prior = optics.prior_information[np.ix_(free, free)]
         gradient = prior @ (optics.values - optics.stated)[free]
         return PriorInformation(corners + prior, self.corners.gradient[free] + gradient)
-
-    def still(self, optics: CameraParameters, name: str) -> Compressed | None:
-        """Normal equations of one camera, if they also hold for other parameters; else None."""
-        own, other = self.camera_parameters.problems[name], optics.problems[name]
-        places = optics.places(name)
-        is_alike = (
-            other.stack is own.stack
-            and other.levels == own.levels
-            and optics.poses is self.camera_parameters.poses
-            and np.array_equal(optics.values[places], self.camera_parameters.values[places])
-        )
-        return self.compressed[list(optics.problems).index(name)] if is_alike else None
 
     @property
     def covariance(self) -> FloatArray:

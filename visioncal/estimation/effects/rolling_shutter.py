@@ -5,7 +5,7 @@ lies at `exp(t w) p` in the target's frame, w being the target's right twist per
 camera's view.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -94,4 +94,4 @@ def compress_delayed(
         starts: (v, 4, 4) starts of `cam_from_target`.
     """
     points, jacobian = delayed_points(stack, camera, twists, readout_s)
-    return compress_points(stack.with_points(points), camera, starts, jacobian, lens=False)
+    return compress_points(replace(stack, points=points), camera, starts, jacobian, lens=False)

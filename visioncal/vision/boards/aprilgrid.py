@@ -33,7 +33,6 @@ from visioncal.vision.boards.template import Print
 _MIN_TAGS, _MOST_SPACING, _MOST_BORDER, _USUAL_SPACING = 1, 1.0, 2, 0.3
 # Number of columns that are tried for an unknown board.
 _MOST_COLUMNS = 24
-LACKS_SQUARES = "the tags lack the small dark squares at their corners that an AprilGrid has"
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
 # where two dark corners meet: it counts as white if dark has to be darker than its surroundings by
 # this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
@@ -193,7 +192,11 @@ class AprilGrid(Board):
                 f"the grid ends before {size} tags: an outer line is missing", misfit=True
             )
         if not _has_squares(image, px, target.spacing):
-            return NotFound(LACKS_SQUARES, misfit=True)
+            return NotFound(
+                "the tags lack the small dark squares at their corners that an AprilGrid has "
+                "(they are a target of kind points)",
+                misfit=True,
+            )
         px = refined_tags(image, px, target.spacing)
         spacing = measured_spacing(target, numbers, px)
         if abs(spacing - target.spacing) > _SPACING:
@@ -227,18 +230,6 @@ _UNKNOWN = Target(
     dictionary=APRILGRID_DICTIONARY,
     spacing=_USUAL_SPACING,
 )
-
-
-def free_tags_step(target: Target) -> str:
-    """Instruction to describe a grid of tags without squares as free tags."""
-    side = f"{target.square_m:g}"
-    return (
-        f'Describe it as free tags: in its .toml, kind = "points", points = "tags.csv", dictionary '
-        f'= "{target.dictionary}" and nothing else; tags.csv beside it has the header '
-        "point,x_m,y_m,z_m,tag,corner and a row for each corner of a tag, 0 to 3 clockwise from "
-        f"the upper left, such as 0,0,0,0,{target.marker_id},0 and then "
-        f"1,{side},0,0,{target.marker_id},1 (x to the right, y down, measured on the print)."
-    )
 
 
 def grid_tags(
