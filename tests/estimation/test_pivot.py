@@ -22,7 +22,7 @@ from support.touched import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.estimation.pivot import fit_pivot, readings_that_close, tool_problem
+from visioncal.estimation.pivot import fit_pivot, tool_problem
 from visioncal.estimation.points import Placement
 from visioncal.estimation.problem_parts import Noise
 
@@ -40,7 +40,7 @@ def test_exact_touches_give_the_exact_tool(job):
     fit = fit_pivot(made.touches)
     # Exact in double precision, at levers of a metre and the weakest of these geometries.
     assert fit.flange_from_tool[:3, 3] == pytest.approx(TIP, abs=1e-11)
-    assert fit.points == pytest.approx(POINTS[: job.points], abs=1e-11)
+    assert fit.agreement.fit.state.points == pytest.approx(POINTS[: job.points], abs=1e-11)
     turn = TURN.as_matrix() if job.axes else np.eye(3)
     assert fit.flange_from_tool[:3, :3] == pytest.approx(turn, abs=1e-10)
     assert fit.oriented == (job.axes > 0)
@@ -57,7 +57,10 @@ def test_three_touches_that_agree_by_chance_are_not_believed():
         squares.append(error @ np.linalg.solve(fit.covariance[3:, 3:], error))
     # Chi-square of three stays under 31, five sigmas, in all but one case of a million.
     assert max(squares) < 31.0
-    assert fit_pivot(touched(Job(tips=3), 0).touches, expected_sigma_m=3e-4).sigma_m >= 3e-4
+    assert (
+        fit_pivot(touched(Job(tips=3), 0).touches, expected_sigma_m=3e-4).agreement.fit.sigma
+        >= 3e-4
+    )
 
 
 @pytest.mark.parametrize("oriented", [False, True])
@@ -147,8 +150,7 @@ def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
 def test_one_wrong_touch_in_ten_is_left_out(spoil, seed):
     fit = fit_pivot(spoil(touched(Job(noise=ROBOT), seed).touches), ROBOT)
     assert rejected(fit) == [4]
-    assert fit.belongs_to[4] is None
-    assert fit.agreement.mahalanobis_sq[4] > fit.agreement.limit[4]
+    assert fit.agreement.beyond[4] > 1.0
     # What is left errs as ten touches of 0.1 mm do: half of that, and six times it for certain.
     assert np.linalg.norm(fit.flange_from_tool[:3, 3] - TIP) < 6e-4
 
@@ -164,7 +166,7 @@ def test_a_lone_touch_of_an_axis_is_not_accused():
     aside = 5e-3 * made.truly[10].apply(TURN.apply([1, 0, 0]))
     fit = fit_pivot(slipped(made.touches, 10, aside))
     assert fit.agreement.mask.all()
-    assert np.isinf(fit.agreement.limit[10:]).all()
+    assert not fit.agreement.beyond[10:].any()
 
 
 def test_of_two_touches_of_a_point_neither_is_accused():
@@ -175,14 +177,6 @@ def test_of_two_touches_of_a_point_neither_is_accused():
     assert fit.agreement.mask.all()
     assert np.flatnonzero(fit.agreement.doubtful).tolist() == [5, 6]
     assert not fit.agreement.explained
-
-
-def test_two_touches_that_contradict_each_other_grossly_are_refused_by_name():
-    touches = touched(Job(tips=5, points=2), 3).touches
-    few = touches.subset(np.array([True] * 6 + [True] + [False] * 3))
-    with pytest.raises(DataError, match=r"touches 0, 6 contr.*touch 0 fits point 'A'") as caught:
-        fit_pivot(relabelled(few.subset(np.arange(7) != 5), 0, 1))
-    assert caught.value.culprits == ("0", "6")
 
 
 def test_sound_touches_are_kept():
@@ -209,7 +203,7 @@ def test_small_turns_are_refused_with_their_size():
 
 def test_touches_that_scatter_are_told_from_touches_that_do_not_turn():
     touches = touched(Job(tips=4, contact_m=0.02, cone_deg=20.0), 1).touches
-    with pytest.raises(DegenerateError, match=r"scatter by .* mm"):
+    with pytest.raises(DegenerateError, match=r"at a scatter of 1\d mm"):
         fit_pivot(touches)
 
 
@@ -242,7 +236,7 @@ def test_axis_touches_too_near_to_the_tip_are_refused():
     # The point stays on the axis, but 2 mm from the tip.
     near = made.reached[10] - [0.0, 0.0, 2e-3]
     poses[10, :3, 3] += made.truly[10].apply(TURN.apply(near))
-    with pytest.raises(DegenerateError, match="of kind z have their point at most 2"):
+    with pytest.raises(DegenerateError, match="of kind z or xz have their points too near"):
         fit_pivot(replace(made.touches, base_from_flange=poses))
 
 
@@ -250,13 +244,11 @@ def test_touches_on_opposite_sides_of_the_tip_are_refused_by_name():
     made = touched(Job(axes=3), 1)
     poses = made.touches.base_from_flange.copy()
     poses[11, :3, 3] += 2 * made.truly[11].apply(TURN.apply(made.reached[11]))
-    with pytest.raises(DataError, match=r"kind z, 11 lie on the other side.*than 10, 12"):
+    with pytest.raises(DataError, match=r"kind z lie on both sides: 11 on .* than 10, 12"):
         fit_pivot(replace(made.touches, base_from_flange=poses))
 
 
-def test_inverse_poses_are_recognised_by_several_points_or_by_a_far_tip():
-    one, two = touched(Job(), 2).touches, touched(Job(points=2), 2).touches
-    (reading,) = readings_that_close(replace(two, base_from_flange=invert(two.base_from_flange)))
-    assert "flange_from_base" in reading.words
+def test_inverse_poses_are_recognised_by_a_far_tip():
+    one = touched(Job(), 2).touches
     assert fit_pivot(replace(one, base_from_flange=invert(one.base_from_flange))).looks_inverse
     assert not fit_pivot(one).looks_inverse

@@ -163,7 +163,6 @@ def test_three_touches_say_what_their_sigma_rests_on():
     assert "assumed" not in stated.verdict.reasons[0]
     assert assumed.noise_mm == pytest.approx(0.1)
     assert np.allclose(stated.edge.covariance, 9 * assumed.edge.covariance, rtol=1e-6)
-    assert "noise_95_mm" not in assumed.details
 
 
 @pytest.mark.parametrize(
@@ -438,7 +437,7 @@ def test_a_drawing_on_a_line_is_refused(tmp_path, tool_file):
     touches = touches_file(tmp_path / "touches.csv", LINE)
     done = visioncal("fixture", touches, "--cad", cad, "--tool", tool_file)
     assert done.status == 2
-    assert "the fixture's rotation about the fixture's x is not determined at all" in done.err
+    assert "the fixture's rotation about its x has a predicted sigma of" in done.err
 
 
 def test_features_need_their_kinds(tmp_path, tool_file):
@@ -474,12 +473,6 @@ def test_touches_on_a_line_are_refused_with_the_rotation_that_is_open(tmp_path, 
     assert done.status == 2
     assert "the fixture's rotation about its x has a predicted sigma of" in done.err
     assert "at a noise of 0.1 mm" in done.err
-    exact = touching(line, np.random.default_rng(2))
-    write_poses(touches, exact, {"point": NAMES[:3]})
-    cad = cad_file(tmp_path / "cad.csv")
-    done = visioncal("fixture", touches, "--tool", tool_file, "--cad", cad)
-    assert done.status == 2
-    assert "is not determined at all: the measured points lie within" in done.err
 
 
 def test_units_of_the_drawing(tmp_path, tool_file):
@@ -494,7 +487,7 @@ def test_units_of_the_drawing(tmp_path, tool_file):
     # Who says a unit has seen that the names are wrong.
     assert run(("x_m", "y_m", "z_m"), "--cad-unit", "mm").status == 0
     for done, words in (
-        (run(("x_m", "y_m", "z_m")), "the drawn ones are in mm and were read as m"),
+        (run(("x_m", "y_m", "z_m")), "times as large as drawn"),
         (run(("x", "y", "z")), "x, y, z are in no unit that is named"),
         (run(("x", "y", "z"), "--cad-unit", "mn"), "no unit of length named 'mn'"),
         (run(("a", "b", "c")), "columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed"),

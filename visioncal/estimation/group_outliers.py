@@ -2,39 +2,44 @@
 
 from dataclasses import dataclass, replace
 from math import comb
-from typing import Generic
 
 import numpy as np
 
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.groups import GroupFit, GroupProblem, State, descended, fit_groups
-from visioncal.estimation.linalg import covariance_from, gram, squared_lengths
+from visioncal.estimation.linalg import squared_lengths
+from visioncal.estimation.points import (
+    FALSE_ALARM,
+    GroupFit,
+    Groups,
+    Placement,
+    PointProblem,
+    descended,
+    fit_groups,
+)
 from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 
-# Share of outlier-free sets in which noise rejects a group.
-_FALSE_ALARM = 1e-3
-# Least share of inlier groups; with fewer, the outliers cannot be identified.
-_LEAST_SHARE = 0.5
 # Odds over any other group at which a single group is called the outlier.
 _ODDS = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class GroupInliers(Generic[State]):
+class GroupInliers:
     """The inlier groups, and their fit."""
 
-    fit: GroupFit[State]  # From the inlier groups.
-    mask: Mask  # (m,) mask of them.
-    # (m,) squared Mahalanobis distance of each group from the prediction of the others, over the
-    # number of predicted directions: one on average for noise.
-    mahalanobis_sq: FloatArray
-    # (m,) its rejection limit; infinite where the others do not predict the group at all.
-    limit: FloatArray
+    fit: GroupFit  # From the inlier groups.
+    # (m,) squared Mahalanobis distance of each group from the prediction of the others, over its
+    # limit; zero where the others do not predict the group at all.
+    beyond: FloatArray
     doubtful: Mask  # (m,) groups of which some are wrong, not known which: all of them stay.
     # Whether noise explains the inliers: none is doubtful, and their misfit is within the
     # chi-square limit of the expected level, where one was given.
     explained: bool
+
+    @property
+    def mask(self) -> Mask:
+        """(m,) mask of the inliers."""
+        return self.fit.used
 
     @property
     def off_m(self) -> FloatArray:
@@ -43,10 +48,10 @@ class GroupInliers(Generic[State]):
 
 
 def find_inlier_groups(
-    problem: GroupProblem[State],
+    problem: PointProblem,
     expected_sigma: float | None = None,
-    start: tuple[Mask, State] | None = None,
-) -> GroupInliers[State]:
+    start: tuple[Mask, Placement] | None = None,
+) -> GroupInliers:
     """Finds the inlier groups, and fits the unknowns to them.
 
     Args:
@@ -66,37 +71,33 @@ def find_inlier_groups(
     if all_groups.freedom > 1:
         first = _core(problem, count) if start is None else fit_groups(problem, *start)
         fit = settled(_GroupSearch(problem), first.used, first, fewest=1, suspect=0.0)[1]
-        if fit.used.sum() < max(_LEAST_SHARE * count, 1) or fit.freedom < 1:
+        if 2 * fit.used.sum() < count or fit.freedom < 1:
             fit = all_groups
-        doubtful = _doubtful(fit)
+        doubtful = _doubtful(problem, fit)
         if doubtful.any():
             fit = fit_groups(problem, fit.used | doubtful, fit.state)
-    found = distances(fit)
-    counts = np.maximum(found.directions, 1)
     explained = not doubtful.any() and (
         expected_sigma is None or _is_explained(fit, expected_sigma)
     )
-    return GroupInliers(
-        fit, fit.used, found.squares / counts, found.limit / counts, doubtful, explained
-    )
+    return GroupInliers(fit, distances(fit).beyond, doubtful, explained)
 
 
 @dataclass(frozen=True, eq=False)
-class _GroupSearch(Generic[State]):
+class _GroupSearch:
     """The search among the groups of a problem."""
 
-    problem: GroupProblem[State]
+    problem: PointProblem
 
-    def fit(self, used: Mask, start: GroupFit[State]) -> GroupFit[State]:
+    def fit(self, used: Mask, start: GroupFit) -> GroupFit:
         return fit_groups(self.problem, used, start.state)
 
-    def distances(self, used: Mask, fit: GroupFit[State]) -> Distances:
+    def distances(self, used: Mask, fit: GroupFit) -> Distances:
         found = distances(fit)
         # Without degrees of freedom nothing is rejected.
         return found if fit.freedom > 0 else replace(found, squares=np.zeros(len(used)))
 
 
-def distances(fit: GroupFit[State]) -> Distances:
+def distances(fit: GroupFit) -> Distances:
     """Mahalanobis distance of each group from the prediction of the other groups.
 
     For a group inside the fit this is the deletion residual's, by the identity of Cook and Weisberg
@@ -112,31 +113,31 @@ def distances(fit: GroupFit[State]) -> Distances:
     # and the inliers were selected for their small level among all sets of their size. Half of the
     # false alarms go to the first excluded group, a quarter to the next.
     excluded = int(np.sum(~fit.used))
-    share = _FALSE_ALARM / 2.0**excluded / comb(len(fit.used), excluded)
+    share = FALSE_ALARM / 2.0**excluded / comb(len(fit.used), excluded)
     positive = np.maximum(directions, 1)
     limit = positive * f_limit(share, positive, max(fit.freedom, 1))
     return Distances(squares, directions, np.where(directions > 0, limit, np.inf))
 
 
-def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
+def _core(problem: PointProblem, count: int) -> GroupFit:
     """Least-trimmed-squares start, extended by all groups it predicts."""
     groups = problem.linearise(next(iter(problem.guesses())))
     even = np.eye(groups.residuals.shape[1])[None].repeat(count, axis=0)
     # Makes groups of different size comparable.
     typical = chi2_limit(0.5, np.maximum(groups.observed.sum(axis=1), 1))
 
-    def normalised_squares(state: State) -> FloatArray:
+    def normalised_squares(state: Placement) -> FloatArray:
         return np.asarray(np.sum(problem.linearise(state).residuals ** 2, axis=1) / typical)
 
-    def solve(mask: Mask, state: State) -> State:
-        return descended(problem, state, mask, even)[0]
+    def solve(mask: Mask, state: Placement) -> Placement:
+        return descended(problem, state, mask, even)
 
     mask, state = trimmed_start(problem.guesses(), normalised_squares, solve, half_of(count))
     fit = fit_groups(problem, mask, state)
     return widened(_GroupSearch(problem), mask, fit, np.ones(count, dtype=bool))[1]
 
 
-def _doubtful(fit: GroupFit[State]) -> Mask:
+def _doubtful(problem: PointProblem, fit: GroupFit) -> Mask:
     """Groups among which the outliers cannot be identified."""
     # Each excluded group is compared with each inlier: under the mean-shift model with unknown
     # noise, the odds of one or the other being wrong are those of the squared residuals left
@@ -145,34 +146,26 @@ def _doubtful(fit: GroupFit[State]) -> Mask:
     for excluded in np.flatnonzero(~fit.used):
         used = fit.used.copy()
         used[excluded] = True
-        squares = _squares_without(fit, used)
-        rivals = fit.used & (squares < squares[excluded] * _ODDS ** (2.0 / max(fit.freedom, 1)))
+        refit = fit_groups(problem, used, fit.state)
+        inside = refit.groups.subset(used)
+        left = np.full(len(used), np.inf)
+        left[used] = _misfit(inside, refit.sigma) - distances(refit).squares[used]
+        least = max(left[excluded], np.finfo(float).eps * _misfit(inside, refit.sigma))
+        rivals = fit.used & (left < least * _ODDS ** (2.0 / max(fit.freedom, 1)))
         if rivals.any():
             doubtful |= rivals
             doubtful[excluded] = True
     return doubtful
 
 
-def _squares_without(fit: GroupFit[State], used: Mask) -> FloatArray:
-    """Whitened squared residuals (m,) left without each group of a mask in turn."""
-    inside = fit.groups.subset(used)
-    covariance = inside.covariance(fit.sigma)
-    fitted = covariance_from(inside.information(fit.sigma))
-    gradient = gram(np.linalg.solve(covariance, inside.jacobian), inside.residuals)
-    residuals = inside.residuals - inside.jacobian @ (fitted @ gradient)
-    total = np.einsum(
-        "mi,mi->", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0]
-    )
-    leverage = inside.jacobian @ fitted @ np.swapaxes(inside.jacobian, 1, 2)
-    squares = np.full(len(used), np.inf)
-    squares[used] = total - squared_lengths(residuals, covariance - leverage, covariance)[0]
-    return np.asarray(np.maximum(squares, np.finfo(float).eps * total))
+def _misfit(inside: Groups, sigma: float) -> float:
+    """Sum of the whitened squared residuals at a noise level [m]."""
+    white = np.linalg.solve(inside.covariance(sigma), inside.residuals[..., None])[..., 0]
+    return float(np.sum(inside.residuals * white))
 
 
-def _is_explained(fit: GroupFit[State], expected_sigma: float) -> bool:
-    inside = fit.groups.subset(fit.used)
+def _is_explained(fit: GroupFit, expected_sigma: float) -> bool:
     if fit.freedom < 1:
         return True
-    white = np.linalg.solve(inside.covariance(expected_sigma), inside.residuals[..., None])[..., 0]
-    misfit = float(np.sum(inside.residuals * white))
-    return misfit <= float(chi2_limit(_FALSE_ALARM, fit.freedom))
+    misfit = _misfit(fit.groups.subset(fit.used), expected_sigma)
+    return misfit <= float(chi2_limit(FALSE_ALARM, fit.freedom))

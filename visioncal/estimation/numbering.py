@@ -7,7 +7,6 @@ several orders: then geometry does not determine the order.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from math import perm
 
 import numpy as np
@@ -17,18 +16,13 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
+from visioncal.estimation.points import FALSE_ALARM
 from visioncal.estimation.procrustes import align, procrustes_residual
 
-# Exhaustive search up to this number of orders: seven points of seven.
-_EXHAUSTIVE = 5040
-# Most triples of drawn points aligned with one measured triangle, most pairs considered for them,
-# and most alignments refined.
-_TRIPLES, _PAIRS, _PLACES = 500, 1000, 60
-# Number of measured triangles searched for: one of them may contain a wrong point.
-_TRIANGLES = 2
-# Share of sound sets in which a wrong order is claimed; and of noise at which an order fits as well
-# as the best.
-_FALSE_ALARM, _AS_GOOD = 1e-3, 1e-2
+# Most pairs and triples of drawn points that are compared with a measured triangle.
+_MOST = 500
+# Chance of noise at which an order fits as well as the best.
+_AS_GOOD = 1e-2
 # From 13 points on the orders are so many that the corrected test would never reject; those that
 # noise could favour move a few points only.
 _MOST_TRIED = 10**9
@@ -47,11 +41,6 @@ class Numbering:
     # Number of orders that fit as well as the best one; 1 where it is unique. Of large sets not all
     # orders are tried, and this is a lower bound.
     equally_good: int
-
-    @property
-    def is_unique(self) -> bool:
-        """Whether geometry determines the order."""
-        return self.equally_good == 1
 
     @property
     def moved(self) -> IntArray:
@@ -82,9 +71,8 @@ def find_numbering(
 ) -> Numbering:
     """Finds the order in which measured points best fit a drawing.
 
-    Few orders are all tried. Else two large triangles of measured points are matched with the
-    drawing by their sides, and each alignment assigns the other points to their nearest ones (Kuhn
-    1955, with all points at once).
+    A large triangle of measured points is matched with the drawing by its sides, and each alignment
+    assigns the points to their nearest ones (Kuhn 1955, with all points at once).
 
     Args:
         measured: (n, 3) in any frame [m], n at least 3.
@@ -109,7 +97,7 @@ def find_numbering(
     stated_row = int(np.flatnonzero(moves == 0)[0])
     # Corrected for the number of orders among which the best one was chosen.
     tried = min(perm(len(nominal), count), _MOST_TRIED)
-    limit = f_limit(_FALSE_ALARM / tried, freedom, freedom)
+    limit = f_limit(FALSE_ALARM / tried, freedom, freedom)
     # Exchanging two measurements of one drawn point gives no other order.
     distinct = np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
     return Numbering(
@@ -125,41 +113,18 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
     """Candidate orders (k, n)."""
     from scipy.optimize import linear_sum_assignment
 
-    count, drawn = len(measured), len(nominal)
-    if perm(drawn, count) <= _EXHAUSTIVE:
-        return np.array(list(permutations(range(drawn), count)))
-    orders, free = [], np.arange(count)
-    for _ in range(min(_TRIANGLES, count // 3)):
-        # The two farthest points, and the one farthest from their line.
-        points = measured[free]
-        first, second = np.unravel_index(cdist(points, points).argmax(), (len(free),) * 2)
-        along = points[second] - points[first]
-        third = np.linalg.norm(np.cross(points - points[first], along), axis=1).argmax()
-        triangle = free[[first, second, third]]
-        free = np.setdiff1d(free, triangle)
-        triples = _similar_triples(measured[triangle], nominal)
-        placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
-        # Lower bound of any order: every point's nearest one.
-        lower = [cdist(measured, value, "sqeuclidean").min(axis=1).sum() for value in placed]
-        for value in placed[np.argsort(lower, kind="stable")[:_PLACES]]:
-            order = linear_sum_assignment(cdist(measured, value, "sqeuclidean"))[1]
-            # Realigned by all points, which is more accurate than by a triangle.
-            again = apply(align(measured, nominal[order]), nominal)
-            orders.append(linear_sum_assignment(cdist(measured, again, "sqeuclidean"))[1])
-    return np.array(orders)
-
-
-def _similar_triples(triangle: FloatArray, nominal: FloatArray) -> IntArray:
-    """Ordered triples (k, 3) of drawn points whose sides are most like a triangle's."""
-    distances, sides = cdist(nominal, nominal), cdist(triangle, triangle)
-    pairs = np.array(list(permutations(range(len(nominal)), 2)))
-    off = (distances[pairs[:, 0], pairs[:, 1]] - sides[0, 1]) ** 2
-    keep = np.argsort(off, kind="stable")[:_PAIRS]
-    pairs, off = pairs[keep], off[keep]
-    total = off[:, None]
-    for end in (0, 1):
-        total = total + (distances[pairs[:, end]] - sides[end, 2]) ** 2
-    np.put_along_axis(total, pairs, np.inf, axis=1)
-    chosen = np.argsort(total, axis=None, kind="stable")[:_TRIPLES]
-    row, third = np.unravel_index(chosen[np.isfinite(total.ravel()[chosen])], total.shape)
-    return np.column_stack([pairs[row], third])
+    # The two farthest points, and the one farthest from their line.
+    sides, distances = cdist(measured, measured), cdist(nominal, nominal)
+    a, b = np.unravel_index(sides.argmax(), sides.shape)
+    along = measured[b] - measured[a]
+    c = np.linalg.norm(np.cross(measured - measured[a], along), axis=1).argmax()
+    # The drawn points whose distances are most like those of the three.
+    off = np.abs(distances - sides[a, b])
+    first, second = np.unravel_index(off.argsort(axis=None)[:_MOST], off.shape)
+    totals = off[first, second][:, None] ** 2 + (distances[first] - sides[a, c]) ** 2
+    totals += (distances[second] - sides[b, c]) ** 2
+    pair, third = np.unravel_index(totals.argsort(axis=None)[:_MOST], totals.shape)
+    triples = np.column_stack([first[pair], second[pair], third])
+    placed = apply(align(measured[[a, b, c]][None], nominal[triples]), nominal[None])
+    costs = (cdist(measured, points, "sqeuclidean") for points in placed)
+    return np.array([linear_sum_assignment(cost)[1] for cost in costs])

@@ -1,15 +1,16 @@
 """Certainty of a placed frame: its worst directions in words, and the noise of a touch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import some_of
 from visioncal.core.transforms import skew
-from visioncal.core.types import FloatArray
-from visioncal.estimation.groups import GroupFit, State
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
+from visioncal.estimation.points import NULL_RATIO, GroupFit
 
 # Least noise of any instrument [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6
@@ -18,11 +19,11 @@ TOUCH_NOISE_M = 1e-4
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
 _ENOUGH = 6
-# Scaled eigenvalue ratio below which points do not determine a direction.
-_NULL_RATIO = 1e-8
+# Touches nearer to the origin than this share of the farthest one's distance may be on either side.
+_BEHIND = 0.1
 
 
-def counted_noise_m(fit: GroupFit[State], expected_m: float) -> float:
+def counted_noise_m(fit: GroupFit, expected_m: float) -> float:
     """Noise of a touch that counts [m]: with few degrees of freedom at least the expected one."""
     return fit.sigma if fit.freedom >= _ENOUGH else max(fit.sigma, expected_m)
 
@@ -35,6 +36,39 @@ def assumed_words(noise_m: float, stated_m: float | None) -> str:
         f" Its sigma is that of touches that repeat to {1e3 * TOUCH_NOISE_M:g} mm, which is "
         "assumed: say --touch-noise-mm as it is."
     )
+
+
+def check_sides(
+    label: str,
+    names: Sequence[str],
+    kinds: Sequence[str],
+    used: Mask,
+    along: Mapping[str, FloatArray],
+) -> None:
+    """Refuses touches of a kind that lie on both sides of the frame's origin or axis.
+
+    Args:
+        label: The first word of the message.
+        names: (n,) names of the touches.
+        kinds: (n,) their kinds.
+        used: (n,) mask of the inliers.
+        along: (n,) the coordinate that has to be positive [m], by kind.
+    """
+    for kind, coordinate in along.items():
+        rows = used & (np.array(kinds) == kind)
+        # Near to the origin noise may put them on either side.
+        limit = _BEHIND * np.abs(coordinate[rows]).max(initial=0.0)
+        behind, before = (
+            [names[row] for row in np.flatnonzero(rows & (side * coordinate > limit)).tolist()]
+            for side in (-1.0, 1.0)
+        )
+        if behind:
+            raise DataError(
+                f"{label}: the touches of kind {kind} lie on both sides: {some_of(behind)} on the "
+                f"other side than {some_of(before)}.",
+                culprits=[*behind, *before],
+                next_step="Touch again only where the axis is positive.",
+            )
 
 
 def worst_of(
@@ -82,7 +116,7 @@ def worst_of(
 
 def refuse_poor(
     label: str,
-    fit: GroupFit[State],
+    fit: GroupFit,
     worst: Callable[[FloatArray], Sequence[Direction]],
     cause: Callable[[Direction], tuple[str, str]],
     culprits: Sequence[str] = (),
@@ -108,7 +142,7 @@ def refuse_poor(
     level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
     information = fit.groups.subset(fit.used).information(level)
     directions = worst(covariance_from(information))
-    is_null = spectrum(information).ratio < _NULL_RATIO
+    is_null = spectrum(information).ratio < NULL_RATIO
     beyond = [direction for direction in directions if direction.sigma > direction.limit]
     if not beyond and not is_null:
         return

@@ -8,6 +8,10 @@ frame:
 Of a fixture the points are measured, without carriers. Of a tool the touched points are unknown,
 the carrier is `flange_from_base`, and the nominal coordinates are zero. Of an instrument's mounting
 the points are unknown on the flange, and the nominal coordinates are its readings.
+
+The residuals of a row are a group, an inlier or outlier as a whole: they share one error, whose
+covariance is the stated one plus one unknown level of noise per axis, `known + sigma^2 I`, with
+sigma by restricted maximum likelihood.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,7 +21,20 @@ import numpy as np
 
 from visioncal.core.transforms import apply_each, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.groups import Groups
+from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
+from visioncal.estimation.linalg import covariance_from, damped_step, gram, spectrum
+from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, Units
+
+# Fewest points of a frame, and fewest touches of a point.
+FEWEST_POINTS = 3
+_ROUNDS = 10
+_CONVERGED = 1e-10
+# Scaled eigenvalue ratio below which a direction is undetermined.
+NULL_RATIO = 1e-8
+# Chance that noise rejects a row, a mirror image, a scale or an order of points.
+FALSE_ALARM = 1e-3
+# Least start of the noise level [m]: it is searched from above.
+_START_SIGMA = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +44,59 @@ class Placement:
     frame: FloatArray  # (4, 4).
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3).
     scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """A problem linearised at a placement: m groups of up to d residuals, by p unknowns."""
+
+    residuals: FloatArray  # (m, d) [m], zero where not observed.
+    jacobian: FloatArray  # (m, d, p) by the unknowns' steps, zero where not observed.
+    observed: Mask  # (m, d) mask of the existing residuals: groups may be smaller than d.
+    known: FloatArray  # (m, d, d) stated covariance [m^2]; zeros where none is.
+
+    def __len__(self) -> int:
+        return len(self.residuals)
+
+    def subset(self, chosen: Mask) -> "Groups":
+        """Returns the groups of an (m,) mask."""
+        return Groups(
+            self.residuals[chosen], self.jacobian[chosen], self.observed[chosen], self.known[chosen]
+        )
+
+    def covariance(self, sigma: float) -> FloatArray:
+        """Covariances (m, d, d) at a noise level [m]; identity where nothing was observed."""
+        return self._units().total(np.log([sigma]))
+
+    def _units(self) -> Units:
+        both = self.observed[:, :, None] & self.observed[:, None, :]
+        identity = np.eye(self.observed.shape[1])
+        absent = identity * ~self.observed[:, None, :]
+        return Units(
+            self.residuals,
+            self.jacobian,
+            np.where(both, self.known, 0.0) + absent,
+            (identity * self.observed[:, None, :])[None],
+            np.zeros(1, dtype=np.int64),
+        )
+
+    def level(self, start: float) -> float:
+        """Noise by restricted maximum likelihood [m], searched from a start."""
+        model = MixedModel((self._units(),), (), np.zeros((self.jacobian.shape[2], 1)))
+        low, high = np.log([LEAST_SIGMA]), np.log([MOST_SIGMA])
+        found = model.maximised(np.log([max(start, LEAST_SIGMA)]), low, high)
+        return float(np.exp(found.logs[0]))
+
+    def information(self, sigma: float) -> FloatArray:
+        """Fisher information (p, p) of the unknowns at a noise level [m]."""
+        weighted = np.linalg.solve(self.covariance(sigma), self.jacobian)
+        return gram(self.jacobian, weighted)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom: residuals observed less directions determined."""
+        values = spectrum(gram(self.jacobian, self.jacobian)).values
+        return int(self.observed.sum() - np.sum(values > NULL_RATIO * values[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +110,8 @@ class PointProblem:
     nominal: FloatArray  # (n, 3) coordinates in the frame [m].
     stated: Mask  # (n, 3) mask of those that are stated.
     covariances: FloatArray  # (n, 3, 3) stated covariance of each point in the parent [m^2].
-    starts: Callable[["PointProblem"], Iterable[Placement]]  # See `GroupProblem.guesses`.
+    # Starts from all rows, then from small sets: near the solution if a set has no outliers.
+    guesses: Callable[[], Iterable[Placement]]
     measured: FloatArray | None = None  # (n, 3) known points in the parent [m]; None for unknown.
     # (n, 4, 4) transforms that carry unknown points to the parent, and the (n,) indices of these.
     carriers: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
@@ -48,10 +119,6 @@ class PointProblem:
     turn_rad: float = 0.0  # Standard deviation of the carriers' rotations, per axis of the parent.
     oriented: bool = True  # Whether the frame's rotation is estimated.
     scaled: bool = False  # Whether the scale is.
-
-    def guesses(self) -> Iterable[Placement]:
-        """Starts from all rows, then from small sets."""
-        return self.starts(self)
 
     def in_parent(self, state: Placement) -> FloatArray:
         """(n, 3) the points in the frame's parent [m]."""
@@ -102,3 +169,88 @@ class PointProblem:
             state.points + step[edge : edge + size].reshape(-1, 3),
             state.scale + float(step[-1]) if self.scaled else state.scale,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class GroupFit:
+    """Fit to some of the groups."""
+
+    state: Placement  # The maximum-likelihood unknowns.
+    # (p, p) of their steps; undetermined directions have a large but finite variance.
+    covariance: FloatArray
+    # Maximum-likelihood noise of one residual [m], beyond the stated one; the expected one where
+    # there are no degrees of freedom.
+    sigma: float
+    freedom: int  # Degrees of freedom: residuals used less directions determined.
+    groups: Groups  # All groups at the solution, used or not.
+    used: Mask  # (m,) mask of the groups of the fit.
+
+    @property
+    def by_points(self) -> FloatArray:
+        """(m, p, 3) derivative of the unknowns by each measured point in the parent.
+
+        It propagates an error that several points share, and that their weights do not model.
+        """
+        weights = np.linalg.inv(self.groups.covariance(self.sigma))
+        weighted = np.where(self.used[:, None, None], weights @ self.groups.jacobian, 0.0)
+        gains = -self.covariance @ np.swapaxes(weighted, 1, 2)
+        rotation = self.state.frame[:3, :3]
+        return np.asarray(gains @ np.where(self.groups.observed[:, :, None], rotation.T, 0.0))
+
+
+def fit_groups(
+    problem: PointProblem,
+    used: Mask | None = None,
+    start: Placement | None = None,
+    expected_sigma: float = 0.0,
+) -> GroupFit:
+    """Fits the unknowns and the noise level to some groups.
+
+    Args:
+        problem: The problem to fit.
+        used: (m,) mask of the groups to use; all where None.
+        start: Start; the problem's first guess where None.
+        expected_sigma: Noise level where there are no degrees of freedom [m].
+    """
+    state = next(iter(problem.guesses())) if start is None else start
+    groups = problem.linearise(state)
+    chosen = np.ones(len(groups), dtype=bool) if used is None else used
+    inside = groups.subset(chosen)
+    square = float(np.sum(inside.residuals**2)) / max(int(inside.observed.sum()), 1)
+    sigma = max(float(np.sqrt(square)), _START_SIGMA)
+    for _ in range(_ROUNDS):
+        # Weights are held during the descent: weights that follow the state would favour states
+        # with large noise.
+        weights = np.asarray(np.linalg.inv(groups.covariance(sigma)), dtype=float)
+        state = descended(problem, state, chosen, weights)
+        groups = problem.linearise(state)
+        inside = groups.subset(chosen)
+        before, sigma = sigma, inside.level(sigma)
+        if np.isclose(before, sigma, rtol=1e-4):
+            break
+    freedom = inside.freedom
+    if freedom < 1:
+        sigma = max(expected_sigma, LEAST_SIGMA)
+    covariance = covariance_from(inside.information(sigma))
+    return GroupFit(state, covariance, sigma, freedom, groups, chosen)
+
+
+def descended(
+    problem: PointProblem, start: Placement, chosen: Mask, weights: FloatArray
+) -> Placement:
+    """Minimises the residuals of some groups at (m, d, d) weights."""
+    weights = np.where(chosen[:, None, None], weights, 0.0)
+
+    def linearise(at: Placement) -> Linearised[Placement]:
+        groups = problem.linearise(at)
+        weighted = weights @ groups.jacobian
+        information = gram(groups.jacobian, weighted)
+        gradient = gram(weighted, groups.residuals)
+        cost = np.einsum("mi,mij,mj->", groups.residuals, weights, groups.residuals)
+        return Linearised(
+            at,
+            float(cost),
+            lambda damping: problem.move(at, damped_step(information, gradient, damping)),
+        )
+
+    return levenberg_marquardt(start, linearise, _CONVERGED)[0]

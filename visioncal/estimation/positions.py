@@ -11,8 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.groups import descended
-from visioncal.estimation.points import Placement, PointProblem
+from visioncal.estimation.points import Placement, PointProblem, descended
 from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 
@@ -33,16 +32,14 @@ def mounting_problem(
     """
     count = len(read)
 
-    def start(problem: PointProblem) -> list[Placement]:
-        # The flange is aligned with the readings, with the points at its origin.
-        frame = align(base_from_flange[:, :3, 3], problem.nominal)
-        return [Placement(frame, np.zeros((int(points.max()) + 1, 3)))]
-
+    # The flange is aligned with the readings, with the points at its origin.
+    frame = align(base_from_flange[:, :3, 3], read)
+    start = Placement(frame, np.zeros((int(points.max()) + 1, 3)))
     return PointProblem(
         read,
         np.ones((count, 3), dtype=bool),
         np.zeros((count, 3, 3)),
-        start,
+        lambda: (start,),
         carriers=base_from_flange,
         points=points,
     )
@@ -63,7 +60,7 @@ def find_mounting(problem: PointProblem, stops: IntArray) -> tuple[Placement, Fl
     (first,) = problem.guesses()
 
     def solve(chosen: Mask, start: Placement) -> Placement:
-        return descended(problem, start, chosen[stops], even)[0]
+        return descended(problem, start, chosen[stops], even)
 
     def sets() -> Iterator[Mask]:
         yield np.ones(count, dtype=bool)

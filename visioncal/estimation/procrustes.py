@@ -5,9 +5,6 @@ import numpy as np
 from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray
 
-# Any one reflection serves: a rotation turns it into any other.
-_MIRROR = np.array([-1.0, 1.0, 1.0])
-
 
 def align(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     """Rigid transforms that align nominal points with measured ones.
@@ -32,22 +29,6 @@ def procrustes_residual(measured: FloatArray, nominal: FloatArray) -> FloatArray
     """Sums (...,) of squared distances [m^2] after the best rigid alignment."""
     residuals = measured - apply(align(measured, nominal), nominal)
     return np.asarray(np.sum(residuals**2, axis=(-1, -2)))
-
-
-def mirrored(points: FloatArray) -> FloatArray:
-    """Reflects (..., n, 3) points, as in a left-handed frame."""
-    return np.asarray(points * _MIRROR)
-
-
-def scale_between(measured: FloatArray, nominal: FloatArray) -> float:
-    """Scale from (n, 3) nominal to (n, 3) measured points (Umeyama 1991, eq. 42).
-
-    It is 1 where the nominal points coincide.
-    """
-    centred_a, centred_b = measured - measured.mean(axis=0), nominal - nominal.mean(axis=0)
-    rotated = centred_b @ align(measured, nominal)[:3, :3].T
-    size = float(np.sum(centred_b**2))
-    return float(np.sum(centred_a * rotated)) / size if size > 0.0 else 1.0
 
 
 def spreads(points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -21,12 +21,10 @@ from visioncal.estimation.pointfit import (
     FEATURE_KINDS,
     DrawingFit,
     FeatureKind,
-    PointFit,
     PointPairs,
     fit_features,
     fit_points,
 )
-from visioncal.estimation.points import Placement
 from visioncal.estimation.procrustes import spreads
 from visioncal.frames.touches import (
     MeasuredPoints,
@@ -132,7 +130,7 @@ class PointsFit:
     kinds: Sequence[str]  # (n,) kinds of the touches, or empty texts.
     # The frame in its parent, with the points' common errors in the covariance.
     edge: Edge
-    agreement: GroupInliers[Placement]  # The inliers.
+    agreement: GroupInliers  # The inliers.
     causes: Sequence[str]  # (n,) probable cause if the point is an outlier.
     noise_m: float  # Noise of a touch per axis [m].
     # Directions of the largest sigma: of the offset, and of the rotation if it was measured.
@@ -150,7 +148,7 @@ class PointsFit:
         words, inliers = [], self.agreement
         for at, cause in enumerate(self.causes):
             off = f"{figure(1e3 * float(inliers.off_m[at]))} mm off"
-            ratio = float(np.sqrt(float(inliers.mahalanobis_sq[at]) / float(inliers.limit[at])))
+            ratio = float(np.sqrt(inliers.beyond[at]))
             if ratio > 1.0:
                 off += f", {figure(ratio)} times what the others allow"
             if inliers.doubtful[at]:
@@ -217,7 +215,6 @@ class PointsFit:
         )
         if not self.oriented:
             praise += " The rotation was not touched: it is the flange's own."
-        noise_95 = [1e3 * value for value in self.agreement.fit.sigma_95]
         return Frame(
             self.edge,
             self.oriented,
@@ -235,11 +232,7 @@ class PointsFit:
             Verdict.by(
                 [*self.findings(setting), *more, *setting.doubts], Finding(AGREEMENT, praise)
             ),
-            {
-                **({"noise_95_mm": noise_95} if np.isfinite(noise_95).all() else {}),
-                **details,
-                **setting.details,
-            },
+            {**details, **setting.details},
         )
 
 
@@ -318,8 +311,8 @@ def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Fi
         kinds=cast("tuple[FeatureKind, ...]", tuple(kinds)),
     )
     fit = fit_features(touches, setting.touch_noise_m)
-    matrix = fit.base_from_fixture
-    centroid = measured.points[fit.agreement.mask].mean(axis=0)
+    matrix = fit.fit.state.frame
+    centroid = measured.points[fit.mask].mean(axis=0)
     centre = np.asarray((centroid - matrix[:3, 3]) @ matrix[:3, :3])
     fitted = _fitted(fit, touches, measured, [_CAUSE] * len(measured), centre, setting)
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
@@ -335,7 +328,7 @@ def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Fi
 
 
 def _fitted(
-    fit: PointFit,
+    agreement: GroupInliers,
     pairs: PointPairs,
     measured: MeasuredPoints,
     causes: Sequence[str],
@@ -347,7 +340,8 @@ def _fitted(
     `causes` are as in `PointsFit`; its worst directions are those at the points' `centre` in the
     fixture [m].
     """
-    noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
+    fit = agreement.fit
+    noise_m = counted_noise_m(fit, setting.expected_m)
     covariance = measured.carried(fit.by_points, np.hypot(noise_m, pairs.nominal_sigma_m))
     thing = "Touch" if pairs.kinds else "Point"
     return PointsFit(
@@ -360,11 +354,11 @@ def _fitted(
         [f"{thing} {label}" for label in pairs.labels],
         measured.places,
         pairs.kinds or ("",) * len(measured),
-        Edge(fit.base_from_fixture, covariance),
-        fit.agreement,
+        Edge(fit.state.frame, covariance),
+        agreement,
         causes,
         noise_m,
-        worst_of(fit.base_from_fixture, covariance, "fixture", "base", centre),
+        worst_of(fit.state.frame, covariance, "fixture", "base", centre),
     )
 
 
@@ -398,7 +392,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
             causes[points.labels[at]] = f"it is where {other} is drawn{RENAMED}"
     centre = np.asarray(pairs.nominal[fit.agreement.mask].mean(axis=0))
     fitted = _fitted(
-        fit, pairs, measured, [causes[label] for label in pairs.labels], centre, setting
+        fit.agreement, pairs, measured, [causes[label] for label in pairs.labels], centre, setting
     )
     count = len(set(pairs.labels))
     several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
@@ -435,7 +429,7 @@ def _drawing_findings(
             "a part or an arm that is warm, or an arm whose links are longer or shorter than its "
             "controller has them, does that."
             if deviation < _WARM
-            else "is it the drawing of this part, in this issue and at full scale?"
+            else "is it the drawing of this part, in this issue and unit, at full scale?"
         )
         yield Finding(
             "scale",
@@ -460,7 +454,7 @@ def _drawing_findings(
                 "and a mirrored drawing would fit them as well, turned to the other side.",
                 "Check to which side its axes point, or measure a point beside the plane.",
             )
-    if not fit.numbering.is_unique:
+    if fit.numbering.equally_good > 1:
         yield Finding(
             "symmetric",
             f"The pattern of the points is symmetric: they fit the drawing in "

@@ -11,7 +11,7 @@ from visioncal.core.limits import FixtureLimits
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import Corners, Target
 from visioncal.core.verdict import remarks
-from visioncal.estimation.pointfit import FEWEST_POINTS
+from visioncal.estimation.points import FEWEST_POINTS
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.fixture import FitSettings, Words, drawn_fixture
 from visioncal.frames.frame_from_images import camera_details, view_findings

@@ -6,21 +6,18 @@ from typing import cast
 import numpy as np
 
 from visioncal.core.arguments import typed
-from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.estimation.pivot import (
     PivotFit,
-    PoseReading,
     Touches,
     TouchKind,
     fit_pivot,
-    readings_that_close,
 )
 from visioncal.estimation.placing import assumed_words
-from visioncal.frames.fixture import RENAMED, FitSettings, PointsFit, Words
+from visioncal.frames.fixture import FitSettings, PointsFit, Words
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
@@ -37,7 +34,8 @@ TOUCH_KINDS = ("point", "z", "xz")
 _NO_TOOL_M = 2e-3
 _WORDS = Words(
     noisy="Touch again with a sharp tip; an arm that was never calibrated is off by a millimetre "
-    "from posture to posture.",
+    "from posture to posture, and poses that are read wrongly (--robot-form, --robot-inverse) by "
+    "more.",
     weak="Add touches tilted by 30 to 45 degrees about other axes.",
 )
 
@@ -79,18 +77,7 @@ def touched_tool(
         rows.labels,
         tuple(numbers),
     )
-    try:
-        fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
-    except (DataError, DegenerateError) as error:
-        readings = readings_that_close(touches)
-        if not readings:
-            raise
-        inverse = readings[0].options == "--robot-inverse"
-        order = "do the columns hold it? Then add --robot-inverse."
-        hint = f"{_closing_words(readings[0])}: "
-        hint += order if inverse else "are the columns in that order?"
-        step = f"{hint} {error.next_step}".strip()
-        raise type(error)(error.message, culprits=error.culprits, next_step=step) from error
+    fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     fitted = PointsFit(
         rows.source,
         rows.labels,
@@ -99,13 +86,9 @@ def touched_tool(
         rows.kinds,
         Edge(fit.flange_from_tool, fit.covariance),
         fit.agreement,
-        [
-            "the tip had slipped, or the pose is of another moment"
-            if belongs is None
-            else f"it fits point {touches.names[belongs]!r}{RENAMED}"
-            for belongs in fit.belongs_to
-        ],
-        fit.sigma_m,
+        ["the tip had slipped, it is of another point, or the pose is of another moment"]
+        * len(touches),
+        fit.agreement.fit.sigma,
         fit.worst,
         fit.oriented,
     )
@@ -128,26 +111,14 @@ def touched_tool(
     sigmas_mm = [1e3 * float(np.sqrt(np.trace(array))) for array in fit.points_covariance]
     details = {
         "turn_deg": float(np.rad2deg(rotation_angle(turns).max())),
-        "points_m": dict(zip(names, fit.points.tolist(), strict=True)),
+        "points_m": dict(zip(names, fit.agreement.fit.state.points.tolist(), strict=True)),
         "points_sigma_mm": dict(zip(names, sigmas_mm, strict=True)),
     }
     return fitted.frame(method, more, details, setting)
 
 
-def _closing_words(best: PoseReading) -> str:
-    return (
-        f"Read {best.words}, the touches close to {figure(1e3 * best.rms_m)} mm instead of "
-        f"{figure(1e3 * best.as_read_m)} mm"
-    )
-
-
 def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator[Finding]:
-    """Findings on how the poses were read, and on too few touches."""
-    for best in readings_that_close(touches)[:1]:
-        command = f"{AGAIN} {best.options}" if best.options else ""
-        step = Remedy("If the columns are in that order, say so.", command)
-        words = f"{_closing_words(best)}."
-        yield Finding("misread_poses", words, step, probability=1.0, by_limit=True, is_fatal=True)
+    """Findings on what the poses are of, and on too few touches."""
     if fit.looks_inverse:
         yield Finding(
             "inverse_poses",
@@ -165,11 +136,12 @@ def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator
             Remedy("Set the controller's tool to zero, and write the poses of the flange."),
         )
     used = int(np.sum(fit.agreement.mask & touches.are("point")))
-    needed = setting.fewest
+    needed, sigma_m = setting.fewest, fit.agreement.fit.sigma
     if used < needed:
+        assumed = assumed_words(sigma_m, setting.touch_noise_m)
         yield Finding(
             "few_touches",
             f"Only {used} touches of a point are used: {needed} or more give the result "
-            f"something to be checked with.{assumed_words(fit.sigma_m, setting.touch_noise_m)}",
+            f"something to be checked with.{assumed}",
             Remedy("Touch the point from more directions."),
         )

@@ -11,7 +11,6 @@ from visioncal.results import Frame
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
 # Labels by the key's path; {} is the name of a point. Other keys are shown as written.
 _LABELS = {
-    "noise_95_mm": "noise, 95 %",
     "turn_deg": "largest turn between touches",
     "points_m": "{}, in the base",
     "points_sigma_mm": "{}, sigma",
@@ -36,7 +35,6 @@ _LABELS = {
     "equal_orders": "orders that fit equally well",
     "spare_points": "drawn points that were not measured",
 }
-_RANGES = {"noise_95_mm"}
 # Ratios near one: their last digits matter.
 _RATIOS = {"scale.value"}
 
@@ -76,8 +74,8 @@ def details(document: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str
         if isinstance(value, Mapping):
             yield from details(value, path)
             continue
-        digits = 6 if path in _RATIOS else 2 if path in _RANGES or "sigma" in path else 4
-        text = _text(value, digits, " to " if path in _RANGES else ", ")
+        digits = 6 if path in _RATIOS else 2 if "sigma" in path else 4
+        text = _text(value, digits, ", ")
         if text:
             # The keys of points are their names; the unit is that of their parent.
             suffix = _suffix(parent if parent in _LABELS else name)

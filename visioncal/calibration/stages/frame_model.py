@@ -17,9 +17,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
-from visioncal.estimation.solve import (
-    fit_problem,
-)
+from visioncal.estimation.solve import fit_problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +39,10 @@ class CellFrameModel:
         return tuple(arm.errors for arm in self.arms.values() if arm.errors is not None)
 
     @property
-    def has_errors(self) -> bool:
-        """Whether errors of an arm are free."""
-        return any(arm.has_free_errors(freely=self.frees_all_errors) for arm in self.arms.values())
-
-    @property
     def has_links(self) -> bool:
         """Whether errors of an arm's links are free."""
-        return self.has_errors and any(error.of_links for error in self.errors)
+        free = (arm.has_free_errors(freely=self.frees_all_errors) for arm in self.arms.values())
+        return any(free) and any(error.of_links for error in self.errors)
 
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the inliers, repeated ones sharing an error."""
