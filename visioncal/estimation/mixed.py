@@ -424,23 +424,16 @@ def profile_interval(
         lowest = local
 
     def crossing(side: float, limit: float) -> float:
-        inner, outer, width = (0.0, 0.0), None, _FIRST_WIDTH
-        while True:
+        width = _FIRST_WIDTH
+        for _ in range(_ITERATIONS):
             # The root is about linear in the width.
             root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
-            if root < _SURPRISE_95:
-                inner = width, root
-            else:
-                outer = width, root
-            if outer is not None:
-                fraction = (_SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
-                next_width = inner[0] + fraction * (outer[0] - inner[0])
-            elif width == _WIDEST:
+            if width == _WIDEST and root < _SURPRISE_95:
                 return limit
-            else:
-                next_width = min(width * min(1.1 * _SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
-            if not abs(next_width - width) >= _EXACT:
-                return float(np.exp(middle + side * next_width))
-            width = next_width
+            before = width
+            width = min(width * min(_SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
+            if not abs(width - before) >= _EXACT:
+                break
+        return float(np.exp(middle + side * width))
 
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))

@@ -18,6 +18,7 @@ other sources are those of the calibration again. How much of the robot's noise 
 unknown, and averaged over.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -113,8 +114,8 @@ def evidence_of(
     sizes_m, widest = SIZES_M if len(cause.units) else SIZES_M[:1], SIZES_M[-1] * cause.units
     values = np.zeros(len(cause.units)) if cause.start is None else cause.start
     for _ in range(_ROUNDS):
-        stops = _linearised(problem, belief, cause, values)
-        variants = {trial: stops.whitened(*trial) for trial in product(cause.noise_factors, shares)}
+        trials = tuple(product(cause.noise_factors, shares))
+        variants = _whitened(problem, belief, cause, values, trials)
         likeliest = max(
             variants,
             key=lambda trial: variants[trial].score(widest, belief.freedom) + prior_of[trial[1]],
@@ -169,36 +170,35 @@ class _White:
         return -covariance @ (self.jacobian.T @ self.residuals), covariance
 
 
-@dataclass(frozen=True, eq=False)
-class _Linearised:
-    """Residuals of n observations, linearised in a cause's values, with what they depend on."""
-
-    residuals: FloatArray  # (6 n,) at zero values, by the linearisation.
-    by_cause: FloatArray  # (6 n, p).
-    by_unknowns: FloatArray  # (n, 6, k) by the calibration's unknowns.
-    by_flange: FloatArray  # (n, 6, 6) by the robot's noise.
-    sensor: FloatArray  # (n, 6, 6) covariance of the sensor's noise.
-    belief: CalibrationPosterior
-    stops: IntArray  # (n,) their stops.
-
-    def whitened(self, factor: float, new_share: float) -> _White:
-        """The residuals whitened, for a factor on the noise and a share that does not repeat."""
-        belief, count = self.belief, len(self.stops)
-        again = belief.repeated
-        repeats = np.zeros(0, dtype=np.int64) if again is None else again.repeats
-        rows = np.append(np.arange(count), repeats)
-        stops = self.stops if again is None else again.stops
-        one_stop = (stops[:, None] == stops).astype(float)
+def _whitened(
+    problem: Problem,
+    belief: CalibrationPosterior,
+    cause: ChangeHypothesis,
+    values: FloatArray,
+    trials: Sequence[tuple[float, float]],
+) -> dict[tuple[float, float], _White]:
+    """Whitens for factors on the noise and shares of it that do not repeat, at (p,) values."""
+    without, count, again = undone(problem, cause, values), len(problem), belief.repeated
+    linear = without.linear(with_change(belief.state, cause))
+    by_cause = linear.jacobian[:, :, len(belief.covariance) :].reshape(6 * count, len(values))
+    by_unknowns = linear.jacobian[:, :, : len(belief.covariance)]
+    repeats = np.zeros(0, dtype=np.int64) if again is None else again.repeats
+    rows = np.append(np.arange(count), repeats)
+    stops = problem.observations.stops if again is None else again.stops
+    one_stop = (stops[:, None] == stops).astype(float)
+    by_flange = linear.by_errors[rows] * np.repeat(belief.noise.robots[0], 3)
+    products = np.einsum("iab,jcb->iajc", by_flange, by_flange)
+    size, end = 6 * len(rows), 6 * count
+    sensor = block_diag(*without.covariance(belief.noise)[rows]) + _LEAST_SIGMA**2 * np.eye(size)
+    whitened = {}
+    for factor, new_share in trials:
         shared = one_stop if again is None else again.correlation
         weights = new_share * one_stop + (1.0 - new_share) * shared
         weights[:count, :count] += (factor**2 - 1.0) * one_stop[:count, :count]
-        by_flange = self.by_flange[rows] * np.repeat(belief.noise.robots[0], 3)
-        errors = np.einsum("ij,iab,jcb->iajc", weights, by_flange, by_flange)
-        size, end = 6 * len(rows), 6 * count
-        covariance = errors.reshape(size, size) + block_diag(*self.sensor[rows])
-        covariance += _LEAST_SIGMA**2 * np.eye(size)
-        jacobian = self.by_unknowns.reshape(end, len(belief.covariance))
-        residuals, total, by_noise = self.residuals, covariance[:end, :end], belief.covariance
+        covariance = sensor + (weights[:, None, :, None] * products).reshape(size, size)
+        jacobian, by_noise = by_unknowns.reshape(end, -1), belief.covariance
+        residuals = linear.residuals.reshape(-1) - by_cause @ values
+        total = covariance[:end, :end]
         if again is not None:
             by_noise = again.by_noise
             cross = covariance[end:, :end]
@@ -207,33 +207,14 @@ class _Linearised:
             total = total - gain @ cross
             elsewhere = jacobian * np.repeat(~np.isin(np.arange(count), repeats), 6)[:, None]
             total += elsewhere @ (belief.covariance - by_noise) @ elsewhere.T
-            jacobian = jacobian - gain @ self.by_unknowns[repeats].reshape(size - end, -1)
+            jacobian = jacobian - gain @ by_unknowns[repeats].reshape(size - end, -1)
         root = cholesky(total + jacobian @ by_noise @ jacobian.T, lower=True)
-        log_det = 2.0 * float(np.log(np.diag(root)).sum())
-        return _White(
+        whitened[factor, new_share] = _White(
             solve_triangular(root, residuals, lower=True),
-            solve_triangular(root, self.by_cause, lower=True),
-            log_det,
+            solve_triangular(root, by_cause, lower=True),
+            2.0 * float(np.log(np.diag(root)).sum()),
         )
-
-
-def _linearised(
-    problem: Problem, belief: CalibrationPosterior, cause: ChangeHypothesis, values: FloatArray
-) -> _Linearised:
-    """Linearises at some values (p,) of a cause."""
-    without, calibrated = undone(problem, cause, values), len(belief.covariance)
-    linear = without.linear(with_change(belief.state, cause))
-    jacobian = linear.jacobian
-    by_cause = jacobian[:, :, calibrated:].reshape(6 * len(problem), len(values))
-    return _Linearised(
-        linear.residuals.reshape(-1) - by_cause @ values,
-        by_cause,
-        jacobian[:, :, :calibrated],
-        linear.by_errors,
-        without.covariance(belief.noise),
-        belief,
-        problem.observations.stops,
-    )
+    return whitened
 
 
 def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Problem:
