@@ -14,7 +14,7 @@ from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation.chain import chain, robot_part
-from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
+from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import (
@@ -345,10 +345,8 @@ def test_linear_algebra_says_what_it_sees():
     tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]
     information = tall.T @ tall
     np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
-    assert spectrum(information).ratio > 0.1  # the units of the columns do not matter
+    assert eigenvalue_shares(information)[0] > 0.1  # the units of the columns do not matter
     tall[:, 3] = tall[:, 0]
-    assert spectrum(tall.T @ tall).ratio < 1e-12
-    null = spectrum(tall.T @ tall).vectors[:, 0]
-    np.testing.assert_allclose(np.abs(null), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
+    assert eigenvalue_shares(tall.T @ tall)[0] < 1e-12
     step = damped_step(information, information @ np.ones(4), 0.0)
     np.testing.assert_allclose(step, -np.ones(4), rtol=1e-8)

@@ -13,7 +13,6 @@ from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.outliers import inliers_and_moves, refine_inliers
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
-from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -208,9 +207,7 @@ def test_the_fit_is_as_good_as_its_covariance_says():
 def test_what_is_left_of_the_observations_is_their_redundancy():
     cell, problem = problem_of(5)
     fit = fit_problem(problem, true_state(cell, problem.tree))
-    squares, left = posterior(
-        problem, fit.state, fit.noise, robot_likelihood(problem, fit.state, fit.noise).reduced
-    )
+    squares, left = posterior(problem, fit.state, fit.noise)
     # Chi-square of some 300: a standard deviation of 8 %.
     assert left.sum() > 200
     assert squares.sum() == pytest.approx(left.sum(), rel=0.3)

@@ -14,7 +14,7 @@ from visioncal.estimation.mixed import (
     PriorInformation,
 )
 from visioncal.estimation.normal_equations import (
-    equations_and_cost,
+    Whitening,
     normal_equations,
 )
 from visioncal.estimation.problem_parts import ROBOT, Effect
@@ -160,7 +160,8 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     jacobian, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
     known = problem.prior_information(fit.state)
     weighted = np.linalg.solve(noise, jacobian)
-    information, gradient, cost = equations_and_cost(problem, fit.state, fit.noise)
+    whitening = Whitening.of(problem, fit.noise, linear.by_errors)
+    information, gradient, cost = whitening.equations(problem, fit.state, linear)
     scale = np.sqrt(np.diag(information))
     # Rounding, of numbers whose squares differ by ten powers of ten.
     np.testing.assert_allclose(

@@ -43,13 +43,9 @@ class _Gain:
         fisher = fisher_information(problem, state, noise)
         columns = covariance_among(fisher, problem.counted)[:, :count]
         linear = problem.linear(state, ideal=True)
-        jacobian, white = linear.jacobian @ columns, Whitening.of(problem, noise, linear.by_errors)
-        rows, shared = white.weights @ jacobian, white.units >= 0
-        units, taken = white.units[shared], white.taken[shared]
-        by_unit = np.zeros((white.count, white.taken.shape[1], columns.shape[1]))
-        np.add.at(by_unit, units, taken @ jacobian[shared])
-        rows[shared] -= np.swapaxes(taken, 1, 2) @ by_unit[units]
-        unit_of, errors = problem.units[0], np.zeros_like(by_unit)
+        white = Whitening.of(problem, noise, linear.by_errors)
+        rows, unit_of = white.inverse(linear.jacobian @ columns), problem.units[0]
+        errors = np.zeros((white.count, linear.by_errors.shape[2], columns.shape[1]))
         own = unit_of >= 0
         by_errors = np.swapaxes(linear.by_errors[own], 1, 2)
         np.add.at(errors, unit_of[own], by_errors @ rows[own])

@@ -1,7 +1,6 @@
 """Linear algebra of least squares: solving, covariance, and the spectrum of the information."""
 
 import math
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,28 +17,14 @@ _LEAST_PIVOT_SQ = 1e-11
 _VANISHED = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Eigenvalues of an information matrix scaled to a unit diagonal.
+def eigenvalue_shares(information: FloatArray) -> FloatArray:
+    """Eigenvalues (n,), ascending, of a matrix scaled to a unit diagonal, over the largest.
 
     The scaling makes them independent of the units of the parameters.
     """
-
-    values: FloatArray  # (n,) ascending, non-negative.
-    vectors: FloatArray  # (n, n) unit vectors in the parameters' own units, one per column.
-
-    @property
-    def ratio(self) -> float:
-        """Smallest over largest eigenvalue; 0 if a direction is unobservable."""
-        return float(self.values[0] / self.values[-1]) if self.values[-1] > 0 else 0.0
-
-
-def spectrum(information: FloatArray) -> Spectrum:
-    """Computes the scaled spectrum of an (n, n) information matrix."""
     scale = _scale(information)
-    values, vectors = _eigen(information * np.outer(scale, scale))
-    directions = vectors * scale[:, None]
-    return Spectrum(np.maximum(values, 0.0), directions / np.linalg.norm(directions, axis=0))
+    values = np.maximum(_eigen(information * np.outer(scale, scale))[0], 0.0)
+    return np.asarray(values / max(values[-1], np.finfo(float).tiny))
 
 
 def covariance_from(information: FloatArray) -> FloatArray:
@@ -114,16 +99,6 @@ def gram(left: _Floats, right: _Floats) -> FloatArray:
     """
     rows = left.reshape(math.prod(left.shape[:-1]), left.shape[-1])
     return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
-
-
-def weighted_gram(blocks: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted Gram matrix (p, p) of (m, d, p) blocks; rows without a positive weight are skipped.
-
-    A product of a matrix with its own transpose takes half the time of a general product.
-    """
-    rows = weights > 0.0
-    half = np.sqrt(weights[rows])[:, None] * blocks[rows]
-    return np.asarray(half.T @ half)
 
 
 def damped_step(

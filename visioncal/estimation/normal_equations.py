@@ -64,6 +64,15 @@ class Whitening:
         taken[shared] = (np.linalg.inv(factor) @ roots)[units[shared]] @ weighted
         return cls(weights, taken, units, len(members))
 
+    def inverse(self, rows: FloatArray) -> FloatArray:
+        """(n, 6, c) product of the inverse covariance with (n, 6, c)."""
+        product, shared = self.weights @ rows, self.units >= 0
+        units, taken = self.units[shared], self.taken[shared]
+        by_unit = np.zeros((self.count, self.taken.shape[1], rows.shape[2]))
+        np.add.at(by_unit, units, taken @ rows[shared])
+        product[shared] -= np.swapaxes(taken, 1, 2) @ by_unit[units]
+        return product
+
     def equations(
         self, problem: Problem, state: State, linear: Linear
     ) -> tuple[FloatArray, FloatArray, float]:
@@ -166,18 +175,6 @@ def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (vectors * inverse[:, None, :]) @ transposed, (vectors * null[:, None, :]) @ transposed
 
 
-def total_equations(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Information (p, p), gradient (p,) and cost for (u, 6 w, 6 w) flange error covariances."""
-    weights = np.linalg.inv(reduced.covariance + errors)
-    weighted = weights @ reduced.jacobian
-    cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
-    return (
-        reduced.information + gram(reduced.jacobian, weighted),
-        reduced.gradient + gram(weighted, reduced.errors),
-        reduced.cost + float(cost),
-    )
-
-
 def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArray:
     """Fisher information (p, p) on the unknowns, at poses for which all chains close exactly.
 
@@ -204,17 +201,6 @@ def normal_equations(
         ideal: See `Problem.linear`.
         among: (n,) mask of the observations to include; all if None.
     """
-    return equations_and_cost(problem, state, noise, ideal=ideal, among=among)[:2]
-
-
-def equations_and_cost(
-    problem: Problem,
-    state: State,
-    noise: Noise,
-    *,
-    ideal: bool = False,
-    among: Mask | None = None,
-) -> tuple[FloatArray, FloatArray, float]:
-    """`normal_equations`, and the whitened squared error."""
     linear = problem.linear(state, ideal=ideal)
-    return Whitening.of(problem, noise, linear.by_errors, among).equations(problem, state, linear)
+    whitening = Whitening.of(problem, noise, linear.by_errors, among)
+    return whitening.equations(problem, state, linear)[:2]

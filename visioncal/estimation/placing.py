@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import covariance_from, spectrum
+from visioncal.estimation.linalg import covariance_from, eigenvalue_shares
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 from visioncal.estimation.points import NULL_RATIO, GroupFit
 
@@ -142,7 +142,7 @@ def refuse_poor(
     level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
     information = fit.groups.subset(fit.used).information(level)
     directions = worst(covariance_from(information))
-    is_null = spectrum(information).ratio < NULL_RATIO
+    is_null = eigenvalue_shares(information)[0] < NULL_RATIO
     beyond = [direction for direction in directions if direction.sigma > direction.limit]
     if not beyond and not is_null:
         return

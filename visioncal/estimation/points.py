@@ -22,7 +22,7 @@ import numpy as np
 from visioncal.core.transforms import apply_each, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import covariance_from, damped_step, gram, spectrum
+from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares, gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, Units
 
 # Fewest points of a frame, and fewest touches of a point.
@@ -95,8 +95,8 @@ class Groups:
     @property
     def freedom(self) -> int:
         """Degrees of freedom: residuals observed less directions determined."""
-        values = spectrum(gram(self.jacobian, self.jacobian)).values
-        return int(self.observed.sum() - np.sum(values > NULL_RATIO * values[-1]))
+        shares = eigenvalue_shares(gram(self.jacobian, self.jacobian))
+        return int(self.observed.sum() - np.sum(shares > NULL_RATIO))
 
 
 @dataclass(frozen=True, eq=False)

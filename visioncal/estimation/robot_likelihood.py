@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance_root, gram, weighted_gram
+from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.estimation.mixed import (
     LEAST_SIGMA,
     MOST_SIGMA,
@@ -98,7 +98,11 @@ class RobotLikelihood:
         return np.exp(found.logs).reshape(start.shape), found.value
 
     def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
-        """Estimates the robots' levels (r, 2); see `robot_levels`."""
+        """Estimates the robots' levels (r, 2); see `estimate_noise`.
+
+        Returns:
+            The levels, and the negative restricted log-likelihood there.
+        """
         if from_above:
             return self.white
         return self._levels(np.maximum(self.before, _ABOVE_NOTHING))
@@ -226,7 +230,8 @@ class RobotLikelihood:
         for index, scale in enumerate(scales.tolist()):
             grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
             weighted = errors / grown
-            root = covariance_root(information + weighted_gram(jacobian, 1.0 / grown))
+            half = jacobian / np.sqrt(grown)[..., None]
+            root = covariance_root(information + gram(half, half))
             projected = root.T @ (gradient + gram(jacobian, weighted))
             squares = float(np.sum(errors * weighted) - projected @ projected)
             determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])

@@ -23,11 +23,9 @@ from visioncal.estimation.linalg import (
     squared_lengths,
 )
 from visioncal.estimation.normal_equations import (
-    Reduced,
     Whitening,
     fisher_information,
     normal_equations,
-    total_equations,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
@@ -213,12 +211,11 @@ def estimate_noise(
         from_above: Whether the search for robots' levels starts above the residuals instead of at
             the initial levels: a search from too low a start may stay there.
     """
-    robots = robot_likelihood(problem, state, noise)
-    noise = replace(noise, robots=robots.levels(from_above=from_above)[0])
+    robots = robot_likelihood(problem, state, noise).levels(from_above=from_above)[0]
+    noise = replace(noise, robots=robots)
     if not len(noise.sensors):
         return noise
-    # The reduction depends on the sensors' noise only, which has not changed yet.
-    squares, redundancies = posterior(problem, state, noise, robots.reduced)
+    squares, redundancies = posterior(problem, state, noise)
     sensors = noise.sensors.copy()
     for sensor in range(len(sensors)):
         observed = (problem.observations.sensors == sensor) & (problem.repeat_counts == 1.0)
@@ -231,64 +228,24 @@ def estimate_noise(
     return replace(noise, sensors=sensors)
 
 
-def robot_levels(
-    problem: Problem, state: State, noise: Noise, *, from_above: bool
-) -> tuple[FloatArray, float]:
-    """Estimates the robots' levels (r, 2); see `estimate_noise`.
-
-    Returns:
-        The levels, and the negative restricted log-likelihood there.
-    """
-    return robot_likelihood(problem, state, noise).levels(from_above=from_above)
-
-
-def posterior(
-    problem: Problem, state: State, noise: Noise, reduced: Reduced
-) -> tuple[FloatArray, FloatArray]:
+def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
     """Squared posterior residuals of the observations, and their redundancies.
-
-    Args:
-        problem: The observations.
-        state: The unknowns.
-        noise: Noise levels.
-        reduced: Result of `reduce` for these.
 
     Returns:
         (n,) squared residuals in units of their own noise, after a Gauss-Newton step and less the
         estimated flange errors, and (n,) their redundancies, the expected values of the squares.
     """
-    own = problem.covariance(noise)
-    weights, linear = np.linalg.inv(own), problem.linear(state)
-    errors = problem.error_covariance(noise)
-    information, gradient, _ = total_equations(reduced, errors)
+    own, linear = problem.covariance(noise), problem.linear(state)
+    whitening = Whitening.of(problem, noise, linear.by_errors)
+    information, gradient, _ = whitening.equations(problem, state, linear)
     fitted = covariance_among(information, problem.moving)
-    step = -fitted @ gradient
-    unit_of, _ = problem.units
-    residuals, absorbed = linear.residuals.copy(), np.zeros_like(weights)
-    # Posterior of the flange errors from their prior and their observations.
-    gain = errors @ np.linalg.inv(reduced.covariance + errors)
-    flange_errors = (gain @ (reduced.errors + reduced.jacobian @ step)[:, :, None])[:, :, 0]
-    # Flange errors depend on all unknowns, an observation on few: this product is formed by unit.
-    response = gain @ reduced.jacobian
-    common = (response.reshape(-1, response.shape[2]) @ fitted).reshape(response.shape)
-    remaining = errors - gain @ errors + common @ np.swapaxes(response, 1, 2)
-    for block in linear.blocks:
-        jacobian, columns = block.jacobian, block.columns
-        products = jacobian.reshape(-1, len(columns)) @ fitted[np.ix_(columns, columns)]
-        absorbed[block.rows] = products.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
-        residuals[block.rows] += jacobian @ step[columns]
-        in_unit = unit_of[block.rows] >= 0
-        rows = block.rows[in_unit]
-        by_errors, units = linear.by_errors[rows], unit_of[rows]
-        transposed = np.swapaxes(by_errors, 1, 2)
-        residuals[rows] -= (by_errors @ flange_errors[units][:, :, None])[:, :, 0]
-        cross = jacobian[in_unit] @ np.swapaxes(common[:, :, columns][units], 1, 2) @ transposed
-        absorbed[rows] += (
-            by_errors @ remaining[units] @ transposed - cross - np.swapaxes(cross, 1, 2)
-        )
-    squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
-    directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
-    return squares, directions - np.einsum("nij,nji->n", weights, absorbed)
+    left = linear.residuals[:, :, None] - linear.jacobian @ (fitted @ gradient)[:, None]
+    pulled, weighted = whitening.inverse(left), whitening.inverse(linear.jacobian)
+    remaining = whitening.weights - np.swapaxes(whitening.taken, 1, 2) @ whitening.taken
+    remaining -= weighted @ fitted @ np.swapaxes(weighted, 1, 2)
+    squares = np.sum(pulled * (own @ pulled), axis=(1, 2))
+    unmeasured = np.where(problem.observations.has_rotation, 0.0, 3.0)
+    return squares, np.einsum("nij,nji->n", own, remaining) - unmeasured
 
 
 def mahalanobis_sq(
@@ -376,16 +333,10 @@ def equations_from(
         stops, without priors.
     """
     stops, linear = problem.observations.stops, problem.linear(solution.state)
-    whitening = Whitening.of(problem, solution.noise, linear.by_errors)
     augmented = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
+    weighted = Whitening.of(problem, solution.noise, linear.by_errors).inverse(augmented)
     total = np.zeros((len(asked), augmented.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
-        at_stop = np.flatnonzero(stops == stop)
-        rows, units = augmented[at_stop], whitening.units[at_stop]
-        total = total + gram(rows[:, :, asked], whitening.weights[at_stop] @ rows)
-        for unit in np.unique(units[units >= 0]).tolist():
-            in_unit = units == unit
-            pulled = np.swapaxes(whitening.taken[at_stop[in_unit]], 1, 2)
-            taken = gram(pulled, rows[in_unit])
-            total -= taken[:, asked].T @ taken
+        at_stop = stops == stop
+        total = total + gram(augmented[at_stop][:, :, asked], weighted[at_stop])
         yield stop, total[:, :-1], total[:, -1]

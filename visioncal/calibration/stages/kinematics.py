@@ -24,11 +24,11 @@ from visioncal.estimation.armmodel import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
     left_out_residuals,
-    robot_levels,
     starting_noise,
 )
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
@@ -248,7 +248,7 @@ def select_errors(
             # A shifted zero has a gain of its own.
             nominal = LevelFit.of(stated, state, robot, noise, None)
             values = [
-                robot_levels(part, level.fit.state, starting_noise(part), from_above=True)[1]
+                robot_likelihood(part, level.fit.state, starting_noise(part)).white[1]
                 for part, level in ((stated, nominal), (problem, start))
             ]
             gain = 2.0 * (values[0] - values[1])

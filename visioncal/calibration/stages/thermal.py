@@ -26,7 +26,7 @@ from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import Solution, fit_problem, robot_levels, starting_noise
+from visioncal.estimation.solve import Solution, fit_problem, starting_noise
 from visioncal.results.arm import (
     DriftPoint,
     DriftResidual,
@@ -355,7 +355,7 @@ def find_drift(
         warm = drift.applied_to(problem, robot, stops, mine)
         state = State(fit.state.edges, np.append(fit.state.values[:-size], drift.values))
         costs = [
-            robot_levels(part, at, fit.noise, from_above=True)[1]
+            robot_likelihood(part, at, fit.noise).white[1]
             for part, at in ((problem, cold.state), (warm, state))
         ]
         information = fisher_information(warm, state, fit.noise)
