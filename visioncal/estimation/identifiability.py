@@ -126,32 +126,28 @@ class Identifiability:
         )
 
 
-@dataclass(frozen=True)
-class Indices:
+def observability_indices(values: FloatArray, stops: int) -> dict[str, float]:
     """Observability indices, by which sets of stops are compared; larger is better.
 
     With the singular values s_1 >= ... >= s_L of the determined directions, over m stops:
+
+    - o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14), the noise ellipsoid's volume
+    - o2: `s_L / s_1` (Driels and Pathre 1990), one over the `condition`
+    - o3: `s_L` (Nahvi, Hollerbach and Hayward 1994)
+    - o4: `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9)
+    - o5: `1 / (1 / s_1 + ... + 1 / s_L)` (Sun and Hollerbach 2008, of A-optimality)
     """
-
-    # `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the noise ellipsoid's volume.
-    o1: float
-    o2: float  # `s_L / s_1`, one over the condition number (Driels and Pathre 1990).
-    o3: float  # `s_L` (Nahvi, Hollerbach and Hayward 1994).
-    o4: float  # `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9).
-    o5: float  # `1 / (1 / s_1 + ... + 1 / s_L)` (Sun and Hollerbach 2008, of A-optimality).
-
-    @property
-    def condition(self) -> float:
-        """Largest over smallest singular value."""
-        return 1.0 / self.o2
-
-    @classmethod
-    def of(cls, values: FloatArray, stops: int) -> "Indices":
-        """Computes the indices from (L,) nonzero singular values, and the number of stops."""
-        least, greatest = float(values.min()), float(values.max())
-        mean = float(np.exp(np.mean(np.log(values))) / np.sqrt(stops))
-        total = float(np.sum(1.0 / values))
-        return cls(mean, least / greatest, least, least**2 / greatest, 1.0 / total)
+    if not len(values):
+        return {}
+    least, greatest = float(values.min()), float(values.max())
+    return {
+        "condition": greatest / least,
+        "o1": float(np.exp(np.mean(np.log(values))) / np.sqrt(stops)),
+        "o2": least / greatest,
+        "o3": least,
+        "o4": least**2 / greatest,
+        "o5": 1.0 / float(np.sum(1.0 / values)),
+    }
 
 
 def null_words(jacobian: Jacobians, named: Sequence[Parameter], robot: Robot) -> Iterator[str]:

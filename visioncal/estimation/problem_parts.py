@@ -46,9 +46,11 @@ class Observations:
 
     def take(self, rows: IntArray) -> "Observations":
         """Returns the observations of (m,) rows."""
+        names = (self.observers, self.observed)
+        observers, observed = (tuple(part[index] for index in rows.tolist()) for part in names)
         return Observations(
-            tuple(self.observers[index] for index in rows.tolist()),
-            tuple(self.observed[index] for index in rows.tolist()),
+            observers,
+            observed,
             self.stops[rows],
             self.sensors[rows],
             self.measured[rows],

@@ -99,22 +99,19 @@ class CornerProblem:
         stack = CornerStack.of(corners, positions)
         if stack.stated_px is None:
             stack = replace(stack, weights=None)
-        stated = [stated_lens_sigma(scene), *map(stated_board_sigma, scene.targets)]
+        boards = [*map(stated_board_sigma, scene.targets)]
         problem = cls(
             scene,
             stack,
             positions,
             boards_basis(scene.targets),
-            np.concatenate(stated),
+            np.concatenate([_lens_sigma(scene, is_refined=False), *boards]),
             np.array([shares.get(view, 1.0) for view in corners]),
         )
         problem = replace(problem, board_sizes=(BoardSizes(),) * len(problem.printed))
-        if scene.mode != "refine" or scene.estimated or not problem.has_spare_corners:
-            return problem
         # Corners too few to judge by leave a lens as it is.
-        return replace(
-            problem, stated_sigma=np.concatenate([refined_lens_sigma(scene), *stated[1:]])
-        )
+        lens = _lens_sigma(scene, is_refined=scene.mode == "refine" and problem.has_spare_corners)
+        return replace(problem, stated_sigma=np.concatenate([lens, *boards]))
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
         """Returns the problem with lens errors beyond the model."""
@@ -222,15 +219,13 @@ class CornerProblem:
         return self.stack.sigma_px(compressed.residuals, self.unknowns(compressed))
 
 
-def stated_lens_sigma(scene: Scene) -> FloatArray:
-    """(k,) stated sigmas of a camera's intrinsics; inf where they are estimated."""
+def _lens_sigma(scene: Scene, *, is_refined: bool) -> FloatArray:
+    """(k,) prior sigmas of a camera's intrinsics; inf where they are estimated."""
     count = len(scene.camera.distortion)
     if scene.estimated:
         return np.full(4 + count, np.inf)
-    return np.repeat([scene.matrix_sigma_px or 0.0, 0.0], [4, count])
-
-
-def refined_lens_sigma(scene: Scene) -> FloatArray:
-    """(k,) prior sigmas of given intrinsics that are to be refined."""
-    matrix = scene.matrix_sigma_px or _FOCAL_SHARE * float(scene.camera.matrix[:2].max())
-    return np.repeat([matrix, _DISTORTION_SIGMA], [4, len(scene.camera.distortion)])
+    matrix, distortion = scene.matrix_sigma_px or 0.0, 0.0
+    if is_refined:
+        matrix = scene.matrix_sigma_px or _FOCAL_SHARE * float(scene.camera.matrix[:2].max())
+        distortion = _DISTORTION_SIGMA
+    return np.repeat([matrix, distortion], [4, count])

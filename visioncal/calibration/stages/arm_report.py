@@ -17,10 +17,10 @@ from visioncal.estimation.armmodel import RIGID
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.identifiability import (
     Identifiability,
-    Indices,
     Jacobians,
     missing_parameters,
     null_words,
+    observability_indices,
 )
 from visioncal.estimation.parameters import (
     free_parameters,
@@ -184,8 +184,6 @@ def add_parameters(
                 sigma=max(sigma, 0.0 if by_row.any() else links * parameter.unit),
             )
         )
-    indices = Indices.of(counts.values, len(arm.stops)) if len(counts.values) else None
-    figures = {} if indices is None else {"condition": indices.condition, **vars(indices)}
     maps = (
         np.column_stack([model.robot.base_from_flange(q)[:, :3, 3], mm])[:_PLACES].tolist()
         for q, mm in ((anywhere, sigmas_mm), (near, near_mm))
@@ -204,7 +202,7 @@ def add_parameters(
             columns=counts.columns,
             identifiable=counts.identifiable,
             determined=counts.determined,
-            **figures,
+            **observability_indices(counts.values, len(arm.stops)),
         ),
         not_determined=tuple(not_determined),
     )

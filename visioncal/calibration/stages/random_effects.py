@@ -59,7 +59,7 @@ def random_effects(
             continue
         candidates = [*_of_flange(problem, robot, stops)]
         if corners is not None and rows is not None and len(arms) == 1:
-            candidates += _of_sensors(problem, corners, rows, stops)
+            candidates += _of_sensors(problem, robot, stops, corners, rows)
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
         found += find_random_effects(problem, fit.state, fit.noise, candidates, [nuisance])
@@ -78,7 +78,7 @@ def _of_flange(
     seen = Stops(poses, _time(stops, len(poses)), np.zeros((0, 6)))
     for kind in RANDOM_EFFECTS:
         if not kind.is_of_sensor:
-            effect = effect_of(kind, robot, seen, None)
+            effect = effect_of(kind, robot, seen)
             columns = _without_constants(effect.flange_jacobian[robot], poses, stops)
             yield kind, replace(effect, flange_jacobian={robot: columns})
 
@@ -99,22 +99,19 @@ def _without_constants(columns: FloatArray, poses: FloatArray, stops: IntArray) 
 
 
 def _of_sensors(
-    problem: Problem, corners: LinearisedCorners, rows: IntArray, stops: IntArray
+    problem: Problem, robot: str, stops: IntArray, corners: LinearisedCorners, rows: IntArray
 ) -> Iterator[tuple[RandomEffect, Effect]]:
-    time = _time(stops, int(stops[-1]) + 1)
+    time = _time(stops, len(problem.poses[robot]))[problem.observations.stops]
     optics = corners.camera_parameters
-    for (name, camera), compressed in zip(
-        ((name, optics.camera(name)) for name in optics.problems), corners.compressed, strict=True
-    ):
-        views = optics.rows(name)
+    for name, compressed in zip(optics.problems, corners.compressed, strict=True):
+        views, by_focal = optics.rows(name), np.zeros((len(rows), 6))
         is_mine = (rows >= views.start) & (rows < views.stop)
-        by_focal = compressed.by_shared[rows[is_mine] - views.start, :, :2] @ camera.matrix[:2]
-        at = np.minimum(problem.observations.stops[is_mine], len(time) - 1)
-        places = np.where(is_mine, np.cumsum(is_mine) - 1, -1)
-        seen = Stops(np.zeros((0, 4, 4)), time[at], by_focal)
+        by_shared = compressed.by_shared[rows[is_mine] - views.start, :, :2]
+        by_focal[is_mine] = by_shared @ optics.camera(name).matrix[:2]
+        seen = Stops(np.zeros((0, 4, 4)), time, by_focal)
         for kind in RANDOM_EFFECTS:
             if kind.is_of_sensor and is_mine.any():
-                yield kind, effect_of(kind, name, seen, places)
+                yield kind, effect_of(kind, name, seen)
 
 
 def random_effect_rms(problem: Problem, state: State, robot: str) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 from visioncal.estimation.mixed import (
     LEAST_SIGMA,
     MOST_SIGMA,
@@ -32,11 +32,11 @@ _ABOVE = 3.0
 
 @dataclass(frozen=True)
 class Stops:
-    """What a robot's errors may depend on, at its s stops."""
+    """What errors may depend on, at a robot's s stops, or at s observations of a sensor."""
 
     base_from_flange: FloatArray  # (s, 4, 4) its poses.
     time: FloatArray  # (s,) share of the session that is over, from 0 to 1.
-    # (s, 6) derivative of the measured pose by the relative focal length; of observations.
+    # (s, 6) derivative of the measured pose by the relative focal length; zero of other cameras.
     by_focal: FloatArray
 
 
@@ -105,19 +105,10 @@ def find_random_effects(
     return tuple(chosen)
 
 
-def effect_of(kind: RandomEffect, robot: str, stops: Stops, rows: IntArray | None) -> Effect:
-    """A kind's columns as an effect without a prior; `rows` are those of a sensor's observations.
-
-    Args:
-        kind: The kind.
-        robot: The robot, or the camera of a sensor's.
-        stops: What it depends on.
-        rows: (n,) index of the columns of each observation; -1 for none. None for a flange.
-    """
-    columns = kind.columns(stops)
+def effect_of(kind: RandomEffect, owner: str, stops: Stops) -> Effect:
+    """A kind's columns as an effect of a robot or a camera, without a prior."""
+    columns, name = kind.columns(stops), f"{kind.kind} of {owner}"
     flat = PriorInformation.flat(columns.shape[2])
-    name = f"{kind.kind} of {robot}"
-    if rows is None:
-        return Effect.free(name, flat, None, {robot: columns})
-    by_sensor = np.where((rows >= 0)[:, None, None], columns[rows], 0.0)
-    return Effect.free(name, flat, by_sensor)
+    if kind.is_of_sensor:
+        return Effect.free(name, flat, columns)
+    return Effect.free(name, flat, flange_jacobian={owner: columns})
