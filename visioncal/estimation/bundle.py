@@ -40,14 +40,8 @@ def fit_bundle(
 ) -> BundleFit:
     """Estimates intrinsics and poses by Levenberg-Marquardt.
 
-    Args:
-        stack: The corners of v views.
-        camera: The start, and the mean of the prior.
-        cam_from_target: (v, 4, 4) starts.
-        prior_sigma: (4 + k,) weak prior, which holds what the views cannot determine.
-
-    Returns:
-        The fit. Its covariance counts the corners only, not the prior.
+    The camera is the start and the mean of a weak prior, (4 + k,) sigmas, which holds what views
+    cannot determine; the covariance does not count it. `cam_from_target` are (v, 4, 4) starts.
     """
     start, weight = intrinsics(camera), 1.0 / prior_sigma**2
 

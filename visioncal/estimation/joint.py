@@ -118,11 +118,8 @@ def fit_jointly(
 ) -> ConvergedFit:
     """Alternates linearisation of the corners and the frame fit until the values converge.
 
-    Args:
-        optics: Corners, and initial lens and board parameters.
-        model: Frame part of the fit.
-        frames: Initial poses of the unknown frames.
-        others: Initial values of all other effects; their linearisation point if None.
+    It starts at given parameters, (4, 4) poses of the frames, and (k,) values of all other effects
+    (their linearisation point if None).
 
     Raises:
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
@@ -226,13 +223,8 @@ def measured_scale(
 ) -> MeasuredScale:
     """Measures the scale of a target by the robots' motion, without the prior of its size.
 
-    Its views alone cannot determine it: a larger target farther away looks the same.
-
-    Args:
-        model: Frame part of the fit.
-        fitted: The converged fit.
-        frame: Frame of the target.
-        board: Index of the target.
+    Its views alone cannot determine it: a larger target farther away looks the same. `board` is its
+    index, and `frame` its frame.
     """
     problem, state, optics = fitted.problem, fitted.fit.state, fitted.camera_parameters
     widened = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
@@ -268,13 +260,7 @@ def scale_by_stated_arms(fitted: ConvergedFit, stated: Problem, frame: str) -> M
 
 
 def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf) -> Effect:
-    """Effect of target scales, which change the measured distance of a target from the camera.
-
-    Args:
-        problem: The observations.
-        frames: Frames of the k targets.
-        sigma: Relative standard deviation of each size a priori.
-    """
+    """Effect of targets' scales, which change their measured distances, with a prior sigma."""
     # A target that was moved has a frame for each of its locations, named with a suffix.
     observed = np.array([name.partition("@")[0] for name in problem.observations.observed])
     of_frames = (observed[:, None] == np.array(frames))[:, None]
@@ -284,12 +270,7 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
 
 
 def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
-    """Squared Mahalanobis distance of lens and board values from the stated ones, by the data.
-
-    Args:
-        fitted: A fit in which these values are free.
-        places: (k,) indices of the values.
-    """
+    """Squared Mahalanobis distance of (k,) free lens and board values from the stated ones."""
     at, optics = fitted.columns_of(places), fitted.camera_parameters
     covariance = fitted.covariance()[np.ix_(at, at)]
     # The prior of these values given the others draws them towards the stated ones.

@@ -12,9 +12,8 @@ State = TypeVar("State")
 ITERATIONS = 400
 START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
 # The iteration ends at a step that raises the cost with a smaller predicted decrease (a hundredth
-# of a sigma). That step is still accepted if the next predicted decrease is smaller by the second
-# factor.
-_LITTLE, _LEADS = 1e-4, 1e-2
+# of a sigma).
+_LITTLE = 1e-4
 # At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
 # so that the problem is already linearised at the returned state.
 _NOTHING = 0.1
@@ -45,16 +44,11 @@ def levenberg_marquardt(
 ) -> tuple[State, bool]:
     """Minimises a sum of squares (Levenberg 1944; Marquardt 1963).
 
-    Args:
-        start: Initial state.
-        linearise: Linearises the problem at a state.
-        settled: Decrease of the cost, relative to the cost plus one, below which the iteration
-            has converged: costs in units of the noise differ insignificantly by less than one.
-        damping: Damping of the first step.
-        most: Maximum number of steps.
+    It has converged at a decrease of the cost below `settled`, relative to the cost plus one: costs
+    in units of the noise differ insignificantly by less than one.
 
     Returns:
-        The state of least cost, and whether the iteration converged.
+        The state of least cost, and whether the iteration converged within `most` steps.
     """
     now = linearise(start)
     for _ in range(most):
@@ -73,8 +67,7 @@ def levenberg_marquardt(
             # What remains is rounding, curvature that Gauss-Newton neglects, or an error of the
             # derivatives.
             if predicted <= _LITTLE:
-                closer = trial.fall is not None and trial.fall(damping) < _LEADS * predicted
-                return trial.state if closer else now.state, True
+                return now.state, True
             damping *= 10
             if damping > _WORST_DAMPING:
                 return now.state, True

@@ -62,15 +62,7 @@ def _floored(information: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def covariance_among(information: FloatArray, among: Mask) -> FloatArray:
-    """Computes the covariance of some unknowns with the others held fixed.
-
-    Args:
-        information: (n, n) of all unknowns.
-        among: (n,) mask of the free unknowns.
-
-    Returns:
-        (n, n) covariance, zero in the rows and columns of held unknowns.
-    """
+    """Covariance (n, n) by the information on n unknowns, zero for those that are not in a mask."""
     covariance = np.zeros_like(information)
     free = np.ix_(among, among)
     covariance[free] = covariance_from(information[free])
@@ -104,15 +96,9 @@ def gram(left: _Floats, right: _Floats) -> FloatArray:
 def damped_step(
     information: FloatArray, gradient: FloatArray, damping: FloatArray | float
 ) -> FloatArray:
-    """Solves for the Levenberg-Marquardt step (Marquardt 1963: damping scaled by the diagonal).
+    """(..., n) Levenberg-Marquardt steps for (..., n, n) normal matrices and (..., n) gradients.
 
-    Args:
-        information: (..., n, n) normal matrices.
-        gradient: (..., n) gradients of half the squared error.
-        damping: Share of the diagonal that is added to it, scalar or (..., 1).
-
-    Returns:
-        (..., n) steps.
+    The damping, scalar or (..., 1), is the share of the diagonal that is added (Marquardt 1963).
     """
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     added = damping * np.maximum(diagonal, np.finfo(float).tiny) + np.finfo(float).tiny
@@ -125,15 +111,9 @@ def squared_lengths(
 ) -> tuple[FloatArray, IntArray]:
     """Computes squared Mahalanobis lengths of residuals in directions that have redundancy.
 
-    An observation that alone determines a direction has zero residual and variance there.
-
-    Args:
-        residuals: (m, d) residuals.
-        left: (m, d, d) residual covariances: noise covariance less the part absorbed by the fit.
-        covariance: (m, d, d) noise covariances.
-
-    Returns:
-        (m,) squared lengths, and (m,) their degrees of freedom.
+    An observation that alone determines a direction has zero residual and variance there. Of (m, d)
+    residuals, `left` is the (m, d, d) covariance less what the fit absorbed, and `covariance` that
+    of their noise. Returns (m,) squared lengths, and (m,) their degrees of freedom.
     """
     root = np.linalg.cholesky(covariance)
     whitening = np.linalg.inv(root)

@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.special import expit, logit
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_root, gram
@@ -29,8 +30,8 @@ _WORST_DAMPING = 1e6
 # A smaller gain of log-likelihood corresponds to a thousandth of the levels' uncertainty.
 _LITTLE = 1e-6
 # Levels near zero have a gradient below this per value that they describe, and at most this ratio
-# of curvature to gradient (that of a variance is 2): they decrease by longer steps.
-HARDLY, _VARIANCES, _LONGEST_FALL = 0.1, 3.0, 2.0
+# of curvature to gradient (that of a variance is 2): they decrease by steps twice as long.
+HARDLY, _VARIANCES = 0.1, 3.0
 # The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
 # this length: at three times the initial level it is three times the prediction.
 _SURELY, _SHORT_STEP = 3.0, 0.5
@@ -42,9 +43,6 @@ _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 _SIZE_STEP = 0.2
 # Eigenvalues of the remaining information below this share of the original trace are rounding.
 _ROUNDING = 1e-9
-
-# Larger logarithms of odds are certainty.
-_FAR = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,14 +170,8 @@ class MixedEstimate(LikelihoodValue):
         """Maximum-likelihood size of additional random unknowns of equal variance.
 
         With the other sizes held, the likelihood of a size is a sum over the eigenvalues of the
-        unknowns' information.
-
-        Args:
-            moved: (n, d, j) Jacobian of residuals of the first units by the unknowns.
-            among: (u,) mask of these n units.
-
-        Returns:
-            The size within a tenth, and the gain of log-likelihood; zeros if no size gains any.
+        unknowns' information. `moved` is the (n, d, j) Jacobian of the n first units in the (u,)
+        mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
         """
         own = self.units[0]
         absorbed = self.root.T @ gram(own.weighted[among], moved)
@@ -334,9 +326,6 @@ def most_likely(
         enough: The search ends once it is unlikely to reach a value below this.
         little: Predicted gain of log-likelihood below which the search has converged, too.
         hardly: Gradient below which a level may be near zero, scalar or (k,).
-
-    Returns:
-        The likelihood there; where the last step gains next to nothing, before that step.
     """
     now, damping = at(logs), 1e-3
     for _ in range(_ITERATIONS):
@@ -345,7 +334,7 @@ def most_likely(
         curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
         near_zero = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
         vanishing = free & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
-        least = np.maximum(low - logs, np.where(vanishing, -_LONGEST_FALL, -_LONGEST_STEP))
+        least = np.maximum(low - logs, np.where(vanishing, -2.0, -1.0) * _LONGEST_STEP)
         # A vanishing variance affects the other levels like half a step of its logarithm.
         fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
         newton = _bounded_step(
@@ -395,27 +384,18 @@ def _bounded_step(
 def level_weight(gain: float, prior: float = 0.5) -> float:
     """Akaike weight of a non-zero level (Akaike 1974: each parameter costs 1 in log-likelihood).
 
-    Args:
-        gain: Decrease of twice the log-likelihood without the level.
-        prior: Its probability a priori.
+    `gain` is the decrease of twice the log-likelihood without it, `prior` its prior probability.
     """
-    odds = (1.0 - prior) / prior * np.exp(np.clip(1.0 - 0.5 * gain, -_FAR, _FAR))
-    return float(1.0 / (1.0 + odds))
+    return float(expit(0.5 * gain - 1.0 + logit(prior)))
 
 
 def profile_interval(
     profile: Callable[[float], float], sigma: float, lowest: float
 ) -> tuple[float, float]:
-    """95 % interval of a standard deviation by its profile likelihood.
+    """95 % interval of a standard deviation by its negative log-likelihood, `lowest` at `sigma`.
 
-    Args:
-        profile: Negative log-likelihood as a function of the logarithm of the sigma.
-        sigma: The maximum-likelihood estimate.
-        lowest: Negative log-likelihood there.
-
-    Returns:
-        Low and high: low is zero if the residuals do not exclude zero noise, and high is about
-        fifty times the sigma if they do not exclude that.
+    The low end is zero if the residuals do not exclude zero noise, and the high one about fifty
+    times the sigma if they do not exclude that. `profile` is by the logarithm of the sigma.
     """
     middle = float(np.log(max(sigma, LEAST_SIGMA)))
     # A fit at a local maximum has its interval about that maximum.

@@ -101,19 +101,17 @@ class Whitening:
         )
 
 
-def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:
-    """Eliminates the flanges' errors, unit by unit.
+def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
+    """Eliminates the flanges' errors, unit by unit, by the noise of the sensors.
 
     A unit of a single observation is inverted for its flange's error; larger units are eliminated
     by a Schur complement.
-
-    Args:
-        problem: The problem.
-        state: The linearisation point.
-        linear: The linearised residuals.
-        covariance: (n, 6, 6) of the observations' own noise.
     """
-    unit_of, members = problem.units
+    linear, covariance, (unit_of, members) = (
+        problem.linear(state),
+        problem.covariance(noise),
+        problem.units,
+    )
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
     own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
@@ -194,12 +192,7 @@ def normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Information (p, p) and gradient (p,) of half the whitened squared error.
 
-    Args:
-        problem: The observations.
-        state: The linearisation point.
-        noise: Noise levels.
-        ideal: See `Problem.linear`.
-        among: (n,) mask of the observations to include; all if None.
+    `ideal` is that of `Problem.linear`; `among` is the (n,) mask of the observations that count.
     """
     linear = problem.linear(state, ideal=ideal)
     whitening = Whitening.of(problem, noise, linear.by_errors, among)

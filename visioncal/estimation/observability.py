@@ -127,13 +127,7 @@ class Turning:
         return not self.is_still and not self.has_lone_axis
 
     def words(self, flange: FloatArray, stops: str, frame: str) -> str:
-        """Words for what is wrong with the motion.
-
-        Args:
-            flange: (m, 4, 4) poses of the robot's flange.
-            stops: Name of the stops.
-            frame: Name of the frame in which the robot's part rotates.
-        """
+        """What is wrong with the motion of an (m, 4, 4) flange, by names of stops and frame."""
         largest, aside = np.rad2deg(self.largest_rad), np.rad2deg(self.aside_rad)
         if self.is_still and np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0)) < 1e-3:
             return f"the {stops} are all from one pose of the robot"
@@ -254,8 +248,7 @@ def check_determined(
         noise: Of the residuals.
         words: The wording.
         pixel_px: By camera, the corner noise behind its poses' covariance [px].
-        with_first_effect: Whether the first effect has to be determined, too: lens and board, or
-            points.
+        with_first_effect: Whether lens and board, or points, have to be determined, too.
         only_open: Whether a direction that is known poorly is left to later checks.
 
     Raises:
@@ -318,11 +311,7 @@ def directions(
 ) -> tuple[tuple[str, Direction], ...]:
     """Least certain directions of all unknown frames, offset before rotation.
 
-    Args:
-        problem: The observations.
-        state: The solution.
-        covariance: (p, p) of all unknowns.
-        names: Names of each unknown frame, and of its parent.
+    By the covariance (p, p) of all unknowns; `names` are those of each frame and of its parent.
     """
     found = []
     for frame, edge in problem.unknown.items():
@@ -335,13 +324,9 @@ def directions(
 def edge_directions(
     matrix: FloatArray, covariance: FloatArray, thing: str, frame: str
 ) -> tuple[Direction, Direction]:
-    """Least certain directions of an edge: of its offset, and of its rotation.
+    """Least certain directions of a (4, 4) edge with a (6, 6) covariance: offset, and rotation.
 
-    Args:
-        matrix: (4, 4) the edge.
-        covariance: (6, 6) its covariance.
-        thing: Name of the frame it places.
-        frame: Name of the parent frame.
+    It places a thing in a frame, by their names.
     """
 
     def worst(block: slice, limit: float, *, is_rotation: bool) -> Direction:

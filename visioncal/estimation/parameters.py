@@ -103,16 +103,9 @@ def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parame
 def parameter_jacobian(
     table: DHTable, parameters: Sequence[Parameter], q: FloatArray, mounted: FloatArray
 ) -> FloatArray:
-    """Jacobian of the reported frame by the parameters of a table.
+    """Jacobian (m, 6, k) of the reported frame's right perturbation by parameters of a table.
 
-    Args:
-        table: The table.
-        parameters: The selected parameters.
-        q: (m, n) joint angles [rad].
-        mounted: (4, 4) `flange_from_reported`.
-
-    Returns:
-        (m, 6, k) right perturbations.
+    For (m, n) joint angles [rad] and the (4, 4) `flange_from_reported`.
     """
     rows, functions = number_jacobian(table, q)
     columns = [

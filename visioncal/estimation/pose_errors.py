@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, stops_of
+from visioncal.estimation.arm import FEWEST_STOPS, TWIST_UNITS, ArmErrors, pose_basis, stops_of
 from visioncal.estimation.linalg import gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, CommonRows, MixedModel, Units
 from visioncal.estimation.problem import Problem
@@ -47,8 +47,6 @@ _PRIOR = {
 }
 # Least weight of a model.
 _NO_WEIGHT = 1e-4
-# Fewer stops have hardly more residuals than edges and noise have parameters.
-_FEWEST_STOPS = 6
 # Rows of a session that is one block, and of the blocks of a longer one: the work grows with the
 # square of these. Most stops that tie its blocks.
 _ONE_BLOCK, _BLOCK, _MOST_TIES = 200, 96, 16
@@ -58,8 +56,8 @@ _MOST_COLUMNS = 360
 _FAINT, _MOST_COMBINED = 0.1, 96
 # Variances below this share of the total are rounding.
 _FACTORED = 1e-6
-# Start of a process's size in units of the noise, the size that counts as zero, and one near it.
-_START_SIZE, _NOTHING, _LITTLE_SIZE = 0.7, 1e-2, 3e-2
+# Start of a process's size in units of the noise, and the size that counts as zero.
+_START_SIZE, _NOTHING = 0.7, 1e-2
 # Least gain in log-likelihood of a step.
 _LITTLE = 5e-3
 
@@ -106,7 +104,7 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         stops.
     """
     observed = stops_of(problem, robot)
-    if len(observed) < _FEWEST_STOPS:
+    if len(observed) < FEWEST_STOPS:
         return None
     poses = problem.poses[robot]
     posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
@@ -184,13 +182,7 @@ def _scatter(count: int, white: FloatArray) -> _Model:
 
 
 def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterator[_Model]:
-    """Yields all models except independent noise and the combination of both processes.
-
-    Args:
-        poses: (s, 4, 4) all postures of the robot.
-        white: (2,) the noise, of rotation [rad] and position [m].
-        observed: Those at which something was observed.
-    """
+    """Yields all models except independent noise and the combination of both processes."""
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
     level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
     base = level * adjoint(invert(poses)) * TWIST_UNITS
@@ -228,12 +220,7 @@ def _squared_distances(poses: FloatArray) -> FloatArray:
 def _columns(
     processes: Sequence[_Process], count: int, observed: IntArray, most: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Factors the covariance of processes by blocks of stops, largest remainder first.
-
-    Returns:
-        (s, 6, c) columns of at most `most` stops, and (2,) the mean variance that they leave at
-        (m,) observed stops.
-    """
+    """(s, 6, c) columns of stops, largest remainder first, and (2,) the variance they leave."""
     all_stops, columns = np.arange(count), np.zeros((count, 6, 0))
     remainder = np.zeros((count, 6, 6))
     for process in processes:
@@ -260,16 +247,7 @@ def _columns(
 def _informative(
     columns: FloatArray, left: FloatArray, noise_sq: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Those combinations of (s, 6, c) columns that stops may distinguish from noise.
-
-    Args:
-        columns: The columns.
-        left: (2,) mean variance that they leave.
-        noise_sq: (2,) variance of the noise.
-
-    Returns:
-        (s, 6, r) combinations, and (2,) the mean variance that these leave.
-    """
+    """Combinations of (s, 6, c) columns that stops distinguish from noise, and what they leave."""
     if not columns.shape[2]:
         return columns, left
     scale = np.repeat(np.sqrt(noise_sq + left), 3)[:, None]
@@ -385,7 +363,7 @@ class _Likelihood:
         start = np.log(np.append(model.white, sizes))
         try:
             # Where the likelihood falls from next to nothing on, a process has no size.
-            little = np.log(np.append(model.white, np.full(len(sizes), _LITTLE_SIZE)))
+            little = np.log(np.append(model.white, np.full(len(sizes), 3.0 * _NOTHING)))
             found = mixed.at(little)
             if not len(sizes) or (found.gradient[2:] < 0.0).any():
                 found = mixed.maximised(start, np.log(least), np.log(MOST_SIGMA), little=_LITTLE)

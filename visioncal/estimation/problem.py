@@ -240,14 +240,6 @@ class Problem:
         return through
 
     @cached_property
-    def shared_units(self) -> tuple[tuple[int, IntArray], ...]:
-        """The units with several observations, and the rows of these."""
-        of, members = self.units
-        count = np.bincount(of[of >= 0], minlength=len(members))
-        several = np.flatnonzero(count > 1).tolist()
-        return tuple((unit, np.flatnonzero(of == unit)) for unit in several)
-
-    @cached_property
     def alone(self) -> Mask:
         """(n,) mask of measured poses with one flange error, shared by no other observation."""
         of, members = self.units
@@ -405,12 +397,9 @@ class Problem:
         return np.asarray(poses @ exp(self.by_sensor @ change[self.sensor_values]))
 
     def linear(self, state: State, *, ideal: bool = False) -> Linear:
-        """Linearises all residuals.
+        """Linearises all residuals; `ideal` ones at the predictions in place of the measurements.
 
-        Args:
-            state: The linearisation point.
-            ideal: Whether to replace the measurements by their predictions, so that noise does not
-                appear as information on undetermined directions.
+        Otherwise noise would appear as information on undetermined directions.
         """
         before = self._last.get(ideal)
         if before is None or before[0] is not state:
@@ -565,14 +554,9 @@ class Problem:
         return Linear(residuals, tuple(blocks), by_errors, by_flanges, self.size)
 
     def change_of(self, frame: str, state: State) -> FloatArray:
-        """Change of a frame's edge that would zero each observation's residual by itself.
+        """Change of an edge, no robot's, that would zero each observation's residual by itself.
 
-        Args:
-            frame: A frame whose edge is not a robot's.
-            state: The unknowns.
-
-        Returns:
-            (n, 4, 4) right factors of the edge; NaN where it is not on the observation's path.
+        It is an (n, 4, 4) right factor of the edge; NaN where that is not on the path.
         """
         changes = np.full((len(self), 4, 4), np.nan)
         error = invert(self.predicted(state)) @ self.measured(state)

@@ -256,7 +256,7 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
     unit_of, members = problem.units
     stops = np.zeros(len(members), dtype=np.int64)
     stops[unit_of[unit_of >= 0]] = problem.observations.stops[unit_of >= 0]
-    reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
+    reduced = reduce(problem, state, noise)
     count, width = len(problem.robots), members.shape[1]
     parts = np.zeros((2 * count, len(members), 6 * width, 6 * width))
     for robot in range(count):

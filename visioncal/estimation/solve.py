@@ -67,13 +67,7 @@ def starting_noise(problem: Problem) -> Noise:
 
 
 def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> Solution:
-    """Minimises the whitened residuals and estimates the noise levels.
-
-    Args:
-        problem: The inlier observations.
-        state: Initial unknowns.
-        noise: Initial noise levels; `starting_noise` if None.
-    """
+    """Minimises the whitened residuals and estimates the noise levels, from given ones on."""
     is_near, given = noise is not None, noise or starting_noise(problem)
     # REML includes one linear step of the unknowns, so levels are close before the first solve.
     noise = estimate_noise(problem, state, given, from_above=not is_near)
@@ -111,13 +105,8 @@ def solve_problem(
 ) -> tuple[State, bool]:
     """Minimises the residuals whitened by a given noise.
 
-    Args:
-        problem: The observations.
-        state: Initial unknowns.
-        noise: Noise levels.
-        is_near: Whether the start is already a solution under other weights.
-        most: Maximum number of steps.
-        settled: See `levenberg_marquardt`.
+    `is_near` is whether the start is a solution under other weights; `most` and `settled` are those
+    of `levenberg_marquardt`.
 
     Returns:
         The unknowns, and whether the iteration converged.
@@ -150,11 +139,8 @@ def solve_problem(
 def solve_without(problem: Problem, fit: Solution, kept: Mask, *, is_linear: bool = False) -> State:
     """Solves for the unknowns without some observations, by one step from the converged fit of all.
 
-    Args:
-        problem: The n observations.
-        fit: Their converged fit.
-        kept: (n,) mask of the observations that remain.
-        is_linear: Whether a long step, too, is taken to first order.
+    The (n,) mask `kept` is of those that remain. After a long step they are solved anew, unless
+    `is_linear`.
     """
     linear, moving = problem.linear(fit.state), problem.moving
     whitening = Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
@@ -204,12 +190,8 @@ def estimate_noise(
     Robots' levels by restricted likelihood (REML); then each sensor's by its squared residuals over
     their redundancy (Foerstner and Wrobel 2016, section 4.2.4), with the others held.
 
-    Args:
-        problem: The observations.
-        state: The unknowns, near the optimum.
-        noise: Initial levels.
-        from_above: Whether the search for robots' levels starts above the residuals instead of at
-            the initial levels: a search from too low a start may stay there.
+    The search for robots' levels starts at the given ones, or above the residuals: from too low a
+    start, it may stay there.
     """
     robots = robot_likelihood(problem, state, noise).levels(from_above=from_above)[0]
     noise = replace(noise, robots=robots)
@@ -253,13 +235,8 @@ def mahalanobis_sq(
 ) -> tuple[FloatArray, FloatArray]:
     """Mahalanobis distances of observations from their prediction, flange error included as noise.
 
-    For an observation in the fit it is that of the deletion residual, by the identity of Cook and
-    Weisberg (1982, section 2.2).
-
-    Args:
-        problem: All n observations.
-        used: (n,) mask of the observations in the fit.
-        solution: The unknowns and the noise.
+    For an observation in the fit, by the (n,) mask `used`, it is that of the deletion residual, by
+    the identity of Cook and Weisberg (1982, section 2.2).
 
     Returns:
         (n,) squared Mahalanobis distances, and (n,) their degrees of freedom.
@@ -280,22 +257,19 @@ def left_out_residuals(
     """Deletion residuals (n, 6): of each observation from a fit without it, to first order.
 
     All observations that share its flange's error are left out with it. By the identity of Cook and
-    Weisberg (1982, section 2.2), with the noise levels held.
-
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: Noise levels.
-        among: (n,) mask of the observations to compute; all if None. NaN for the others.
+    Weisberg (1982, section 2.2), with the noise levels held. NaN where no robot is observed, and
+    for units without observations in the (n,) mask `among`.
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
-    wanted = np.ones(len(problem), dtype=bool) if among is None else among
-    deletion, residuals = np.full((len(problem), 6), np.nan), linear.residuals
-    errors, own = problem.error_covariance(noise), problem.covariance(noise)
-    alone = wanted.copy()
-    for unit, rows in problem.shared_units:
-        alone[rows] = False
-        if not wanted[rows].any():
+    errors, own, (unit_of, _) = (
+        problem.error_covariance(noise),
+        problem.covariance(noise),
+        problem.units,
+    )
+    deletion = np.full((len(problem), 6), np.nan)
+    for unit in np.unique(unit_of if among is None else unit_of[among]).tolist():
+        rows = np.flatnonzero(unit_of == unit)
+        if unit < 0:
             continue
         by_errors, jacobian = (
             array.reshape(6 * len(rows), -1)
@@ -303,10 +277,7 @@ def left_out_residuals(
         )
         total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
         inverse = covariance_from(total - jacobian @ fitted @ jacobian.T)
-        deletion[rows] = (total @ inverse @ residuals[rows].ravel()).reshape(-1, 6)
-    singles = problem.total_covariance(linear, noise)[alone]
-    remaining = singles - linear.covariance(fitted)[alone]
-    deletion[alone] = (singles @ covariance_from(remaining) @ residuals[alone, :, None])[:, :, 0]
+        deletion[rows] = (total @ inverse @ linear.residuals[rows].ravel()).reshape(-1, 6)
     return deletion
 
 
@@ -323,14 +294,9 @@ def equations_from(
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
     """Accumulates information and gradient of the observations from each stop on, last stop first.
 
-    Args:
-        problem: The observations.
-        solution: The unknowns and the noise.
-        asked: (a,) indices of the unknowns of interest.
-
     Yields:
         Each stop with the rows of the information (a, p) and gradient (a,) of it and all later
-        stops, without priors.
+        stops, without priors, for (a,) `asked` unknowns.
     """
     stops, linear = problem.observations.stops, problem.linear(solution.state)
     augmented = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)

@@ -45,12 +45,7 @@ def random_effects(
 ) -> tuple[Effect, ...]:
     """The random effects that the residuals of a fit show.
 
-    Args:
-        problem: The inlier observations.
-        fit: Their fit.
-        arms: The robots' arms.
-        corners: Linearised corners of the cameras, if any.
-        rows: (n,) the view of each observation; -1 for none.
+    `rows` are the (n,) views of the observations, -1 for none, among the cameras' corners, if any.
     """
     found = list[Effect]()
     for robot, arm in arms.items():

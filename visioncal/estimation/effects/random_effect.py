@@ -60,14 +60,9 @@ def find_random_effects(
     candidates: Sequence[tuple[RandomEffect, Effect]],
     nuisance: Sequence[Effect],
 ) -> tuple[Effect, ...]:
-    """Those of some effects that the residuals show, with their sizes as priors.
+    """Those of some kinds, each with its columns, that the residuals of a fit show.
 
-    Args:
-        problem: The inlier observations.
-        state: Their fit.
-        noise: Its noise.
-        candidates: The kinds, each with its columns.
-        nuisance: Errors of arms by their posture, each of an unknown size.
+    Their sizes are their priors; `nuisance` are errors of arms by posture, each of unknown size.
     """
     effects = [*(effect for _, effect in candidates), *nuisance]
     typical = [kind.typical for kind, _ in candidates] + [_ARM] * len(nuisance)

@@ -43,17 +43,10 @@ class Shutter:
 def target_twists(
     mount: Mount, base_from_flange: FloatArray, x: FloatArray, poses: FloatArray, speeds: FloatArray
 ) -> FloatArray:
-    """Twists of the views' targets relative to the camera.
+    """Twists (v, 6) per second of the views' targets relative to the camera, in their own frames.
 
-    Args:
-        mount: Mounting of the camera.
-        base_from_flange: (v, 4, 4).
-        x: (4, 4) the camera's edge.
-        poses: (v, 4, 4) `cam_from_target`.
-        speeds: (v, 6) twists per second of the flange, in its own frame.
-
-    Returns:
-        (v, 6) twists per second, in the target's frame.
+    The (4, 4) camera's edge is `x`, (v, 4, 4) `poses` are `cam_from_target`, and (v, 6) `speeds`
+    the flange's twists per second, in its own frame.
     """
     hand = mount == "eye-in-hand"
     flange_from_target = x @ poses if hand else invert(base_from_flange) @ x @ poses
@@ -66,14 +59,8 @@ def delayed_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Target positions of the corners at the time of their exposure; the middle row has the stamp.
 
-    Args:
-        stack: The corners of v views.
-        camera: The intrinsics.
-        twists: (v, 6) of `target_twists`.
-        readout_s: The readout time [s].
-
-    Returns:
-        (n, 3) positions on the target [m], and (n, 3, 1) their derivatives by the readout [m/s].
+    For (v, 6) `target_twists` and a readout time [s], (n, 3) positions on the target [m], and
+    (n, 3, 1) their derivatives by the readout [m/s].
     """
     shares, of_corner = stack.px[:, 1] / (camera.resolution[1] - 1) - 0.5, twists[stack.view_of]
     points = apply_each(exp((readout_s * shares)[:, None] * of_corner), stack.points)
@@ -84,14 +71,9 @@ def delayed_points(
 def compress_delayed(
     stack: CornerStack, camera: Camera, twists: FloatArray, readout_s: float, starts: FloatArray
 ) -> Compressed:
-    """Compresses corners to normal equations in each view's pose and the readout time.
+    """Compresses corners to normal equations in each view's pose and the readout time [s].
 
-    Args:
-        stack: The corners of v views.
-        camera: The intrinsics, held.
-        twists: (v, 6) of `target_twists`.
-        readout_s: Linearisation point [s].
-        starts: (v, 4, 4) starts of `cam_from_target`.
+    They are linearised at the readout time and (v, 4, 4) starts of `cam_from_target`.
     """
     points, jacobian = delayed_points(stack, camera, twists, readout_s)
     return compress_points(replace(stack, points=points), camera, starts, jacobian, lens=False)
