@@ -172,7 +172,7 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     away = gradient - known.gradient - weighted.T @ residuals
     np.testing.assert_allclose(away / scale, 0.0, atol=1e-8)
     whole = residuals @ np.linalg.solve(noise, residuals)
-    assert cost == pytest.approx(whole + problem.prior_cost(fit.state), rel=1e-8)
+    assert cost == pytest.approx(whole + known.cost, rel=1e-8)
 
 
 def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):

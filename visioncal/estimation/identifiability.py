@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import svd
 
-from visioncal.core.number_format import listed
+from visioncal.core.number_format import listed, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
@@ -23,8 +23,8 @@ from visioncal.robot import Robot
 # Directions whose singular value is below this share of the largest are unidentifiable; entries of
 # a null direction below the second share of its largest are rounding.
 _LEAST_SHARE, _NOTHING = 1e-7, 1e-6
-# Least share of the largest change for a parameter to be named, and most named.
-_NAMED_SHARE, _MOST_NAMED = 0.5, 3
+# Least share of the largest change for a parameter to be named.
+_NAMED_SHARE = 0.5
 _WORDS = {
     "theta": "offset",
     "d": "length d",
@@ -154,15 +154,12 @@ def null_words(jacobian: Jacobians, named: Sequence[Parameter], robot: Robot) ->
     """Yields what no stops can determine, by Jacobians at postures all over the workspace."""
     _, sizes, vectors = jacobian.spectrum()
     directions = _echelon(vectors[sizes <= _LEAST_SHARE * sizes[0]])
-    for rows, involved in _connected(directions):
-        parameters = [named[index] for index in involved]
-        things = listed([_thing(parameter, robot) for parameter in parameters])
-        if len(parameters) == len(rows):
-            yield f"{things} cannot be separated from the frames of base and tool"
+    for involved in sorted(np.flatnonzero(row).tolist() for row in directions):
+        things = [_thing(named[index], robot) for index in involved]
+        if len(things) == 1:
+            yield f"{things[0]} cannot be separated from the frames of base and tool"
         else:
-            left = len(parameters) - len(rows)
-            of_them = "one combination of them is" if left == 1 else f"{left} combinations are"
-            yield f"{things}: only {of_them} determined"
+            yield f"one combination of {listed(things)} is determined by no stops"
 
 
 def _echelon(rows: FloatArray) -> FloatArray:
@@ -176,19 +173,6 @@ def _echelon(rows: FloatArray) -> FloatArray:
         others = np.arange(len(rows)) != pivot
         rows[others] -= np.outer(rows[others, column], rows[pivot])
     return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
-
-
-def _connected(directions: FloatArray) -> list[tuple[list[int], list[int]]]:
-    """Groups of rows with parameters in common, and these, in the order of their first ones."""
-    groups: list[tuple[list[int], set[int]]] = []
-    for row, numbers in enumerate(directions):
-        rows, columns = [row], set(np.flatnonzero(numbers).tolist())
-        for group in [group for group in groups if group[1] & columns]:
-            rows, columns = [*group[0], *rows], group[1] | columns
-            groups.remove(group)
-        groups.append((rows, columns))
-    ordered = sorted(groups, key=lambda pair: min(pair[1]))
-    return [(rows, sorted(columns)) for rows, columns in ordered]
 
 
 def joint_words(joint: int, robot: Robot) -> str:
@@ -214,7 +198,5 @@ def missing_parameters(
     (_, left), (_, right) = by_parameters.free(), by_errors.free()
     changes = np.linalg.lstsq(left, right @ directions, rcond=_LEAST_SHARE)[0]
     sizes = np.linalg.norm(changes, axis=1)
-    largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED].tolist()
-    kept = sorted(index for index in largest if sizes[index] >= _NAMED_SHARE * sizes.max())
-    words = [_thing(named[index], robot) for index in kept]
-    return listed([*words, "others"] if len(words) < changes.shape[1] else words)
+    kept = np.flatnonzero(sizes >= _NAMED_SHARE * sizes.max())
+    return some_of([_thing(named[index], robot) for index in kept.tolist()], most=3)

@@ -51,17 +51,12 @@ class PriorInformation:
 
     information: FloatArray  # (p, p), zero for parameters without a prior.
     gradient: FloatArray  # (p,) half the gradient of the prior cost at the current state.
+    cost: float = 0.0  # The prior cost there, up to a constant.
 
     @classmethod
     def flat(cls, count: int) -> "PriorInformation":
         """Zero information on some parameters."""
         return cls(np.zeros((count, count)), np.zeros(count))
-
-    def beside(self, count: int) -> "PriorInformation":
-        """The same with `count` parameters without a prior appended."""
-        return PriorInformation(
-            np.pad(self.information, (0, count)), np.pad(self.gradient, (0, count))
-        )
 
 
 @dataclass(frozen=True, eq=False)

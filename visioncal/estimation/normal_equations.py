@@ -97,7 +97,7 @@ class Whitening:
         return (
             total[:-1, :-1] + prior.information,
             total[:-1, -1] + prior.gradient,
-            float(total[-1, -1]) + problem.prior_cost(state),
+            float(total[-1, -1]) + prior.cost,
         )
 
 
@@ -154,7 +154,7 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
     return Reduced(
         total[:-1, :-1] + known.information,
         total[:-1, -1] + known.gradient,
-        float(total[-1, -1]) + problem.prior_cost(state),
+        float(total[-1, -1]) + known.cost,
         solved[:, :, -1],
         solved[:, :, :-1],
         inverse + null_variance,

@@ -319,18 +319,21 @@ class Problem:
         }
 
     def prior_information(self, state: State) -> PriorInformation:
-        """Prior information (p, p) on the unknowns, and half the gradient of its cost."""
+        """Prior information (p, p) on the unknowns, half the gradient of its cost, and this."""
         information, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
+        cost = 0.0
         for effect in self.effects:
             columns = self.effect_columns[effect.name]
             information[columns, columns] = effect.prior.information
             change = self.values_of(effect.name, state) - effect.values
             gradient[columns] = effect.prior.gradient + effect.prior.information @ change
+            cost += float(change @ (effect.prior.gradient + gradient[columns]))
         for prior in self.priors:
             residuals, jacobian = self.prior_rows(prior, state)
             information += jacobian.T @ jacobian
             gradient += jacobian.T @ residuals
-        return PriorInformation(information, gradient)
+            cost += float(residuals @ residuals)
+        return PriorInformation(information, gradient, cost)
 
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (d,) of a frame prior, and their Jacobian (d, p)."""
@@ -345,19 +348,6 @@ class Problem:
             rest = before
         residuals, jacobian = prior.whitened(rest)
         return residuals, jacobian @ by_edges
-
-    def prior_cost(self, state: State) -> float:
-        """Sum of the priors' squared whitened residuals, up to a constant."""
-        cost = 0.0
-        for effect in self.effects:
-            change = self.values_of(effect.name, state) - effect.values
-            cost += float(
-                change @ (2.0 * effect.prior.gradient + effect.prior.information @ change)
-            )
-        for prior in self.priors:
-            residuals, _ = self.prior_rows(prior, state)
-            cost += float(residuals @ residuals)
-        return cost
 
     def _edge(self, step: PathStep, state: State, rows: IntArray) -> FloatArray:
         """(4, 4) or (m, 4, 4) `parent_from_frame` of a path step for m observations."""
