@@ -6,13 +6,13 @@ prior to measurement sigma of a direction: over one, it is determined. Observabi
 the same singular values.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import svd
 
-from visioncal.core.number_format import listed, some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
@@ -20,9 +20,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.robot import Robot
 
-# Directions whose singular value is below this share of the largest are unidentifiable; entries of
-# a null direction below the second share of its largest are rounding.
-_LEAST_SHARE, _NOTHING = 1e-7, 1e-6
+# Directions whose singular value is below this share of the largest are unidentifiable.
+_LEAST_SHARE = 1e-7
 # Least share of the largest change for a parameter to be named.
 _NAMED_SHARE = 0.5
 _WORDS = {
@@ -148,31 +147,6 @@ def observability_indices(values: FloatArray, stops: int) -> dict[str, float]:
         "o4": least**2 / greatest,
         "o5": 1.0 / float(np.sum(1.0 / values)),
     }
-
-
-def null_words(jacobian: Jacobians, named: Sequence[Parameter], robot: Robot) -> Iterator[str]:
-    """Yields what no stops can determine, by Jacobians at postures all over the workspace."""
-    _, sizes, vectors = jacobian.spectrum()
-    directions = _echelon(vectors[sizes <= _LEAST_SHARE * sizes[0]])
-    for involved in sorted(np.flatnonzero(row).tolist() for row in directions):
-        things = [_thing(named[index], robot) for index in involved]
-        if len(things) == 1:
-            yield f"{things[0]} cannot be separated from the frames of base and tool"
-        else:
-            yield f"one combination of {listed(things)} is determined by no stops"
-
-
-def _echelon(rows: FloatArray) -> FloatArray:
-    """Reduced row echelon form of (r, k) independent rows, largest pivots first."""
-    rows = rows.copy()
-    for pivot in range(len(rows)):
-        magnitudes = np.abs(rows[pivot:])
-        row, column = divmod(int(np.argmax(magnitudes)), magnitudes.shape[1])
-        rows[[pivot, pivot + row]] = rows[[pivot + row, pivot]]
-        rows[pivot] /= rows[pivot, column]
-        others = np.arange(len(rows)) != pivot
-        rows[others] -= np.outer(rows[others, column], rows[pivot])
-    return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
 
 
 def joint_words(joint: int, robot: Robot) -> str:

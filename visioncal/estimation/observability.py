@@ -260,7 +260,7 @@ def check_determined(
     if with_first_effect and problem.effects:
         problem, noise = _at_typical_noise(problem, noise, pixel_px, keeps_less=True)
         cause, advice = words.undetermined
-        first = problem.effects[0].determined
+        first = problem.effects[0]
         _refuse_open(
             problem.with_effects([first]),
             State(state.edges, state.values[: len(first)]),

@@ -295,16 +295,14 @@ class Problem:
         return of, robots
 
     @cached_property
-    def sensor_values(self) -> IntArray:
-        """(s,) indices of the effects' values that move measured poses."""
-        moves = [np.full(len(effect), effect.by_sensor is not None) for effect in self.effects]
-        return np.flatnonzero(np.concatenate(moves)) if moves else np.zeros(0, dtype=np.int64)
-
-    @cached_property
     def by_sensor(self) -> FloatArray:
-        """(n, 6, s) Jacobian of the measured poses with respect to the `sensor_values`."""
-        parts = [effect.by_sensor for effect in self.effects if effect.by_sensor is not None]
-        return np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
+        """(n, 6, k) Jacobian of the measured poses with respect to the effects' values."""
+        rows = (len(self), 6)
+        parts = [
+            np.zeros((*rows, len(effect))) if effect.by_sensor is None else effect.by_sensor
+            for effect in self.effects
+        ]
+        return np.concatenate([np.zeros((*rows, 0)), *parts], axis=2)
 
     @cached_property
     def flange_jacobian(self) -> Mapping[str, FloatArray]:
@@ -384,7 +382,7 @@ class Problem:
         poses, change = self.observations.measured, state.values - self.start_values
         if not change.any():
             return poses
-        return np.asarray(poses @ exp(self.by_sensor @ change[self.sensor_values]))
+        return np.asarray(poses @ exp(self.by_sensor @ change))
 
     def linear(self, state: State, *, ideal: bool = False) -> Linear:
         """Linearises all residuals; `ideal` ones at the predictions in place of the measurements.
@@ -449,25 +447,19 @@ class Problem:
         moved_groups = []
         for group in self.groups:
             by_sensor = self.by_sensor[group.rows]
-            is_sensor_moved = by_sensor.any(axis=(0, 1))
             flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
             by_steps = [
                 None if flange is None else _rows_of(flange, group.rows) for flange in flanges
             ]
-            moved = np.zeros(sum(map(len, self.effects)), dtype=bool)
-            moved[self.sensor_values] = is_sensor_moved
-            for by_step in by_steps:
-                if by_step is not None:
-                    moved |= by_step.any(axis=(0, 1))
+            parts = [by_sensor, *(by_step for by_step in by_steps if by_step is not None)]
+            moved = np.any([part.any(axis=(0, 1)) for part in parts], axis=0)
             values, every = np.flatnonzero(moved), bool(moved.all())
             steps = tuple(
                 by_step if by_step is None or every else by_step[:, :, values]
                 for by_step in by_steps
             )
-            places = np.searchsorted(values, self.sensor_values[is_sensor_moved])
-            moved_groups.append(
-                _MovedGroup(values, places, by_sensor[:, :, is_sensor_moved], steps)
-            )
+            places = np.flatnonzero(by_sensor[:, :, values].any(axis=(0, 1)))
+            moved_groups.append(_MovedGroup(values, places, by_sensor[:, :, values[places]], steps))
         return tuple(moved_groups)
 
     def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:

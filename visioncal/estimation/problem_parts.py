@@ -117,20 +117,6 @@ class Effect:
     def __len__(self) -> int:
         return len(self.values)
 
-    @property
-    def determined(self) -> "Effect":
-        """The effect without its random coefficients."""
-        kept = len(self) - self.random
-        information = self.prior.information[:kept, :kept]
-        return replace(
-            self,
-            values=self.values[:kept],
-            prior=PriorInformation(information, self.prior.gradient[:kept]),
-            held=self.held[:kept],
-            by_sensor=None if self.by_sensor is None else self.by_sensor[:, :, :kept],
-            random=0,
-        )
-
     def take(self, rows: IntArray) -> "Effect":
         """Returns the effect for (m,) rows of the observations."""
         return replace(

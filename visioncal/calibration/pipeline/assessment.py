@@ -364,7 +364,7 @@ def _state_in(problem: Problem, state: State) -> State:
         return state
     first = problem.effects[0]
     behind = len(problem.start_values) - len(first)
-    values = [state.values[: len(first.determined)], np.zeros(first.random)]
+    values = [state.values[: len(first) - first.random], np.zeros(first.random)]
     return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 

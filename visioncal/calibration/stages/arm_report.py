@@ -19,7 +19,6 @@ from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
     missing_parameters,
-    null_words,
     observability_indices,
 )
 from visioncal.estimation.parameters import (
@@ -151,7 +150,7 @@ def add_parameters(
             weight,
         )
         counts = Identifiability.of(by_stops, by_errors)
-        not_determined = list(null_words(by_parameters, parameters, nominal))
+        not_determined = list[str]()
         if counts.missing.size:
             named = missing_parameters(
                 by_parameters, by_errors, counts.missing, parameters, nominal
