@@ -14,7 +14,6 @@ is free or held: held values are not moved by the solver, but count in the covar
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
-from visioncal.estimation.tree import PathStep, Stride, Tree, TreePaths
+from visioncal.estimation.tree import PathStep, Tree
 
 # Variance of a rotation that was not measured; its residual and Jacobian rows are zero.
 _NOT_MEASURED = 1.0
@@ -335,26 +334,22 @@ class Problem:
 
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (d,) of a frame prior, and their Jacobian (d, p)."""
-        rest, by_edges = np.eye(4), np.zeros((6, self.size))
-        no_rows = np.zeros(0, dtype=np.int64)
-        for step in reversed(self.tree.path(prior.first, prior.second)):
-            edge = self._edge(step, state, no_rows)
-            before = invert(edge) @ rest if step.is_up else edge @ rest
+        path, by_edges = self.tree.path(prior.first, prior.second), np.zeros((6, self.size))
+        product, slopes = self._moved_path(path, state, np.zeros(1, dtype=np.int64))
+        for step, slope in zip(path, slopes, strict=True):
             if step.frame in self.unknown:
-                jacobian_step = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
-                by_edges[:, self.edge_columns(step.frame)] += jacobian_step
-            rest = before
-        residuals, jacobian = prior.whitened(rest)
+                by_edges[:, self.edge_columns(step.frame)] += slope[0]
+        residuals, jacobian = prior.whitened(product[0])
         return residuals, jacobian @ by_edges
 
     def _edge(self, step: PathStep, state: State, rows: IntArray) -> FloatArray:
         """(4, 4) or (m, 4, 4) `parent_from_frame` of a path step for m observations."""
         if step.robot:
             poses = self.poses[step.robot][self.observations.stops[rows]]
-            moves = self.flange_jacobian.get(step.robot)
-            if moves is None:
+            moves, change = self.flange_jacobian.get(step.robot), state.values - self.start_values
+            if moves is None or not change.any():
                 return poses
-            return np.asarray(poses @ exp(moves[rows] @ (state.values - self.start_values)))
+            return np.asarray(poses @ exp(_rows_of(moves, rows) @ change))
         known = self.tree.branches[step.frame].known
         return state.edges[self.unknown[step.frame]] if known is None else known
 
@@ -366,15 +361,26 @@ class Problem:
             product = product @ (invert(edge) if step.is_up else edge)
         return product
 
+    def _moved_path(
+        self, path: tuple[PathStep, ...], state: State, rows: IntArray
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        """`product`, and Jacobians (m, 6, 6) of its right perturbation by each step's edge's."""
+        product, slopes = np.broadcast_to(np.eye(4), (len(rows), 4, 4)), []
+        for step in reversed(path):
+            edge, after = self._edge(step, state, rows), product
+            product = (invert(edge) if step.is_up else edge) @ after
+            slopes.append(-adjoint(invert(product)) if step.is_up else adjoint(invert(after)))
+        return product, slopes[::-1]
+
     def between(self, first: str, second: str, state: State, rows: IntArray) -> FloatArray:
         """(m, 4, 4) `first_from_second` of two frames for m observations."""
         return self.product(self.tree.path(first, second), state, rows)
 
     def predicted(self, state: State) -> FloatArray:
         """(n, 4, 4) `observer_from_observed` predicted by the unknowns and the robots' poses."""
-        predicted, change = np.empty((len(self), 4, 4)), state.values - self.start_values
-        for ways in self._ways:
-            predicted[ways.rows] = invert(ways.backward(state.edges, change))
+        predicted = np.empty((len(self), 4, 4))
+        for group in self.groups:
+            predicted[group.rows] = self.product(group.path, state, group.rows)
         return predicted
 
     def measured(self, state: State) -> FloatArray:
@@ -393,53 +399,6 @@ class Problem:
         if before is None or before[0] is not state:
             before = self._last[ideal] = state, self._linearised(state, ideal=ideal)
         return before[1]
-
-    @cached_property
-    def _ways(self) -> tuple[TreePaths, ...]:
-        """The observations' paths through the tree, stacked by the kinds of their steps."""
-        alike: dict[tuple[tuple[bool, ...], ...], list[int]] = {}
-        for at, group in enumerate(self.groups):
-            kind = [
-                (step.is_up, step.frame in self.unknown, step.robot in self.flange_jacobian)
-                for step in group.path
-            ]
-            alike.setdefault(tuple(kind), []).append(at)
-        return tuple(self._ways_of(mine) for mine in alike.values())
-
-    def _ways_of(self, mine: list[int]) -> TreePaths:
-        """Stacks the paths of groups whose steps are of the same kinds."""
-        groups, (of, members) = [self.groups[index] for index in mine], self.units
-        ends = np.cumsum([0, *(len(group.rows) for group in groups)]).tolist()
-        rows = np.concatenate([group.rows for group in groups])
-        strides = []
-        for steps in zip(*(group.path for group in groups), strict=True):
-            edges, poses, moves, slots = [], [], [], []
-            for step, group in zip(steps, groups, strict=True):
-                count = len(group.rows)
-                slot = np.full(count, -1)
-                if step.frame in self.unknown:
-                    edges.append(np.full(count, self.unknown[step.frame]))
-                elif step.robot:
-                    poses.append(self.poses[step.robot][self.observations.stops[group.rows]])
-                    robots = members[of[group.rows]] == self.robots.index(step.robot)
-                    slot = np.where(robots.any(axis=1), robots.argmax(axis=1), -1)
-                    if step.robot in self.flange_jacobian:
-                        moves.append(_rows_of(self.flange_jacobian[step.robot], group.rows))
-                elif (known := self.tree.branches[step.frame].known) is not None:
-                    poses.append(np.broadcast_to(known, (count, 4, 4)))
-                slots.append(slot)
-            stacked_poses = np.concatenate(poses) if poses else np.zeros((0, 4, 4))
-            strides.append(
-                Stride(
-                    steps[0].is_up,
-                    np.concatenate(edges) if edges else np.zeros(0, dtype=np.int64),
-                    stacked_poses if steps[0].is_up else invert(stacked_poses),
-                    None if not moves else np.concatenate(moves) if moves[1:] else moves[0],
-                    np.concatenate(slots),
-                )
-            )
-        places = tuple((at, slice(*pair)) for at, pair in zip(mine, pairwise(ends), strict=True))
-        return TreePaths(rows, places, tuple(strides))
 
     @cached_property
     def _moved_groups(self) -> tuple[_MovedGroup, ...]:
@@ -471,33 +430,26 @@ class Problem:
         """
         if self._last_moved and self._last_moved[0][0] is state:
             return self._last_moved[0][1]
-        change, width = state.values - self.start_values, self.units[1].shape[1]
-        back, errors = np.empty((len(self), 4, 4)), np.zeros((len(self), 6, width, 6))
-        blocks: dict[int, JacobianBlock] = {}
-        for ways in self._ways:
-            inverse, moved = ways.moved(state.edges, change)
-            back[ways.rows] = inverse
-            for stride, step in zip(ways.strides, moved, strict=True):
-                erring = np.flatnonzero(stride.slots >= 0)
-                if len(erring):
-                    errors[ways.rows[erring], :, stride.slots[erring]] += step[erring]
-            unknown = [at for at, stride in enumerate(ways.strides) if len(stride.edges)]
-            for at, place in ways.groups:
-                group = self._moved_groups[at]
-                effects = np.zeros((place.stop - place.start, 6, len(group.values)))
-                for step, by_flange in zip(moved, group.by_steps, strict=True):
-                    if by_flange is not None:
-                        effects += step[place] @ by_flange
-                edges = [
-                    6 * ways.strides[index].edges[place.start] + np.arange(6) for index in unknown
-                ]
-                blocks[at] = JacobianBlock(
-                    ways.rows[place],
-                    np.concatenate([*edges, 6 * len(self.unknown) + group.values]),
-                    np.concatenate([*(moved[index][place] for index in unknown), effects], axis=2),
-                )
-        by_flanges = errors.reshape(len(self), 6, 6 * width)
-        result = back, by_flanges, tuple(blocks[index] for index in range(len(self.groups)))
+        (of, members), groups = self.units, zip(self.groups, self._moved_groups, strict=True)
+        back, blocks = np.empty((len(self), 4, 4)), []
+        errors = np.zeros((len(self), 6, members.shape[1], 6))
+        for group, effects in groups:
+            rows, columns, slopes = group.rows, [6 * len(self.unknown) + effects.values], []
+            product, by_steps = self._moved_path(group.path, state, rows)
+            by_effects = np.zeros((len(rows), 6, len(effects.values)))
+            for step, slope, by_flange in zip(group.path, by_steps, effects.by_steps, strict=True):
+                if step.frame in self.unknown:
+                    columns.insert(-1, 6 * self.unknown[step.frame] + np.arange(6))
+                    slopes.append(slope)
+                elif step.robot:
+                    slots = members[of[rows]] == self.robots.index(step.robot)
+                    errors[rows, :, slots.argmax(axis=1)] += slope
+                if by_flange is not None:
+                    by_effects += slope @ by_flange
+            back[rows] = invert(product)
+            jacobian = np.concatenate([*slopes, by_effects], axis=2)
+            blocks.append(JacobianBlock(rows, np.concatenate(columns), jacobian))
+        result = back, errors.reshape(len(self), 6, -1), tuple(blocks)
         self._last_moved[:] = [(state, result)]
         return result
 

@@ -1,17 +1,13 @@
 """Frame tree of a cell, and the paths between its frames.
 
 Every frame is attached to its parent by an edge that is unknown, known, or a robot. Frames with no
-robot between form one body: the stationary frames, and those on each flange. Paths of one
-structure, from observers to observed frames, are evaluated together.
+robot between form one body: the stationary frames, and those on each flange.
 """
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from visioncal.core.transforms import adjoint, exp, invert
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,57 +102,3 @@ class Tree:
             *(PathStep(name, self.branches[name].robot, True) for name in up),
             *(PathStep(name, self.branches[name].robot, False) for name in reversed(down)),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Stride:
-    """One step of m paths, each by its own edge."""
-
-    is_up: bool  # Whether the edges are traversed from child to parent.
-    edges: IntArray  # (m,) indices of unknown edges; empty for known edges and robots.
-    # (m, 4, 4) transforms in the direction of the path, for known edges and robots.
-    poses: FloatArray
-    moves: FloatArray | None  # (m, 6, k) their Jacobian by all effects; None for zero.
-    slots: IntArray  # (m,) index of a robot's flange error within its unit; -1 for none.
-
-    def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
-        """(m, 4, 4) inverse transforms of the step, after a change (k,) of the effects."""
-        if len(self.edges):
-            edge = edges[self.edges]
-            return edge if self.is_up else invert(edge)
-        if self.moves is None or not change.any():
-            return self.poses
-        motion = exp((-1.0 if not self.is_up else 1.0) * (self.moves @ change))
-        return np.asarray(self.poses @ motion if self.is_up else motion @ self.poses)
-
-
-@dataclass(frozen=True, eq=False)
-class TreePaths:
-    """Paths of m observations with the same structure."""
-
-    rows: IntArray  # (m,) the observations, group by group.
-    # Indices of the groups of observations, and their slices of the rows.
-    groups: tuple[tuple[int, slice], ...]
-    strides: tuple[Stride, ...]  # The steps, from the observer on.
-
-    def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
-        """(m, 4, 4) `observed_from_observer`."""
-        product = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4))
-        for stride in reversed(self.strides):
-            product = product @ stride.backward(edges, change)
-        return product
-
-    def moved(self, edges: FloatArray, change: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-        """`backward`, and (m, 6, 6) Jacobians of the observed frames by each step's edges.
-
-        An edge is perturbed on its right: at its end, or at its start where it is traversed up.
-        """
-        back, jacobians = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
-        for stride in reversed(self.strides):
-            before, back = back, back @ stride.backward(edges, change)
-            varies = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
-            none = np.zeros((len(self.rows), 6, 0))
-            jacobians.append(
-                (-adjoint(back) if stride.is_up else adjoint(before)) if varies else none
-            )
-        return back, jacobians[::-1]
