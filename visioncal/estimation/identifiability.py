@@ -14,6 +14,7 @@ from scipy.linalg import svd
 
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
 from visioncal.estimation.problem import Problem
@@ -22,8 +23,8 @@ from visioncal.robot import Robot
 
 # Directions whose singular value is below this share of the largest are unidentifiable.
 _LEAST_SHARE = 1e-7
-# Least share of the largest change for a parameter to be named.
-_NAMED_SHARE = 0.5
+# A parameter is determined where its sigma is below this share of its prior sigma.
+_DETERMINED = 0.7
 _WORDS = {
     "theta": "offset",
     "d": "length d",
@@ -81,18 +82,20 @@ class Jacobians:
         basis = basis[:, sizes > _LEAST_SHARE * sizes[0]]
         return basis.shape[1], self.arm - basis @ (basis.T @ self.arm)
 
-    def spectrum(self) -> tuple[int, FloatArray, FloatArray]:
-        """Rank of the frames; singular values (p,) and directions (p, p) of the arm's errors."""
+    def spectrum(self) -> tuple[int, FloatArray]:
+        """Rank of the frames, and singular values (p,) of the arm's errors."""
         rank, free = self.free()
         padded = np.vstack([free, np.zeros((free.shape[1],) * 2)])
-        return rank, *_singular(np.asarray(np.linalg.qr(padded, mode="r")))[1:]
+        # Divide and conquer, which numpy has, does not converge on some of these.
+        triangle = np.linalg.qr(padded, mode="r")
+        return rank, np.asarray(svd(triangle, compute_uv=False, lapack_driver="gesvd"))
 
-
-def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Thin singular value decomposition of a matrix that may be rank deficient."""
-    # Divide and conquer, which numpy has, does not converge on some of these.
-    left, sizes, right = svd(matrix, full_matrices=False, lapack_driver="gesvd")
-    return left, sizes, right
+    def shares(self, moves: FloatArray) -> FloatArray:
+        """(k,) ratio of the posterior to the prior sigma of parameters, by the errors (k, p)."""
+        _, free = self.free()
+        covariance = covariance_from(free.T @ free + np.eye(free.shape[1]))
+        prior = np.maximum(np.linalg.norm(moves, axis=1), np.finfo(float).tiny)
+        return np.asarray(np.sqrt(np.sum(moves @ covariance * moves, axis=1)) / prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,24 +107,19 @@ class Identifiability:
     identifiable: int
     determined: int  # Number of them that the stops determine better than the prior.
     values: FloatArray  # (L,) singular values of the determined directions of the arm, descending.
-    # (p, k) the k directions of the arm's errors identifiable but not determined.
-    missing: FloatArray
 
     @classmethod
     def of(cls, stops: Jacobians, anywhere: Jacobians) -> "Identifiability":
         """Counts the directions that stops determine, and that postures anywhere could."""
-        frame_rank, sizes, vectors = anywhere.spectrum()
-        shown = vectors[sizes > _LEAST_SHARE * sizes[0]]
-        frames_determined, values, vectors = stops.spectrum()
-        determined, values = vectors[values > 1.0], values[values > 1.0]
-        # The identifiable space without the determined one; both have orthonormal bases.
-        missing = _singular(shown.T - determined.T @ (determined @ shown.T))[0]
+        frame_rank, sizes = anywhere.spectrum()
+        shown = int(np.sum(sizes > _LEAST_SHARE * sizes[0]))
+        frames_determined, values = stops.spectrum()
+        values = values[values > 1.0]
         return cls(
             columns=stops.frames.shape[1] + stops.arm.shape[1],
-            identifiable=frame_rank + len(shown) + stops.frames.shape[1] - anywhere.frames.shape[1],
+            identifiable=frame_rank + shown + stops.frames.shape[1] - anywhere.frames.shape[1],
             determined=frames_determined + len(values),
             values=values,
-            missing=missing[:, : max(len(shown) - len(values), 0)],
         )
 
 
@@ -154,23 +152,18 @@ def joint_words(joint: int, robot: Robot) -> str:
     return f"joint {joint + 1} ({robot.joint_names[joint]})"
 
 
-def _thing(parameter: Parameter, robot: Robot) -> str:
-    return f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
-
-
-def missing_parameters(
-    by_parameters: Jacobians,
-    by_errors: Jacobians,
-    directions: FloatArray,
+def undetermined(
+    stops: Jacobians,
+    anywhere: Jacobians,
+    moves: FloatArray,
     named: Sequence[Parameter],
     robot: Robot,
 ) -> str:
-    """Names the parameters that change most along (p, n) directions of the arm's errors.
-
-    Both Jacobians, by the table's parameters and by the arm's errors, are at the same postures.
-    """
-    (_, left), (_, right) = by_parameters.free(), by_errors.free()
-    changes = np.linalg.lstsq(left, right @ directions, rcond=_LEAST_SHARE)[0]
-    sizes = np.linalg.norm(changes, axis=1)
-    kept = np.flatnonzero(sizes >= _NAMED_SHARE * sizes.max())
-    return some_of([_thing(named[index], robot) for index in kept.tolist()], most=3)
+    """Names parameters, by the errors (k, p), that other stops would determine."""
+    is_open = (stops.shares(moves) > _DETERMINED) & (anywhere.shares(moves) < _DETERMINED)
+    things = [
+        f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+        for parameter, found in zip(named, is_open.tolist(), strict=True)
+        if found
+    ]
+    return some_of(things, most=3) or "some combinations of its parameters"

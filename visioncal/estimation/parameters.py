@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import FUNCTION_NAMES, DHTable
-from visioncal.robot.jacobians import ROW_NAMES, number_jacobian, table_jacobian
+from visioncal.robot.jacobians import ROW_NAMES, table_jacobian
 
 _LENGTHS = ("d", "a")
 _ROW = len(ROW_NAMES)
@@ -98,20 +97,3 @@ def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parame
         elif parameter.link:
             moves[row] = rows[:, parameter.link - 1, parameter.place]
     return moves
-
-
-def parameter_jacobian(
-    table: DHTable, parameters: Sequence[Parameter], q: FloatArray, mounted: FloatArray
-) -> FloatArray:
-    """Jacobian (m, 6, k) of the reported frame's right perturbation by parameters of a table.
-
-    For (m, n) joint angles [rad] and the (4, 4) `flange_from_reported`.
-    """
-    rows, functions = number_jacobian(table, q)
-    columns = [
-        rows[:, :, parameter.link, parameter.place]
-        if parameter.place < _ROW
-        else functions[:, :, parameter.joint, parameter.place - _ROW]
-        for parameter in parameters
-    ]
-    return np.asarray(adjoint(invert(mounted)) @ np.stack(columns, axis=2))

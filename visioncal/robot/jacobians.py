@@ -6,16 +6,14 @@ all motions; so each row takes its part of a link's motion and passes on the scr
 does with finite motions.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from visioncal.core.transforms import adjoint, exp, invert
 from visioncal.core.types import FloatArray
-from visioncal.robot.chain import Chain, chain_document
+from visioncal.robot.chain import Chain
 from visioncal.robot.conversion import EXACTLY, chain_about_z, swing
 from visioncal.robot.model import Robot
-from visioncal.robot.tables import DHTable, about_x, chain_of_table
+from visioncal.robot.tables import DHTable, about_x
 
 # The numbers of a row, in the order of the Jacobians' last axis.
 ROW_NAMES = ("theta", "d", "a", "alpha", "beta")
@@ -61,25 +59,6 @@ def table_jacobian(
     across = about_x(table.a_m[-1], table.alpha_rad[-1], table.beta_rad[-1])
     derivatives[:, -1, [_THETA, _D]] = (last @ adjoint(across @ table.flange).T)[:, _Z]
     return derivatives
-
-
-def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Jacobian of the flange over the numbers of a table, at (m, n) joint angles [rad or m].
-
-    Returns:
-        (m, 6, n + 1, 5) right perturbations of `base_from_flange` for a unit of theta, d, a, alpha
-        and beta; first those of X_0, which has no theta and d, then of each Z_i X_i. And
-        (m, 6, n, 4) for a unit of the joint function coefficients.
-    """
-    # All conventions are the same product of their numbers; this one may have a beta.
-    chain = chain_of_table(replace(table, convention="hayati"))
-    robot = Robot.from_document(chain_document(table.name, table.tip, chain))
-    placement_jacobian = robot.placement_jacobian(q).reshape(len(q), 6, len(table) + 1, 6)
-    ends = np.array([_row_jacobian(table, row) for row in range(-1, len(table))])
-    ends[0, :, [_THETA, _D]] = 0.0
-    ends[-1] = adjoint(invert(table.flange)) @ ends[-1]
-    functions = robot.function_jacobian(q).reshape(len(q), 6, len(table), -1)
-    return np.einsum("mirj,rjk->mirk", placement_jacobian, ends), functions
 
 
 def _twists_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -> FloatArray:

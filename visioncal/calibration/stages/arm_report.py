@@ -18,12 +18,11 @@ from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
-    missing_parameters,
     observability_indices,
+    undetermined,
 )
 from visioncal.estimation.parameters import (
     free_parameters,
-    parameter_jacobian,
     parameter_moves,
 )
 from visioncal.estimation.problem_parts import State
@@ -142,19 +141,12 @@ def add_parameters(
             arm.problem, arm.state, arm.noise, arm.frames, columns, arm.error_rad
         )
         by_errors = _error_jacobians(arm, anywhere, weight)
-        units = [parameter.unit for parameter in parameters]
-        by_parameters = _pair_jacobians(
-            arm.pair,
-            nominal.base_from_flange(anywhere) @ model.flange_from_reported,
-            parameter_jacobian(before, parameters, anywhere, model.flange_from_reported) * units,
-            weight,
-        )
         counts = Identifiability.of(by_stops, by_errors)
+        jacobian = parameter_moves(model, after, parameters)
         not_determined = list[str]()
-        if counts.missing.size:
-            named = missing_parameters(
-                by_parameters, by_errors, counts.missing, parameters, nominal
-            )
+        if counts.determined < counts.identifiable:
+            moves = jacobian[:, model.is_kept]
+            named = undetermined(by_stops, by_errors, moves, parameters, nominal)
             not_determined.append(f"these stops do not determine {named}")
             advice = (
                 f"The stops determine {counts.determined} of the {counts.identifiable} "
@@ -162,7 +154,6 @@ def add_parameters(
                 "not determined stays about as stated. Add stops all over the workspace."
             )
         sigmas_mm, near_mm = (1e3 * arm.place_sigmas_m(array) for array in (anywhere, near))
-        jacobian = parameter_moves(model, after, parameters)
         covariance = arm.arm_covariance
         sigmas = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)).tolist()
     links, rows = arm.error_rad * model.weights.get("links", 1.0), []
@@ -210,17 +201,11 @@ def add_parameters(
 
 def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Jacobians by frames and arm errors at (k, n) postures, weighted as for the stops' noise."""
-    columns = arm.model.basis_without_harmonics(q) * arm.error_rad
-    return _pair_jacobians(arm.pair, arm.model.base_from_flange(q), columns, weight)
-
-
-def _pair_jacobians(
-    pair: ArmPair, flange: FloatArray, flange_jacobian: FloatArray, weight: FloatArray
-) -> Jacobians:
-    """Jacobians of the pair by the frames at both ends, and through a (k, 6, p) flange Jacobian."""
-    by_flange = weight @ pair.at(flange)[0].by_errors
-    frames, arm = by_flange @ pair.frame_jacobian(flange), by_flange @ flange_jacobian
-    return Jacobians(frames.reshape(-1, 12), arm.reshape(-1, flange_jacobian.shape[2]))
+    columns, flange = arm.model.basis_without_harmonics(q), arm.model.base_from_flange(q)
+    by_flange = weight @ arm.pair.at(flange)[0].by_errors
+    errors = by_flange @ (columns * arm.error_rad)
+    frames = by_flange @ arm.pair.frame_jacobian(flange)
+    return Jacobians(frames.reshape(-1, 12), errors.reshape(-1, columns.shape[2]))
 
 
 def _functions_of(arm: ArmData, levels: SelectedArmLevel) -> JointFunctions | None:
