@@ -1,6 +1,7 @@
 """What lenses do beyond their models: its elimination from corners, and its sizes by REML."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from support.cells import calibrated, known_of
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
 from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
-from visioncal.estimation.mixed import LikelihoodValue, most_likely
+from visioncal.estimation.mixed import LikelihoodValue, MixedModel
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, views=8, seed=1)
@@ -93,7 +94,8 @@ def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():
 
     best = np.array([0.5 * np.log(99.0)])
     low, high = np.array([-9.0]), np.array([9.0])
-    likely = most_likely(at, np.array([-2.3]), low, high, enough=at(best).value + 1.0)
+    model, enough = SimpleNamespace(at=at), at(best).value + 1.0
+    likely = MixedModel.maximised(model, np.array([-2.3]), low, high, enough=enough)
     assert likely.value == pytest.approx(at(best).value, abs=1e-6)
 
 

@@ -9,6 +9,9 @@ from scipy.special import chdtri, fdtri, stdtr
 
 from visioncal.core.types import FloatArray
 
+# False-alarm probability of findings: one sound session of ten thousand has one by chance.
+FALSE_ALARM = 1e-4
+
 
 def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:
     """Upper quantile of chi-square: exceeded with probability `chance` at `freedom` degrees."""

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
@@ -30,8 +30,6 @@ from visioncal.estimation.solve import (
     fitted_covariance,
 )
 
-# False-alarm probability of the test for freeing unknowns.
-_FALSE_ALARM = 1e-4
 # Values that change by less than this share of their sigma have converged; maximum of iterations.
 _SETTLED, _ROUNDS = 0.02, 8
 # A step is halved while it increases the corner residuals by this factor; maximum of halvings.
@@ -210,7 +208,7 @@ class MeasuredScale:
     @property
     def is_another(self) -> bool:
         """Whether it differs significantly from the stated size, taken as exact."""
-        return (self.scale / self.sigma) ** 2 > chance_limit(1)
+        return bool((self.scale / self.sigma) ** 2 > chi2_limit(FALSE_ALARM, 1))
 
     @property
     def contradicts(self) -> bool:
@@ -287,8 +285,3 @@ def contradicted_lens(optics: CameraParameters, camera: str) -> bool:
     deviation = (optics.values - optics.stated)[optics.lens_of(camera)[:4]]
     stated = optics.problems[camera].stated_sigma[:4]
     return bool(np.any(np.abs(deviation) > _CONTRADICTION * stated))
-
-
-def chance_limit(freedom: int) -> float:
-    """Chi-square limit of the squared error's decrease by chance for additional free values."""
-    return float(chi2_limit(_FALSE_ALARM, freedom))

@@ -12,7 +12,6 @@ of units are eliminated unit by unit, so that an evaluation is linear in the num
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -66,9 +65,6 @@ class LikelihoodValue:
     value: float
     gradient: FloatArray
     curvature: FloatArray
-
-
-Found = TypeVar("Found", bound=LikelihoodValue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,70 +290,55 @@ class MixedModel:
         little: float = _LITTLE,
         hardly: FloatArray | float = HARDLY,
     ) -> MixedEstimate:
-        """The most likely sizes within (k,) bounds of their logarithms; see `most_likely`."""
+        """Finds the most likely sizes by damped Newton steps (k,) of their logarithms.
+
+        Args:
+            logs: (k,) initial logarithms.
+            low: (k,) lower bounds; equal to `high` for fixed sizes.
+            high: (k,) upper bounds.
+            settled: Step below which the search has converged.
+            enough: The search ends once it is unlikely to reach a value below this.
+            little: Predicted gain of log-likelihood below which the search has converged, too.
+            hardly: Gradient below which a size may be near zero, scalar or (k,).
+        """
         low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
-        start = np.clip(logs, low, high)
-        return most_likely(self.at, start, low, high, settled, enough, little, hardly)
-
-
-def most_likely(
-    at: Callable[[FloatArray], Found],
-    logs: FloatArray,
-    low: FloatArray,
-    high: FloatArray,
-    settled: float = SETTLED,
-    enough: float = np.inf,
-    little: float = _LITTLE,
-    hardly: FloatArray | float = HARDLY,
-) -> Found:
-    """Finds the maximum-likelihood logarithms of levels by damped Newton steps.
-
-    Args:
-        at: Evaluates the likelihood at (k,) logarithms.
-        logs: (k,) initial logarithms, within the bounds.
-        low: (k,) lower bounds; equal to `high` for fixed levels.
-        high: (k,) upper bounds.
-        settled: Step below which the search has converged.
-        enough: The search ends once it is unlikely to reach a value below this.
-        little: Predicted gain of log-likelihood below which the search has converged, too.
-        hardly: Gradient below which a level may be near zero, scalar or (k,).
-    """
-    now, damping = at(logs), 1e-3
-    for _ in range(_ITERATIONS):
-        # Levels at a bound that they would cross are held there.
-        free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
-        curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
-        near_zero = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
-        vanishing = free & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
-        least = np.maximum(low - logs, np.where(vanishing, -2.0, -1.0) * _LONGEST_STEP)
-        # A vanishing variance affects the other levels like half a step of its logarithm.
-        fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
-        newton = _bounded_step(
-            now.gradient + curvature @ fall, curvature, np.where(free & ~vanishing, least, 0.0),
-            np.where(free & ~vanishing, np.minimum(high - logs, _LONGEST_STEP), 0.0),
-        )  # fmt: skip
-        step = np.where(vanishing, least, newton)
-        candidate, length = logs + step, np.abs(step).max(initial=0.0)
-        predicted = -float(newton @ (now.gradient + now.curvature @ (fall + 0.5 * newton)))
-        predicted += 0.5 * float(now.gradient[vanishing].sum())
-        if damping < 1.0:
-            if length < settled or predicted < little:
+        logs = np.clip(logs, low, high)
+        now, damping = self.at(logs), 1e-3
+        for _ in range(_ITERATIONS):
+            # Levels at a bound that they would cross are held there.
+            free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
+            curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
+            near_zero = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
+            vanishing = free & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
+            least = np.maximum(low - logs, np.where(vanishing, -2.0, -1.0) * _LONGEST_STEP)
+            # A vanishing variance affects the other levels like half a step of its logarithm.
+            fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
+            newton = _bounded_step(
+                now.gradient + curvature @ fall, curvature, np.where(free & ~vanishing, least, 0.0),
+                np.where(free & ~vanishing, np.minimum(high - logs, _LONGEST_STEP), 0.0),
+            )  # fmt: skip
+            step = np.where(vanishing, least, newton)
+            candidate, length = logs + step, np.abs(step).max(initial=0.0)
+            predicted = -float(newton @ (now.gradient + now.curvature @ (fall + 0.5 * newton)))
+            predicted += 0.5 * float(now.gradient[vanishing].sum())
+            if damping < 1.0:
+                if length < settled or predicted < little:
+                    break
+                is_short = np.abs(newton).max(initial=0.0) < _SHORT_STEP
+                if is_short and now.value - _SURELY * predicted > enough:
+                    break
+            trial = None
+            # Levels of very different size can make matrices numerically singular.
+            with suppress(np.linalg.LinAlgError):
+                trial = self.at(candidate)
+            if trial is not None and trial.value <= now.value:
+                logs, now, damping = candidate, trial, max(damping / 10, 1e-6)
+            else:  # The next step is at most half as long.
+                damping = max(10.0 * damping, 1.0)
+            # If no step lowers the value any more, only rounding is left.
+            if length < settled or damping > _WORST_DAMPING:
                 break
-            is_short = np.abs(newton).max(initial=0.0) < _SHORT_STEP
-            if is_short and now.value - _SURELY * predicted > enough:
-                break
-        trial = None
-        # Levels of very different size can make matrices numerically singular.
-        with suppress(np.linalg.LinAlgError):
-            trial = at(candidate)
-        if trial is not None and trial.value <= now.value:
-            logs, now, damping = candidate, trial, max(damping / 10, 1e-6)
-        else:  # The next step is at most half as long.
-            damping = max(10.0 * damping, 1.0)
-        # If no step lowers the value any more, only rounding is left.
-        if length < settled or damping > _WORST_DAMPING:
-            break
-    return now
+        return now
 
 
 def _bounded_step(

@@ -205,8 +205,8 @@ def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, 
     return f"{title(mount)}: {words}.", _advice(mount)
 
 
-def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
-    """Refuses fewer stops, of a number of used views, than any calibration needs.
+def refuse_too_few(problem: Problem, mount: Mount) -> None:
+    """Refuses fewer stops than any calibration needs.
 
     Raises:
         DegenerateError: There are fewer than three stops.
@@ -216,12 +216,10 @@ def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
         return
     sensor = "instrument" if mount == "instrument" else "camera"
     culprit = f"the {sensor}'s offset from the {_frame(mount)}"
-    found = f"{counted(stops, 'usable stop')} of the robot"
-    if stops == 1 < views:
-        found = f"all {views} used views are from one pose of the robot"
     raise DegenerateError(
-        f"{title(mount)}: {found}, at least {FEWEST_VIEWS} are needed; {culprit} is not "
-        "determined: it takes two different axes of rotation between views.",
+        f"{title(mount)}: {counted(stops, 'usable stop')} of the robot, at least {FEWEST_VIEWS} "
+        f"are needed; {culprit} is not determined: it takes two different axes of rotation between "
+        "views.",
         culprits=[culprit],
         next_step=_advice(mount),
     )

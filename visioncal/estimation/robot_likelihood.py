@@ -89,8 +89,8 @@ class RobotLikelihood:
             start: (r, 2) initial levels; or (2 r + k,) with k more sizes.
             free: (2 r + k,) mask of the sizes to estimate, robot by robot.
             least: Lower bound of the sizes.
-            settled: See `mixed.most_likely`.
-            enough: See `mixed.most_likely`.
+            settled: See `MixedModel.maximised`.
+            enough: See `MixedModel.maximised`.
         """
         logs = np.log(np.maximum(start.ravel(), LEAST_SIGMA))
         low, high = (np.where(free, np.log(bound), logs) for bound in (least, MOST_SIGMA))

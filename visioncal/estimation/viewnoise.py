@@ -8,26 +8,19 @@ variances are draws of one inverse gamma distribution, whose two parameters all 
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray
 
-# Share of sessions in which views of equal noise are taken for unequal.
-_FALSE_ALARM = 1e-4
 # Bounds of the variance of log variances between views; and of the logarithm of the distribution's
 # shape.
 _BETWEEN, _LOGS = (1e-3, 1e2), (-3.0, 8.0)
 
 
 def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | None:
-    """Relative weights of the views' corners.
+    """Relative weights (v,) of the views' corners: a typical standard deviation over each one's.
 
-    Args:
-        squares: (v,) sums of squared residuals [px^2].
-        freedom: (v,) their degrees of freedom.
-
-    Returns:
-        (v,) ratios of a typical standard deviation to each view's; None where chance explains their
-        differences, or where one has no residuals.
+    By (v,) sums of squared residuals [px^2] and their degrees of freedom; None where chance
+    explains their differences, or where one has no residuals.
     """
     if len(squares) < 2 or not np.all((squares > 0.0) & (freedom > 0.0)):
         return None
@@ -35,7 +28,7 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     logs = np.log(squares / 2.0) - digamma(freedom / 2.0)
     by_chance = polygamma(1, freedom / 2.0)
     deviations = logs - np.average(logs, weights=1.0 / by_chance)
-    if np.sum(deviations**2 / by_chance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
+    if np.sum(deviations**2 / by_chance) < chi2_limit(FALSE_ALARM, len(logs) - 1):
         return None
     # Imported here for `locate`, which rarely needs it: the import takes a tenth of a second.
     from scipy.optimize import brentq

@@ -56,7 +56,7 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
-        refuse_too_few(problem, cell.mount, len(cell.rows))
+        refuse_too_few(problem, cell.mount)
         _refuse_few_of_each(cell)
     tied = init_frames(problem, views, targets_of(cell))
     chosen = {view.view: view for view in tied.views}

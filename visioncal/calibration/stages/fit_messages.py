@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.finding_kinds import NOTE
 from visioncal.core.number_format import counted, figure
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.appearance import MOST_LOOSE, Compressed
@@ -15,7 +15,6 @@ from visioncal.estimation.joint import (
     ConvergedFit,
     FrameModel,
     MeasuredScale,
-    chance_limit,
     contradicted_lens,
     measured_scale,
     moved_mahalanobis_sq,
@@ -31,8 +30,6 @@ from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
 from visioncal.vision.camera import normalise, project
 
-# False-alarm probability of the test of a rig's points.
-_FALSE_ALARM = 1e-4
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
 # Changes of intrinsics or corners below this show in no image [px].
@@ -203,7 +200,7 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
     sigmas = np.array(target.point_sigmas_m)
     distances = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
     worst = int(np.argmax(distances / sigmas))
-    if (distances[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
+    if (distances[worst] / sigmas[worst]) ** 2 > chi2_limit(FALSE_ALARM / len(sigmas), 3):
         yield Finding(
             "board_shape",
             f"Point {target.point_numbers[worst]} of target {target.name} lies "
@@ -248,7 +245,7 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         moves = held_shift(fitted.problem, fitted.fit)[at]
         covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
         squared = float(moves @ np.linalg.solve(covariance, moves))
-        if np.abs(moves).max() > _LEAST_MOVE_PX and squared > chance_limit(len(at)):
+        if np.abs(moves).max() > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(at)):
             yield Finding(
                 "lens",
                 "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
@@ -262,7 +259,9 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
 def _has_changed(fitted: ConvergedFit, places: IntArray) -> bool:
     """Whether values differ significantly from the stated ones."""
     free = np.intersect1d(places, fitted.linearised.moving)
-    return len(free) > 0 and moved_mahalanobis_sq(fitted, free) > chance_limit(len(free))
+    if not len(free):
+        return False
+    return bool(moved_mahalanobis_sq(fitted, free) > chi2_limit(FALSE_ALARM, len(free)))
 
 
 def _px(values: FloatArray) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding, Remedy
@@ -26,8 +26,6 @@ from visioncal.estimation.solve import Solution
 
 # With fewer stops, no such error is distinguished from noise.
 _FEWEST_STOPS = 12
-# False-alarm probability of a finding.
-_FALSE_ALARM = 1e-4
 _KINDS = {kind.kind: kind for kind in RANDOM_EFFECTS}
 
 
@@ -128,6 +126,6 @@ def random_effect_findings(
         kind, columns = _KINDS[name], problem.effect_columns[effect.name]
         values = problem.values_of(effect.name, fit.state)
         squared = float(values @ np.linalg.solve(covariance[columns, columns], values))
-        if squared > chi2_limit(_FALSE_ALARM, len(values)):
+        if squared > chi2_limit(FALSE_ALARM, len(values)):
             found = Finding(kind.kind, kind.says(values), Remedy(kind.do), mahalanobis_sq=squared)
             yield found.of(owner if len(problem.robots) > 1 else "")
