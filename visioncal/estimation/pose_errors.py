@@ -113,7 +113,10 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     white = likelihood.maximised(_Model("white", _PRIOR["white"], (), levels))
     independent = [white]
     if problem.is_combined:
-        scatter = likelihood.maximised(_scatter(len(posed), white.white))
+        # Noise of the flange from stop to stop, which acts on distant frames with its lever.
+        flange = np.broadcast_to(np.diag(np.repeat(white.white, 3)), (len(posed), 6, 6))
+        own = (_Process(np.eye(len(posed)), flange, _START_SIZE),)
+        scatter = likelihood.maximised(_Model("scatter", _PRIOR["white"], own, white.white))
         independent = [replace(model, prior=_PRIOR["white"] / 2) for model in (white, scatter)]
     observed_rows = np.searchsorted(posed, observed)
     others = _models(poses[posed], white.white, observed_rows)
@@ -172,13 +175,6 @@ def spread_postures(poses: FloatArray, count: int) -> IntArray:
     for _ in range(min(count, len(poses)) - 1):
         chosen.append(int(np.argmax(distance_sq[chosen].min(axis=0))))
     return np.array(chosen)
-
-
-def _scatter(count: int, white: FloatArray) -> _Model:
-    """Noise of the flange from stop to stop, which acts on distant frames with its lever."""
-    flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (count, 6, 6))
-    process = _Process(np.eye(count), flange, _START_SIZE)
-    return _Model("scatter", _PRIOR["white"], (process,), white)
 
 
 def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterator[_Model]:

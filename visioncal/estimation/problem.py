@@ -422,11 +422,9 @@ class Problem:
         return tuple(moved_groups)
 
     def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:
-        """Jacobians of the predicted poses' right perturbations.
+        """Inverses (n, 4, 4) of the predicted poses, and Jacobians of their right perturbations.
 
-        Returns:
-            (n, 4, 4) inverses of the predicted poses, (n, 6, 6 w) Jacobian with respect to the
-            flange errors, and that with respect to the unknowns, one block for each group in order.
+        These are (n, 6, 6 w) by the flange errors, and by the unknowns, one block for each group.
         """
         if self._last_moved and self._last_moved[0][0] is state:
             return self._last_moved[0][1]

@@ -22,7 +22,8 @@ _POINTS, _SIZE = 4096, 6
 _MOST_FREEDOM = 1e6
 # Search range of radii about a first guess, as a factor, and relative tolerance.
 _FAR, _TOLERANCE = 1e3, 1e-9
-_EXACT, _FAR_WITHIN = 1e-30, 1e15
+# Radii beyond are infinite.
+_INFINITE = 1e15
 
 
 def chance_within(
@@ -39,7 +40,7 @@ def chance_within(
         turn_rad: The limit of the rotation's angle; infinite for none.
         shift_m: The limit of the distance; likewise.
         freedom: Degrees of freedom of their scale; infinite where it is known.
-        offsets: (k, 6) known part of the error there; none by default.
+        offsets: (k, 6) known part of the error there.
     """
     errors, known = _errors(spreads, offsets)
     return _mean_chance(
@@ -92,12 +93,12 @@ def _crossings(
     errors: FloatArray, known: FloatArray, limit: float
 ) -> tuple[FloatArray, FloatArray]:
     """(n,) lower and upper r at which |known + r error| (n, 3) is the limit; equal for none."""
-    length = np.maximum(np.linalg.norm(errors, axis=1), _EXACT)
+    length = np.maximum(np.linalg.norm(errors, axis=1), np.finfo(float).tiny)
     along = np.einsum("ni,ni->n", known, errors) / length
     beside_sq = np.maximum(np.sum(known**2, axis=1) - along**2, 0.0)
     half = np.sqrt(np.maximum(limit**2 - beside_sq, 0.0))
     low, high = ((root - along) / length for root in (-half, half))
-    return np.clip(low, 0.0, _FAR_WITHIN), np.clip(high, 0.0, _FAR_WITHIN)
+    return np.clip(low, 0.0, _INFINITE), np.clip(high, 0.0, _INFINITE)
 
 
 def _errors(spreads: FloatArray, offsets: FloatArray | None) -> tuple[FloatArray, FloatArray]:
