@@ -238,7 +238,7 @@ def test_parameters_of_the_level_alone_are_told():
     table = convert_table(table_from_document(model.nominal.document), "hayati")
     kinds = {parameter.kind for parameter in free_parameters(model, table)}
     assert kinds == {"theta", "sine", "cosine"}
-    moves = parameter_moves(model, table, free_parameters(model, table))
+    moves = parameter_moves(model, table, [*free_parameters(model, table)])
     # Each value is one number of the table.
     assert np.abs(moves).sum(axis=0) == pytest.approx(np.ones(len(model.values)))
 

@@ -13,12 +13,11 @@ import numpy as np
 from scipy.linalg import svd
 
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Noise, State
 from visioncal.robot import Robot
 
 # Directions whose singular value is below this share of the largest are unidentifiable.
@@ -45,31 +44,14 @@ class Jacobians:
     arm: FloatArray  # (r, p) by the arm's errors, in units of their prior size.
 
     @classmethod
-    def of_stops(
-        cls,
-        problem: Problem,
-        state: State,
-        noise: Noise,
-        frames: IntArray,
-        arm: IntArray,
-        size: float,
-    ) -> "Jacobians":
-        """Root of the information of all observations, without priors.
-
-        Args:
-            problem: The observations.
-            state: The linearisation point.
-            noise: Noise levels.
-            frames: (f,) columns of the frames.
-            arm: (p,) columns of the arm's errors.
-            size: Their prior size.
-        """
-        both = np.concatenate([frames, arm])
-        information = fisher_information(problem, state, noise)
-        information -= problem.prior_information(state).information
+    def of_stops(cls, arm: ArmData) -> "Jacobians":
+        """Root of the information of an arm's observations, without priors."""
+        both = np.concatenate([arm.frames, arm.columns[arm.model.is_kept]])
+        information = fisher_information(arm.problem, arm.state, arm.noise)
+        information -= arm.problem.prior_information(arm.state).information
         values, vectors = np.linalg.eigh(information[np.ix_(both, both)])
         root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        return cls(root[:, : len(frames)], size * root[:, len(frames) :])
+        return cls(root[:, : len(arm.frames)], arm.error_rad * root[:, len(arm.frames) :])
 
     def free(self) -> tuple[int, FloatArray]:
         """Rank of the frames, and (r, p) the arm's Jacobian projected off them.

@@ -35,7 +35,7 @@ _SETTLED, _ROUNDS = 0.02, 8
 # A step is halved while it increases the corner residuals by this factor; maximum of halvings.
 FOLLOWS, _HALVINGS = 2.0, 12
 # Standard deviations from which on a stated value counts as contradicted.
-_CONTRADICTION = 3.0
+CONTRADICTION = 3.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
 # by this factor.
 UNEVEN_LINKS = 2.0
@@ -213,7 +213,7 @@ class MeasuredScale:
     @property
     def contradicts(self) -> bool:
         """Whether it differs by more than both uncertainties combined explain."""
-        return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
+        return abs(self.scale) > CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
 def measured_scale(
@@ -278,10 +278,3 @@ def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
     values, vectors = np.linalg.eigh(information - prior)
     kept = values > _UNMEASURED * np.diag(information).max()
     return float(np.sum((offset @ vectors[:, kept]) ** 2 / values[kept]))
-
-
-def contradicted_lens(optics: CameraParameters, camera: str) -> bool:
-    """Whether intrinsics deviate by more than their stated standard deviation explains."""
-    deviation = (optics.values - optics.stated)[optics.lens_of(camera)[:4]]
-    stated = optics.problems[camera].stated_sigma[:4]
-    return bool(np.any(np.abs(deviation) > _CONTRADICTION * stated))

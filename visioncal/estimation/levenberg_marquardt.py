@@ -75,11 +75,7 @@ def levenberg_marquardt(
 
 
 def _change(decrease: float, predicted: float) -> float:
-    """Factor of the damping after a step that lowered the cost (Nielsen 1999).
-
-    A tenth at a gain ratio near one, two at a ratio near zero: where the Gauss-Newton curvature is
-    too small, every second step would raise the cost otherwise.
-    """
+    """Factor of the damping after a step that lowered the cost, by its gain (Nielsen 1999)."""
     if not 0.0 < predicted < np.inf:
         return _LEAST_CHANGE
     gain = min(decrease / predicted, 1.0)

@@ -92,7 +92,6 @@ class HypothesisEvidence:
     values: FloatArray  # (p,) its unknowns, by the stops alone.
     covariance: FloatArray  # (p, p) of these.
     noise_factor: float  # Most likely factor on the noise.
-    new_share: float  # Most likely share of the noise's variance that repeated stops do not share.
     misfit: float  # Squared Mahalanobis distance that the cause leaves unexplained.
     freedom: int  # Degrees of freedom of the misfit.
     deviance: float  # Twice the negative log-likelihood at the values, up to a common constant.
@@ -136,7 +135,7 @@ def evidence_of(
         float(np.logaddexp.reduce(scores) - np.log(len(sizes_m))),
         mean,
         covariance,
-        *likeliest,
+        likeliest[0],
         misfit,
         len(remaining) - len(mean),
         misfit + white.log_det,

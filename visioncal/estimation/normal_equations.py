@@ -107,11 +107,8 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
     A unit of a single observation is inverted for its flange's error; larger units are eliminated
     by a Schur complement.
     """
-    linear, covariance, (unit_of, members) = (
-        problem.linear(state),
-        problem.covariance(noise),
-        problem.units,
-    )
+    linear, covariance = problem.linear(state), problem.covariance(noise)
+    unit_of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
     own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))

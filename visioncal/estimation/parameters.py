@@ -57,16 +57,12 @@ class Parameter:
         return float(across[self.kind][self.link])
 
 
-def free_parameters(model: ArmModel, table: DHTable) -> tuple[Parameter, ...]:
-    """The parameters of a table that a model's errors change, joint by joint."""
+def free_parameters(model: ArmModel, table: DHTable) -> Iterator[Parameter]:
+    """Yields the parameters of a table that a model's errors change, joint by joint."""
     placements, functions = model.changes(np.ones(len(model.values)))
-    return tuple(_free(table, functions, links=bool(placements.any())))
-
-
-def _free(table: DHTable, functions: FloatArray, *, links: bool) -> Iterator[Parameter]:
     for joint in range(len(table)):
         link = joint if table.convention == "modified" else joint + 1
-        if links:
+        if placements.any():
             yield Parameter(joint, "theta", joint + 1)
             # beta replaces d between parallel axes.
             if not table.parallel[joint + 1]:

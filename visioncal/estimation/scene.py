@@ -1,7 +1,6 @@
 """Scene of one camera: its targets and corners, with priors of lens and boards."""
 
-from collections import Counter
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -47,16 +46,6 @@ class Scene:
     is_focus_fixed: bool = False
 
 
-def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
-    """Weight of each view; images that repeat an earlier one share one weight.
-
-    Errors of a lens, a print or a detector in one of them are the same in all. `shown` has a key by
-    view number that is equal for views of the same content and pose.
-    """
-    counts = Counter(shown.values())
-    return {view: 1.0 / counts[key] for view, key in shown.items()}
-
-
 @dataclass(frozen=True)
 class BoardSizes:
     """Sizes of a printed board's errors beyond what is stated: standard deviations."""
@@ -76,7 +65,8 @@ class CornerProblem:
     basis: FloatArray  # (c, 3, s) of `boards_basis`.
     # (k + s,) stated sigmas of lens and boards; inf where they are estimated from the corners.
     stated_sigma: FloatArray
-    shares: FloatArray  # (m,) weight of each view for lens and board; see `repeat_shares`.
+    # (m,) weight of each view for lens and board; images that repeat an earlier one share one.
+    shares: FloatArray
     # Sizes of lens errors beyond the model; None before their estimation.
     levels: LensLevels | None = None
     # Sizes of a given lens's errors beyond what is stated.

@@ -22,6 +22,7 @@ from visioncal.estimation.linalg import (
     gram,
     squared_lengths,
 )
+from visioncal.estimation.mixed import LEAST_SIGMA
 from visioncal.estimation.normal_equations import (
     Whitening,
     fisher_information,
@@ -31,8 +32,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import START_SIGMA, robot_likelihood
 
-# Steps of frames below this [rad and m] have negligible second-order terms.
-_LINEAR = 1e-3
 # Iterations of the noise levels; relative decrease of the cost at convergence, and while the noise
 # levels still change.
 _ROUNDS, _SETTLED, _NEARLY = 20, 1e-10, 1e-7
@@ -45,8 +44,6 @@ _LEVELS_SETTLED = 1e-3
 
 # Bounds of a sensor's noise relative to its stated noise.
 _SENSOR_RANGE = (1e-3, 1e4)
-# Levels below this count as zero [rad and m].
-_FLOOR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +88,7 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
 
 def _are_close(before: Noise, after: Noise) -> bool:
     pairs = (before.robots, after.robots), (before.sensors, after.sensors)
-    return all(np.allclose(*pair, rtol=_LEVELS_SETTLED, atol=_FLOOR) for pair in pairs)
+    return all(np.allclose(*pair, rtol=_LEVELS_SETTLED, atol=10.0 * LEAST_SIGMA) for pair in pairs)
 
 
 def solve_problem(
@@ -136,19 +133,15 @@ def solve_problem(
     return levenberg_marquardt(state, linearise, settled, damping, most)
 
 
-def solve_without(problem: Problem, fit: Solution, kept: Mask, *, is_linear: bool = False) -> State:
-    """Solves for the unknowns without some observations, by one step from the converged fit of all.
+def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
+    """The unknowns without some observations, by one step from the converged fit of all.
 
-    The (n,) mask `kept` is of those that remain. After a long step they are solved anew, unless
-    `is_linear`.
+    The (n,) mask `kept` is of those that remain.
     """
-    linear, moving = problem.linear(fit.state), problem.moving
     whitening = Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
-    information, gradient, _ = whitening.equations(problem, fit.state, linear)
-    step = np.zeros(len(moving))
+    information, gradient, _ = whitening.equations(problem, fit.state, problem.linear(fit.state))
+    moving, step = problem.moving, np.zeros(problem.size)
     step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
-    if not is_linear and np.abs(step[: 6 * len(problem.unknown)]).max() > _LINEAR:
-        return solve_problem(problem.subset(kept), fit.state, fit.noise, is_near=True)[0]
     return fit.state.moved(step)
 
 

@@ -112,11 +112,8 @@ def _errors(spreads: FloatArray, offsets: FloatArray | None) -> tuple[FloatArray
 
 
 def _directions() -> FloatArray:
-    """(n, 6) evenly distributed unit vectors, by an additive recurrence (Roberts 2018).
-
-    Its steps are powers of the root of x^7 = x + 1, which generalises the golden ratio to six
-    dimensions.
-    """
+    """(n, 6) evenly distributed unit vectors, by an additive recurrence (Roberts 2018)."""
+    # Steps are powers of the root of x^7 = x + 1, a golden ratio of six dimensions.
     ratio = float(np.max(np.real(np.roots([1.0, *np.zeros(_SIZE - 1), -1.0, -1.0]))))
     steps = ratio ** -np.arange(1.0, _SIZE + 1.0)
     even = (0.5 + np.arange(1, _POINTS + 1)[:, None] * steps) % 1.0

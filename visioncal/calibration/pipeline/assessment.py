@@ -186,7 +186,7 @@ def assess_fit(
         cell_fit = replace(cell_fit, arms=with_errors_beside_step(cell_fit.arms, part, fit, steps))
     beside = covariance_from_other_sources(part, fit, cell_fit.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
-    held_out = left_out(cell_fit, is_misread=observed.is_misread)
+    held_out = left_out(cell_fit)
     (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     # The first view of each stop.
     first = {row.station: row.view for row in reversed(cell_fit.cell.rows)}

@@ -26,8 +26,8 @@ from visioncal.vision.targets import corner_positions
 _SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 
-def left_out(cell_fit: CellFit, *, is_misread: bool) -> HeldOutResiduals:
-    """Residuals of the inliers, each by a fit without its stop; to first order if misread."""
+def left_out(cell_fit: CellFit) -> HeldOutResiduals:
+    """Residuals of the inliers, each by a fit without its stop, to first order."""
     fit, used, mount = (
         cell_fit.inlier_fit.fit,
         np.flatnonzero(cell_fit.inlier_fit.used),
@@ -37,8 +37,7 @@ def left_out(cell_fit: CellFit, *, is_misread: bool) -> HeldOutResiduals:
 
     def refit(kept: Mask) -> State:
         if cell_fit.solver == "joint" or mount is None:
-            # Of poses that do not belong together, the fit of each part would be another.
-            return solve_without(part, fit, kept, is_linear=is_misread)
+            return solve_without(part, fit, kept)
         return closed_form_state(part.subset(kept), cell_fit.solver, fit.state, mount)
 
     def pixels(rows: IntArray, predicted: FloatArray, state: State) -> FloatArray:

@@ -130,16 +130,13 @@ def add_parameters(
         convention = "hayati"
     before = convert_table(before, convention or before.convention)
     after = table_of(model.bare, before.convention, like=before)
-    parameters = free_parameters(model, before)
+    parameters = tuple(free_parameters(model, before))
     anywhere = postures(model.robot)
     shares = np.random.default_rng(0).uniform(size=(_PLACES, arm.q.shape[1]))
     near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
     with one_blas_thread():
         weight = arm.pair.weight(arm.noise, arm.measured)
-        columns = arm.columns[model.is_kept]
-        by_stops = Jacobians.of_stops(
-            arm.problem, arm.state, arm.noise, arm.frames, columns, arm.error_rad
-        )
+        by_stops = Jacobians.of_stops(arm)
         by_errors = _error_jacobians(arm, anywhere, weight)
         counts = Identifiability.of(by_stops, by_errors)
         jacobian = parameter_moves(model, after, parameters)

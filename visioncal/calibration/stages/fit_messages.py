@@ -12,10 +12,10 @@ from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.appearance import MOST_LOOSE, Compressed
 from visioncal.estimation.joint import (
+    CONTRADICTION,
     ConvergedFit,
     FrameModel,
     MeasuredScale,
-    contradicted_lens,
     measured_scale,
     moved_mahalanobis_sq,
     scale_by_stated_arms,
@@ -232,7 +232,9 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         rays = np.column_stack([rays, np.ones(len(rays))])
         before, after = (project(at, rays) for at in (problem.scene.camera, optics.camera(camera)))
         moved_px = np.nanmax(np.linalg.norm(after - before, axis=1), initial=0.0)
-        is_wrong = problem.scene.matrix_sigma_px is None or contradicted_lens(optics, camera)
+        moves, stated_px = (optics.values - optics.stated)[lens[:4]], problem.stated_sigma[:4]
+        is_wrong = problem.scene.matrix_sigma_px is None
+        is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * stated_px))
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
             yield Finding("lens", words, _NEW_LENS)

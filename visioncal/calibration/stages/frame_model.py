@@ -1,5 +1,6 @@
 """The frames' side of the joint fit: observations, arms and their effects."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -16,7 +17,7 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
+from visioncal.estimation.scene import CornerProblem, Scene
 from visioncal.estimation.solve import fit_problem
 
 
@@ -126,4 +127,6 @@ class CellFrameModel:
         has_robot = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
         rows = zip(self.views, pairs, observations.stops.tolist(), strict=True)
         repeated = {view: (pair, stop if has_robot[pair] else None) for view, pair, stop in rows}
-        return repeat_shares(repeated)
+        # Errors of a lens, a print or a detector in one of them are the same in all.
+        counts = Counter(repeated.values())
+        return {view: 1.0 / counts[key] for view, key in repeated.items()}
