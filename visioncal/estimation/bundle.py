@@ -71,11 +71,9 @@ def fit_bundle(
 def _reduced(
     stack: CornerStack, reprojection: Reprojection, damping: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Normal equations of k intrinsics, without the v poses.
+    """Information (k, k) and gradient (k,) of k intrinsics, without the v poses.
 
-    Returns:
-        (k, k) information, (k,) gradient, and (v, 6, k + 1) response of the poses: to a step of the
-        intrinsics, and of their own gradient.
+    And (v, 6, k + 1) response of the poses: to a step of the intrinsics, and of their own gradient.
     """
     by_pose, by_intrinsics = reprojection.by_pose, reprojection.by_intrinsics
     rest = np.concatenate([by_intrinsics, reprojection.residuals[:, :, None]], axis=2)

@@ -54,10 +54,7 @@ class Jacobians:
         return cls(root[:, : len(arm.frames)], arm.error_rad * root[:, len(arm.frames) :])
 
     def free(self) -> tuple[int, FloatArray]:
-        """Rank of the frames, and (r, p) the arm's Jacobian projected off them.
-
-        Both are exact where the frames have no prior.
-        """
+        """Rank of the frames, and (r, p) the arm's Jacobian projected off them."""
         scale = np.linalg.norm(self.frames, axis=0)
         shown = scale > _LEAST_SHARE * scale.max()
         basis, sizes, _ = np.linalg.svd(self.frames[:, shown] / scale[shown], full_matrices=False)

@@ -128,11 +128,7 @@ def fit_jointly(
 
 @contextmanager
 def diverging() -> Iterator[None]:
-    """Reports failures of linear algebra in its context as divergence of the fit.
-
-    Raises:
-        ConvergenceError: A matrix was singular or not finite.
-    """
+    """Reports matrices that are singular or not finite as divergence of the fit."""
     try:
         # Diverging values overflow before linear algebra fails.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -167,11 +163,8 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     # Far from the solution, as with a lens stated for another image size, the full step leads to
     # lenses that image nothing.
     limits = [FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
-    optics, free, change = (
-        fitted.linearised.camera_parameters,
-        fitted.linearised.free,
-        fitted.change,
-    )
+    optics, free = fitted.linearised.camera_parameters, fitted.linearised.free
+    change = fitted.change
     for _ in range(_HALVINGS):
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
@@ -245,7 +238,6 @@ def scale_by_stated_arms(fitted: ConvergedFit, stated: Problem, frame: str) -> M
     """Measures the scale of an exact target with nominal arms; None where errors are likelier.
 
     Longer links explain a larger target as well, but one scale is simpler than many link errors.
-    `stated` has the same observations as the fit, which has calibrated arms.
     """
     widened = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
     fit = fit_problem(widened, State(fitted.fit.state.edges, widened.start_values))

@@ -85,10 +85,8 @@ def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def gram(left: _Floats, right: _Floats) -> FloatArray:
-    """Sums `left_i^T right_i` over blocks: (m, d, p) and (m, d, q), or (m, d), to (p, q) or (p,).
-
-    A single product of tall matrices is many times faster than `einsum` over the blocks.
-    """
+    """Sums `left_i^T right_i` over blocks (m, d, p) and (m, d, q), or (m, d): (p, q) or (p,)."""
+    # A single product of tall matrices is many times faster than `einsum` over the blocks.
     rows = left.reshape(math.prod(left.shape[:-1]), left.shape[-1])
     return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
 

@@ -290,16 +290,16 @@ class MixedModel:
         little: float = _LITTLE,
         hardly: FloatArray | float = HARDLY,
     ) -> MixedEstimate:
-        """Finds the most likely sizes by damped Newton steps (k,) of their logarithms.
+        """Finds the most likely sizes by damped Newton steps of their (k,) logarithms.
 
         Args:
             logs: (k,) initial logarithms.
-            low: (k,) lower bounds; equal to `high` for fixed sizes.
-            high: (k,) upper bounds.
+            low: Lower bounds; equal to `high` for fixed sizes.
+            high: Upper bounds.
             settled: Step below which the search has converged.
             enough: The search ends once it is unlikely to reach a value below this.
             little: Predicted gain of log-likelihood below which the search has converged, too.
-            hardly: Gradient below which a size may be near zero, scalar or (k,).
+            hardly: Gradient below which a size may be near zero.
         """
         low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
         logs = np.clip(logs, low, high)

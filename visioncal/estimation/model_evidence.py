@@ -100,10 +100,7 @@ class HypothesisEvidence:
 def evidence_of(
     problem: Problem, belief: CalibrationPosterior, cause: ChangeHypothesis | None = None
 ) -> HypothesisEvidence:
-    """Computes the evidence for a cause from the stops of one robot; with None, for no change.
-
-    The problem has all unknowns of `belief`.
-    """
+    """Evidence for a cause, or no change, from the stops of one robot, by the belief's unknowns."""
     cause = cause or ChangeHypothesis("nothing", np.zeros(0))
     shares = (1.0,) if belief.repeated is None else _NEW_SHARES
     new_m = max(belief.noise.robots[0, 1], _LEAST_SIGMA) * np.sqrt(shares)
@@ -217,10 +214,7 @@ def _whitened(
 
 
 def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Problem:
-    """The stops with a change of (p,) values undone, and these as their last effect.
-
-    Changes may be large: a board may have turned by any angle.
-    """
+    """The stops with a change of (p,) values undone, however large, and these as last effect."""
     ((robot, poses),) = problem.poses.items()
     observations = problem.observations
     sensor, by_sensor = _stepped(cause.by_sensor, values, len(problem))

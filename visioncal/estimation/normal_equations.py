@@ -171,11 +171,7 @@ def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArray:
-    """Fisher information (p, p) on the unknowns, at poses for which all chains close exactly.
-
-    At the measured poses, noise would appear as information on directions that the motion leaves
-    undetermined.
-    """
+    """Fisher information (p, p) on the unknowns, at poses for which all chains close exactly."""
     return normal_equations(problem, state, noise, ideal=True)[0]
 
 

@@ -206,10 +206,10 @@ def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, 
 
 
 def refuse_too_few(problem: Problem, mount: Mount) -> None:
-    """Refuses fewer stops than any calibration needs.
+    """Refuses fewer than three stops.
 
     Raises:
-        DegenerateError: There are fewer than three stops.
+        DegenerateError: There are fewer.
     """
     stops = len(np.unique(problem.observations.stops))
     if stops >= FEWEST_VIEWS:

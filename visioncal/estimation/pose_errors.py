@@ -95,13 +95,10 @@ class _Model:
 
 
 def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
-    """Averages models of the errors of an arm without joint angles, from the white-noise solution.
+    """Errors of an arm without joint angles, and noise beside them, averaged over all models.
 
-    The noise levels of the sensors and of other robots are kept.
-
-    Returns:
-        Its errors, and the noise beside them, both averaged over all models; None for too few
-        stops.
+    The solution is that of white noise; the noise of sensors and other robots is kept. None for too
+    few stops.
     """
     observed = stops_of(problem, robot)
     if len(observed) < FEWEST_STOPS:

@@ -259,11 +259,9 @@ class Problem:
 
     @cached_property
     def units(self) -> tuple[IntArray, IntArray]:
-        """Units of observations with shared errors: those of robots at one stop.
+        """Unit (n,) of each observation, those that share errors of flanges at a stop; -1 for none.
 
-        Returns:
-            (n,) the unit of each observation, -1 for none, and (u, w) the indices of each unit's
-            robots, padded with -1.
+        And (u, w) the indices of each unit's robots, padded with -1.
         """
         if self.is_combined:  # each observation is its own unit
             return np.arange(len(self)), np.zeros((len(self), 1), dtype=np.int64)

@@ -138,12 +138,8 @@ class Effect:
         """(n, 6, k) Jacobian of a robot's flange at observations of (n,) stops."""
         if robot not in self.flange_jacobian:
             return np.zeros((len(stops), 6, len(self)))
-        jacobian = self.flange_jacobian[robot][stops]
-        return (
-            jacobian
-            if self.rows_concerned is None
-            else jacobian * self.rows_concerned[:, None, None]
-        )
+        jacobian, rows = self.flange_jacobian[robot][stops], self.rows_concerned
+        return jacobian if rows is None else jacobian * rows[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,22 +171,12 @@ class FramePrior:
 
     def without(self, axis: int) -> "FramePrior":
         """Returns the prior without one of its measured components."""
-        kept = [
-            (index, value)
-            for index, value in zip(self.axes, self.values_m, strict=True)
-            if index != axis
-        ]
-        return replace(
-            self, axes=tuple(index for index, _ in kept), values_m=tuple(value for _, value in kept)
-        )
+        at = self.axes.index(axis)
+        values_m = self.values_m[:at] + self.values_m[at + 1 :]
+        return replace(self, axes=self.axes[:at] + self.axes[at + 1 :], values_m=values_m)
 
     def whitened(self, estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (d,), and their Jacobian (d, 6).
-
-        Args:
-            estimate: (4, 4) estimate of `first_from_second`; the Jacobian is by its right
-                perturbation.
-        """
+        """Whitened residuals (d,) of a (4, 4) estimate, and their Jacobian (d, 6)."""
         rows = list(self.axes)
         offset = (estimate[rows, 3] - np.array(self.values_m)) / self.sigma_m
         jacobian = np.concatenate(

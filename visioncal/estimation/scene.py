@@ -82,8 +82,8 @@ class CornerProblem:
     ) -> "CornerProblem":
         """Builds the problem from the corners by view, and the weights of repeated views.
 
-        Views without a share have weight one. Unstated corner weights are left to
-        `CameraParameters.weighed`: errors of lens and board would pass for a view's noise.
+        Unstated corner weights are left to `CameraParameters.weighed`: errors of lens and board
+        would pass for a view's noise.
         """
         positions = numbered_positions(scene.targets)
         stack = CornerStack.of(corners, positions)
@@ -191,10 +191,7 @@ class CornerProblem:
         return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
     def unknowns(self, compressed: Compressed) -> int:
-        """Number of unknowns that the corners have determined, including the poses.
-
-        Values with a tight prior are hardly determined by the corners, and reduce no residuals.
-        """
+        """Number of unknowns, poses among them, that the corners have determined, not a prior."""
         sigma_px = self.stack.shown_px(compressed.residuals, 6 * len(compressed.information))
         kept = self.is_uncertain & ~self.is_held
         information = compressed.shared_information[np.ix_(kept, kept)]

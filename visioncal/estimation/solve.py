@@ -41,7 +41,6 @@ _STEPS = 30
 # Relative change of noise levels at convergence, far below their uncertainty.
 _LEVELS_SETTLED = 1e-3
 
-
 # Bounds of a sensor's noise relative to its stated noise.
 _SENSOR_RANGE = (1e-3, 1e4)
 
@@ -146,18 +145,14 @@ def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
-    """Covariance (p, p) of the fitted unknowns, at the measured poses; zero for held ones.
-
-    It serves residual tests: it is what the fit absorbed of the residuals' covariance.
-    """
+    """Covariance (p, p) that the fit absorbed of the residuals', zero for held unknowns."""
     return covariance_among(normal_equations(problem, state, noise)[0], problem.moving)
 
 
 def held_shift(problem: Problem, solution: Solution) -> FloatArray:
     """First-order shift (p,) of the unknowns if the held ones were estimated as well.
 
-    Held values are wrong by their uncertainty, which the covariance includes, and by the shift that
-    the observations imply: the square of this shift is the additional error of holding them.
+    Its square is the error of holding them, beside their uncertainty, which the covariance has.
     """
     held = problem.counted & ~problem.moving
     if not held.any():
@@ -167,10 +162,7 @@ def held_shift(problem: Problem, solution: Solution) -> FloatArray:
 
 
 def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
-    """Covariance (p, p) of the unknowns, at poses for which all chains close; zero for fixed ones.
-
-    It is the uncertainty of the result: held values contribute with their prior.
-    """
+    """Covariance (p, p) of the unknowns, held ones by their prior, where all chains close."""
     information = fisher_information(problem, solution.state, solution.noise)
     return covariance_among(information, problem.counted)
 
@@ -204,11 +196,9 @@ def estimate_noise(
 
 
 def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Squared posterior residuals of the observations, and their redundancies.
+    """Squared posterior residuals (n,) of the observations, and their expected values (n,).
 
-    Returns:
-        (n,) squared residuals in units of their own noise, after a Gauss-Newton step and less the
-        estimated flange errors, and (n,) their redundancies, the expected values of the squares.
+    They are in units of their own noise, after a Gauss-Newton step and less the flange errors.
     """
     own, linear = problem.covariance(noise), problem.linear(state)
     whitening = Whitening.of(problem, noise, linear.by_errors)

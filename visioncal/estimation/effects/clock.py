@@ -12,12 +12,8 @@ def clock_effect(
 ) -> Effect:
     """The change of a clock offset [s] as an unknown.
 
-    Args:
-        speeds: (s, 6) twists per second of the robot's flange at each stop, in its own frame; zero
-            where a pose does not depend on the clock.
-        sigma_s: Prior standard deviation of the offset [s].
-        name: Name of the effect.
-        robot: The robot whose flange moves.
+    By (s, 6) twists per second of the robot's flange at each stop, in its own frame; zero where a
+    pose does not depend on the clock.
     """
     prior = PriorInformation(np.array([[sigma_s**-2.0]]), np.zeros(1))
     # The farther the camera's clock is ahead, the earlier the robot's own time.

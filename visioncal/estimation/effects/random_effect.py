@@ -14,7 +14,6 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.mixed import (
     LEAST_SIGMA,
     MOST_SIGMA,
-    MixedEstimate,
     PriorInformation,
     level_weight,
 )
@@ -86,10 +85,9 @@ def find_random_effects(
     found = model.maximised(logs, low, np.log(MOST_SIGMA))
 
     def gain(index: int) -> float:
-        without, high = found.logs.copy(), np.full(len(low), np.log(MOST_SIGMA))
-        without[first + index] = high[first + index] = low[first + index]
-        least: MixedEstimate = model.maximised(without, low, high)
-        return 2.0 * (least.value - found.value)
+        high = np.full(len(low), np.log(MOST_SIGMA))
+        high[first + index] = low[first + index]
+        return 2.0 * (model.maximised(found.logs, low, high).value - found.value)
 
     chosen = []
     for index, effect in enumerate(effects[: len(candidates)]):
