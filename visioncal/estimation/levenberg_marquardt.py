@@ -17,9 +17,8 @@ _LITTLE = 1e-4
 # At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
 # so that the problem is already linearised at the returned state.
 _NOTHING = 0.1
-# Smallest damping factor after a step, and that after a step with at least this gain ratio, where
-# the problem is practically linear.
-_LEAST_CHANGE, _LINEAR_CHANGE, _LINEAR = 0.1, 1e-3, 0.99
+# Smallest damping factor after a step.
+_LEAST_CHANGE = 0.1
 # Near the solution, where poorly determined directions would need many damped steps.
 NEAR_DAMPING = 1e-9
 
@@ -79,4 +78,4 @@ def _change(decrease: float, predicted: float) -> float:
     if not 0.0 < predicted < np.inf:
         return _LEAST_CHANGE
     gain = min(decrease / predicted, 1.0)
-    return _LINEAR_CHANGE if gain > _LINEAR else max(_LEAST_CHANGE, 1.0 - (2.0 * gain - 1.0) ** 3)
+    return max(_LEAST_CHANGE, 1.0 - (2.0 * gain - 1.0) ** 3)

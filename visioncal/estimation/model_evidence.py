@@ -27,7 +27,7 @@ from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 
@@ -42,8 +42,6 @@ _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
 _REPEATABILITY_M, _FACTOR = 3e-5, 2.0
 # Steps of a cause converge after two or three, to far below any arm's repeatability.
 _ROUNDS, _CONVERGED = 6, 1e-7
-# Least sigma [rad and m]: exact data would otherwise be compared with rounding.
-_LEAST_SIGMA = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ def evidence_of(
     """Evidence for a cause, or no change, from the stops of one robot, by the belief's unknowns."""
     cause = cause or ChangeHypothesis("nothing", np.zeros(0))
     shares = (1.0,) if belief.repeated is None else _NEW_SHARES
-    new_m = max(belief.noise.robots[0, 1], _LEAST_SIGMA) * np.sqrt(shares)
+    new_m = max(belief.noise.robots[0, 1], LEAST_SIGMA) * np.sqrt(shares)
     log_priors = -0.5 * (np.log(new_m / _REPEATABILITY_M) / np.log(_FACTOR)) ** 2
     log_priors -= np.logaddexp.reduce(log_priors) + np.log(len(cause.noise_factors))
     prior_of = dict(zip(shares, log_priors.tolist(), strict=True))
@@ -185,7 +183,9 @@ def _whitened(
     by_flange = linear.by_errors[rows] * np.repeat(belief.noise.robots[0], 3)
     products = np.einsum("iab,jcb->iajc", by_flange, by_flange)
     size, end = 6 * len(rows), 6 * count
-    sensor = block_diag(*without.covariance(belief.noise)[rows]) + _LEAST_SIGMA**2 * np.eye(size)
+    # Exact data would otherwise be compared with rounding.
+    sensor = block_diag(*without.covariance(belief.noise)[rows])
+    sensor += (10.0 * LEAST_SIGMA) ** 2 * np.eye(size)
     whitened = {}
     for factor, new_share in trials:
         shared = one_stop if again is None else again.correlation

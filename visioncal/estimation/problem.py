@@ -23,8 +23,6 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import PathStep, Tree
 
-# Variance of a rotation that was not measured; its residual and Jacobian rows are zero.
-_NOT_MEASURED = 1.0
 # Uninformative variance of a flange error that was not observed [rad^2 and m^2].
 ANYTHING = 1e4
 
@@ -512,7 +510,8 @@ class Problem:
         covariance = np.asarray(scale * observations.covariance)
         places = np.flatnonzero(~observations.has_rotation)
         covariance[places, :3, :] = covariance[places, :, :3] = 0.0
-        covariance[places, :3, :3] = _NOT_MEASURED * np.eye(3)
+        # The residual and Jacobian rows of a rotation that was not measured are zero.
+        covariance[places, :3, :3] = np.eye(3)
         return covariance
 
     def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:

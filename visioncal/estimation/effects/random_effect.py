@@ -21,8 +21,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 
-# Share of sessions that have one such error; weight from which on it is fitted.
-_RARE, _FITTED = 0.01, 0.5
+# Share of sessions that have one such error.
+_RARE = 0.01
 # Typical size of an arm's errors by its posture [rad].
 _ARM = 3e-4
 # The search for a size starts at this multiple of its typical one.
@@ -92,7 +92,7 @@ def find_random_effects(
     chosen = []
     for index, effect in enumerate(effects[: len(candidates)]):
         size = float(np.exp(found.logs[first + index]))
-        if size > 10.0 * LEAST_SIGMA and level_weight(gain(index), _RARE) > _FITTED:
+        if size > 10.0 * LEAST_SIGMA and level_weight(gain(index), _RARE) > 0.5:
             information = PriorInformation(np.eye(len(effect)) / size**2, np.zeros(len(effect)))
             chosen.append(replace(effect, prior=information))
     return tuple(chosen)
