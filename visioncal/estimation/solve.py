@@ -183,9 +183,11 @@ def estimate_noise(
     if not len(noise.sensors):
         return noise
     squares, redundancies = posterior(problem, state, noise)
+    # Repeats scatter by the noise of one, not by that of their weight.
+    squares *= problem.repeat_counts
     sensors = noise.sensors.copy()
     for sensor in range(len(sensors)):
-        observed = (problem.observations.sensors == sensor) & (problem.repeat_counts == 1.0)
+        observed = problem.observations.sensors == sensor
         redundancy = float(redundancies[observed].sum())
         if redundancy > 1.0:
             factor = np.sqrt(float(squares[observed].sum()) / redundancy)
