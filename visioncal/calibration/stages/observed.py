@@ -215,8 +215,9 @@ def nothing_seen(observed: Observed) -> DataError:
     image = next((view.image for view in observed.session.views if view.image), "")
     has_files = image and isinstance(observed.session.images, FolderImages)
     command = f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""
+    why = "".join(f" ({reason})" for reason in observed.lost_views[:1])
     return DataError(
-        f"session {observed.session.name!r}: no view shows the target, or enough of it.",
+        f"session {observed.session.name!r}: no view shows the target, or enough of it{why}.",
         culprits=observed.lost_views,
         next_step="Look at an image: is the whole board in it, sharp, near enough and not "
         f"mirrored, and is it the one that the session declares?{command} {DESCRIBE_IT}",
