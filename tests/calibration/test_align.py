@@ -116,6 +116,7 @@ def test_a_frame_that_moves_with_a_robot_asks_for_its_pose(clean):
         found.between("cam_lft", "base_a")
 
 
+@pytest.mark.slow
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
     options = NetworkOptions(stops=STOPS, moved=pushes, swapped_rows=1, stray_images=3, seed=3)
@@ -190,6 +191,7 @@ def test_a_board_of_a_wholly_other_size_is_found_and_the_cell_is_where_it_is():
     assert off(cell, found, "base_a", "base_b")[1] < 22.0
 
 
+@pytest.mark.slow
 def test_lenses_come_from_images_of_their_own():
     cameras = (replace(LEFT, state_intrinsics=False), replace(RIGHT, state_intrinsics=False))
     cell = simulate(NetworkOptions(cameras=cameras, lens_views=12, stops=STOPS))
@@ -207,7 +209,7 @@ def test_lenses_come_from_images_of_their_own():
     assert len(found.views) == len(cell.sights) - 24
 
 
-@pytest.mark.parametrize("mode", ["auto", "hold"])
+@pytest.mark.parametrize("mode", ["auto", slow("hold")])
 def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     cell, right = clean
     session = cell_session(cell, "cell", seen="names")
@@ -463,6 +465,7 @@ def test_motion_that_leaves_an_offset_from_an_only_robot_open_is_named(mount, se
     assert f"'s {left_open} {frame}" in culprit
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
     apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))

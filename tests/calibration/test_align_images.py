@@ -1,7 +1,6 @@
 """A whole cell from its pictures: `visioncal align` on a folder, and on its recording."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.drawn import column
-from support.fuzz.broken_sessions import edit_rows
 
 from visioncal.core.transforms import log
 from visioncal.present.recording import paths, read_evidence
@@ -72,17 +70,6 @@ def test_pictures_of_several_cameras_are_one_cell(out):
         assert "disagrees" in left_out[view]
     assert found.cell.lenses["cam_right"].estimated
     assert not found.cell.lenses["cam_left"].estimated
-
-
-def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(folder, tmp_path):
-    wrong = tmp_path / "wrong"
-    shutil.copytree(folder, wrong)
-    other = {"left": "right", "right": "left"}
-    edit_rows(wrong, lambda rows: [row | {"camera": other[row["camera"]]} for row in rows])
-    done = visioncal("calibrate", wrong, "-o", tmp_path / "out")
-    assert done.status == 2
-    assert "that is the size of camera right's" in done.err
-    assert "Exchange left and right in the column camera of views.csv" in done.err
 
 
 def test_what_was_detected_lies_over_the_image_of_the_camera_that_saw_it(folder, out):

@@ -196,6 +196,7 @@ def test_the_map_is_by_the_covariance(mount):
     assert 1e-3 * numbers.map_sigmas_mm == pytest.approx(sigmas_m[: len(numbers.workspace_map)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "convention"), [("ur5e", "hayati"), ("panda", "modified")])
 def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
     """Twenty arms drawn from what is known of them beforehand, and measured with noise."""

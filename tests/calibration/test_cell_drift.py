@@ -59,6 +59,7 @@ def mahalanobis_sq(cell, found, frame):
     return float(away @ np.linalg.solve(edge.covariance, away))
 
 
+@pytest.mark.slow
 def test_frames_are_those_of_the_cold_arm(cell, session, found):
     without = aligned(cell, session, "hand-eye")
     for frame in ("base_b", "cam_left"):

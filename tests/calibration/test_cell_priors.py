@@ -42,6 +42,7 @@ def whole(matrix, sigma_m, sigma_rad):
     }
 
 
+@pytest.mark.slow
 def test_a_prior_narrows_what_it_is_of(cell):
     height = float(cell.between("base_a", "base_b")[2, 3])
     before = aligned(cell, {}).between("base_a", "base_b")
@@ -68,6 +69,7 @@ def test_a_prior_that_is_wrong_is_named_with_what_the_observations_say(cell):
     assert found.verdict.status == "check"
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
     """A stereo rig: the right camera is known from the left one, and sees a board by itself."""
     options = NetworkOptions(stops=STOPS)

@@ -145,6 +145,7 @@ def test_a_robot_whose_poses_are_misread_is_named_first(session):
     assert "rows of robot b in views.csv" in refused.value.next_step
 
 
+@pytest.mark.slow
 def test_poses_of_a_robot_that_are_exchanged_are_named(session):
     first, second = seen_often(session, "plate_b")[:2]
     told = poses(session, "b")
@@ -161,6 +162,7 @@ def test_poses_of_a_robot_that_are_exchanged_are_named(session):
     assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
 
 
+@pytest.mark.slow
 def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
     # The images of one camera at two stops.
     views = [view for view in session.views if view.text["target"] == "plate_b"]
@@ -182,6 +184,7 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
         exchange_views(session, first, other)
 
 
+@pytest.mark.slow
 def test_a_camera_whose_corners_are_bad_is_named(session):
     table = session.corner_table
     mine = {view.number for view in session.views if view.text.get("camera") == "right"}

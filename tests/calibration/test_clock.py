@@ -84,7 +84,7 @@ def restamped(session: Session, stamp) -> Session:
     ("stamp", "words"),
     [
         (lambda s: s - 0.02 * (s >= s[200]), "from view 200 on it is -"),
-        (lambda s: s + 1e-3 * (s - s[0]), "drifts against the robot's, by +"),
+        slow(lambda s: s + 1e-3 * (s - s[0]), "drifts against the robot's, by +"),
     ],
     ids=["back", "drift"],
 )
@@ -144,6 +144,7 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     assert error @ np.linalg.solve(covariance, error) < 27.9
 
 
+@pytest.mark.slow
 def test_another_sweep_verifies_the_camera(known):
     again = swept(recording=1)
     held = verify(cell_session(again, "again", seen="poses"), known)

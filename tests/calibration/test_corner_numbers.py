@@ -65,6 +65,7 @@ def test_a_marker_numbered_counterclockwise_is_named():
     assert "counterclockwise" in causes[0].words
 
 
+@pytest.mark.slow
 def test_numbers_as_drawn_are_not_accused():
     for order in (lambda ids, *_: ids, lambda ids, columns, rows: columns * rows - 1 - ids):
         _, session = renumbered(order, load_target("checkerboard_9x6_25mm"))

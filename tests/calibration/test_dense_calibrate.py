@@ -14,6 +14,7 @@ from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.optics import wide_camera
 
+pytestmark = pytest.mark.slow
 CAMERA = wide_camera()
 # A quarter of the pixels.
 OPTIONS = CellOptions(

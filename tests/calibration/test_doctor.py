@@ -104,6 +104,7 @@ def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     assert "target check SESSION/images" in caught.value.next_step
 
 
+@pytest.mark.slow
 def test_a_matrix_of_larger_images_is_named(tmp_path):
     folder = broken_session(tmp_path / "session", BROKEN["the lens of larger images"])
     first, *_ = visioncal.doctor(folder).findings
@@ -113,7 +114,7 @@ def test_a_matrix_of_larger_images_is_named(tmp_path):
         assert "are not this camera's, or of images of another size" in found.words
 
 
-@pytest.mark.parametrize("more", [1, slow(-1)])
+@pytest.mark.parametrize("more", [slow(1), slow(-1)])
 def test_squares_in_the_place_of_inner_corners_are_named(tmp_path, more):
     plain = BROKEN["semicolons"]
     options = replace(plain.options, target=BOARDS["checkerboard"], views=4)

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from support.marks import slow
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
@@ -27,7 +28,7 @@ def cell_with(camera, seed, **changes):
 
 @pytest.mark.parametrize(
     ("camera", "model"),
-    [(wide_camera(), "brown"), (fisheye_camera(), "fisheye")],
+    [(wide_camera(), "brown"), slow(fisheye_camera(), "fisheye")],
     ids=["brown", "fisheye"],
 )
 def test_errors_follow_the_stated_covariance(camera, model):

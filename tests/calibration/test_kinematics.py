@@ -183,6 +183,7 @@ def test_the_result_holds_the_calibrated_arm(tmp_path):
     assert np.array_equal(result.robot.base_from_flange(q), known.robot.base_from_flange(q))
 
 
+@pytest.mark.slow
 def test_a_level_that_explains_too_little_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=1))
     known = calibrated(cell, level="offsets")

@@ -122,6 +122,7 @@ def test_a_board_of_several_may_be_known_whole():
     assert sum("was used" in note and name in note for note in known.notes) == 3
 
 
+@pytest.mark.slow
 def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     cell = simulate(CellOptions(robot="ur5e", views=20, seed=3))
     true = float(cell.transforms["flange_from_cam"][2, 3])

@@ -97,6 +97,7 @@ def test_a_rough_matrix_is_refined_within_its_prior_by_views_of_one_marker(mode)
     assert 0.5 < np.mean(nees) < 1.7
 
 
+@pytest.mark.slow
 def test_a_matrix_off_by_many_of_its_sigmas_is_refined_without_its_prior_and_named():
     nees = []
     for seed in range(2):

@@ -500,6 +500,7 @@ def test_commands_take_a_rig_or_say_why_not(cube, tmp_path):
     assert "rig of points outside the plane z = 0" in planned.err
 
 
+@pytest.mark.slow
 def test_corners_of_images_give_what_the_images_give(rendered, tmp_path):
     session = Session.load(rendered)
     found = detect(session)

@@ -165,6 +165,7 @@ def test_a_film_of_a_few_stops_is_so_many_views():
     assert found.views[1].reason == "counts in the mean of view 0, of its stop"
 
 
+@pytest.mark.slow
 def test_still_boards_seen_often_outvote_no_robot():
     """Most rows are of still cameras and a still board, and agree best of all."""
     seed, images = 2, 3

@@ -120,6 +120,7 @@ def test_a_global_shutter_is_not_mistaken():
     assert not any("rolling" in note for note in known.notes)
 
 
+@pytest.mark.slow
 def test_it_is_said_and_written(tmp_path):
     folder = write_session(swept(5), tmp_path / "swept", images=False)
     result = calibrate(folder)

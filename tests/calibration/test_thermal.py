@@ -261,6 +261,7 @@ def test_currents_that_warm_nothing_yet_are_refused():
         calibrate(session, level="thermal")
 
 
+@pytest.mark.slow
 def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(learnt):
     session = learnt["temperatures"].session
     heat = session.streams["heat"]
@@ -361,6 +362,7 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
     assert "looks like kelvin" in refused.err
 
 
+@pytest.mark.slow
 def test_an_instrument_that_reads_points_sees_the_drift(learnt):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth

@@ -10,6 +10,7 @@ from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, FITTED, Change, again, knock, known_again, usual
+from support.marks import slow
 from support.pages import Page
 
 from visioncal import calibrate, verify
@@ -121,7 +122,7 @@ def test_a_turned_camera_a_moved_board_and_a_slip_are_told_apart(place):
     assert "Joint 3 (elbow_joint) off by -0.0" in verdict_of(found).reasons[0]
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_what_no_stops_can_tell_apart_is_named_together(mount):
     place, rng = usual(mount), np.random.default_rng(3)
     stands, carried = "board", "camera"
@@ -194,7 +195,7 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_stops_that_repeat_calibrated_ones_show_what_the_arms_errors_hide(mount):
     wrong = {"dh_sigma_m": 1e-4, "dh_sigma_rad": 1e-4, "branches": True, "roll_rad": np.pi}
     cell = simulate(CellOptions(mount=mount, views=25, seed=11, **wrong))
@@ -232,6 +233,7 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
         assert check(predict_detected(known, prior_calibration), prior_calibration).passed
 
 
+@pytest.mark.slow
 def test_a_bent_arm_under_its_loads_is_no_change():
     """Springs and loads are in what is predicted."""
     loads = (Payload(), Payload(8.0, (0.0, 0.0, 0.1)))
@@ -252,6 +254,7 @@ def test_a_bent_arm_under_its_loads_is_no_change():
     ).passed
 
 
+@pytest.mark.slow
 def test_one_of_two_boards_that_moved_is_named():
     cell = simulate(replace(ANYHOW, second=Second(turn_rad=0.6, tilt_rad=0.2), views=24, seed=2))
     calibration = result_of(calibrated(cell))
@@ -282,6 +285,7 @@ def test_one_of_two_boards_that_moved_is_named():
     assert "the one that moved is named" in refused.value.next_step
 
 
+@pytest.mark.slow
 def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_path):
     cell = simulate(CellOptions(views=24, seed=3))
     flange = cell.robot.base_from_flange.copy()
@@ -301,6 +305,7 @@ def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_p
     ).passed
 
 
+@pytest.mark.slow
 def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(tmp_path):
     cell = simulate(CellOptions(views=24, second=Second(), seed=3))
     two = Session.load(write_session(cell, tmp_path / "two", images=False))

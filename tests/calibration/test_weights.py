@@ -36,6 +36,7 @@ def test_weight_is_among_the_functions(bare):
     assert again == pytest.approx(torques, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_an_arm_of_unknown_weight_is_calibrated_with_its_sag(bare):
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=bare)

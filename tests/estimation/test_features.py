@@ -48,6 +48,7 @@ def test_derivatives_are_those_of_the_residuals():
     assert np.abs(problem.linearise(state).jacobian - found).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_the_error_over_its_sigma_is_distributed_as_it_should_be():
     shares = []
     kinds = ["origin", "x", "xy", "xy", "x", "xy", "origin", "x"]

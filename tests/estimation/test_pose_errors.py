@@ -103,6 +103,7 @@ def observed(errors, seed, stops=20):
     return problem, fit_problem(problem, problem.start({"cam": X, "target": Z}))
 
 
+@pytest.mark.slow
 def test_noise_at_both_ends_is_no_error_of_the_arm():
     # The flange's turns it about itself, and shifts a far target with that: no one level of noise
     # at the target is like it, and errors that hardly any two stops have in common are.

@@ -162,6 +162,7 @@ def test_repeats_do_not_pass_for_a_step():
         assert not find_steps(problem, fit, frames_of(problem, tuple(problem.unknown)))
 
 
+@pytest.mark.slow
 def test_steps_are_as_likely_as_their_evidence_says():
     """Half of the cells have one, of the sizes that steps have; robots hide the smallest."""
     frame, found = "target_b", []
