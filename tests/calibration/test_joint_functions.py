@@ -12,7 +12,6 @@ from support.tracked import known_of
 from visioncal import correct
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.kinematics import FUNCTIONS
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.prediction import predict_detected
@@ -20,7 +19,7 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
 from visioncal.results import Calibration
-from visioncal.results.arm import ArmResult
+from visioncal.results.arm import FUNCTIONS, ArmResult
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (
     InstrumentOptions,
@@ -132,7 +131,6 @@ def test_where_it_carries_over_is_what_is_predicted_there(known):
     assert found.sigma_mm**2 > squares[0]
     assert found.sigma_mm < found.nominal_mm
     assert found.better_share > 0.9
-    assert {region.region for region in found.regions} >= {"box", "beside"}
     assert found.words in known.verdict.reasons
 
 
@@ -148,23 +146,6 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
     # One arm of errors that few values tell of: its error is within a factor of what is predicted.
     ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
     assert 0.4 < ours / found.sigma_mm < 1.5
-
-
-def test_tables_of_the_functions_are_within_their_sigmas(shop, known):
-    found = arm_found(known).sections.arm.functions
-    assert [joint.joint for joint in found.joints] == list(known.robot.joint_names)
-    angles = np.linspace(-np.pi, np.pi, 180, endpoint=False)
-    nodes = np.linspace(0.0, 2 * np.pi, len(shop.true_arm.beyond), endpoint=False)
-    ratios = []
-    for at, joint in enumerate(found.joints):
-        true = 1e3 * np.interp(angles, nodes, shop.true_arm.beyond[:, at], period=2 * np.pi)
-        away, sigma = true - np.array(joint.error_mrad), np.array(joint.sigma_mrad)
-        # What is constant is the joint's offset.
-        away -= np.sum(away / sigma**2) / np.sum(1 / sigma**2)
-        ratios.append(np.mean(away**2 / sigma**2))
-        # Stops reach to 2.5 rad; beyond, little more is known than beforehand.
-        assert sigma[np.abs(angles) < 2.0].mean() < 0.5 * sigma[np.abs(angles) > 2.9].mean()
-    assert 0.3 < np.mean(ratios) < 2.0
 
 
 @pytest.mark.slow

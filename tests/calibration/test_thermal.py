@@ -246,7 +246,7 @@ def still(**changes):
 
 def test_a_session_at_one_temperature_is_refused():
     session = still()
-    with pytest.raises(DegenerateError, match=r"change by at most .* K in the 0\.42 h") as refused:
+    with pytest.raises(DegenerateError, match=r"warm up by at most .* K in the 0\.42 h") as refused:
         calibrate(session, level="thermal")
     assert "cold robot" in refused.value.next_step
     known = calibrate(session)
@@ -262,33 +262,20 @@ def test_currents_that_warm_nothing_yet_are_refused():
 
 
 @pytest.mark.slow
-def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(learnt):
+def test_a_session_without_temperatures_is_refused_by_the_columns_it_needs(learnt):
     session = learnt["temperatures"].session
     heat = session.streams["heat"]
-    with pytest.raises(DataError, match=r"temp1_c \.\.\. temp6_c or current1_a"):
+    with pytest.raises(DataError, match=r"all of temp1_c \.\.\. temp6_c or current1_a"):
         calibrate(replace(session, streams={}), level="thermal")
     five = [at for at, value in enumerate(heat.columns) if value != "temp6_c"]
     fewer = Stream(tuple(heat.columns[at] for at in five), heat.values[:, five])
-    with pytest.raises(DataError, match="temp6_c of temp1_c"):
+    with pytest.raises(DataError, match=r"all of temp1_c \.\.\. temp6_c"):
         calibrate(session.with_streams({"heat": fewer}), level="thermal")
     soon = Stream(heat.columns, heat.values[heat.stamps_s < 3000.0])
     with pytest.raises(
         DataError, match=r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"
     ):
         calibrate(session.with_streams({"heat": soon}), level="thermal")
-
-
-@pytest.mark.slow
-def test_residuals_that_drift_say_why_the_drift_was_not_looked_for(learnt):
-    session = learnt["temperatures"].session
-    heat = session.streams["heat"]
-    soon = Stream(heat.columns, heat.values[heat.stamps_s < 3000.0])
-    (drifts,) = (
-        finding
-        for finding in calibrate(session.with_streams({"heat": soon})).verdict.findings
-        if finding.kind == "moved_slowly"
-    )
-    assert "was not looked for: temperatures were read from 0 to 2990 s, and views" in drifts.words
 
 
 def test_kelvin_is_no_celsius(learnt, tmp_path):
@@ -308,20 +295,6 @@ def test_report_and_recording_show_the_drift(learnt, tmp_path):
     page = Page(render(found.calibration, found.session, ()))
     assert "Drift with temperature" in page.text
     assert "Steel grows by 12, aluminium by 23" in page.text
-    assert "seen by the stops" in page.text
-    seen = found.calibration.thermal.seen
-    # Of the six views that are looked at again every five minutes, one is in the posture drawn.
-    assert [value.stamp_s // 300.0 for value in seen] == list(range(20))
-    course = found.calibration.thermal.course
-    told = np.interp(
-        [value.stamp_s for value in seen],
-        [value.stamp_s for value in course],
-        [value.drift_mm for value in course],
-    )
-    off = np.array([value.drift_mm for value in seen]) - told
-    # Poses that are measured to about 0.05 mm along one direction, of twenty stops.
-    assert abs(off.mean()) < 0.04
-    assert 0.01 < off.std() < 0.1
     path = tmp_path / "drift.rrd"
     layout = blueprint(found.session, found.calibration)
     write_recording(path, found.session, found.calibration, (), layout)
@@ -381,12 +354,3 @@ def test_an_instrument_that_reads_points_sees_the_drift(learnt):
     session = session.with_streams({"heat": learnt["temperatures"].session.streams["heat"]})
     found = calibrate(session, level="thermal").thermal
     assert found.residual_mm.with_drift < 0.6 * found.residual_mm.without
-    course = np.array([(point.stamp_s, point.drift_mm) for point in found.course])
-    seen = np.array(
-        [(observed_drift.stamp_s, observed_drift.drift_mm) for observed_drift in found.seen]
-    )
-    away_mm = seen[:, 1] - np.interp(seen[:, 0], *course.T)
-    # What is left of a stop is its noise, along one direction: 0.07 mm, and a tenth of a point's
-    # 0.15 m by what the arm's rotation errs.
-    assert len(seen) > 10
-    assert np.sqrt(np.mean(away_mm**2)) < 2.0 * found.residual_mm.with_drift

@@ -406,7 +406,7 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
     springs = tuple(
         JointSpring(joint=name, torque_nm=(0.0, 9.0), **spring) for name in result.robot.joint_names
     )
-    sagging = {"not_determined": (), "weight": "unknown", "payload_kg": (0.0, 0.0), "stops": ()}
+    sagging = {"not_determined": (), "weight": "unknown", "payload_kg": (0.0, 0.0)}
     elastic = ElasticResult(joints=springs, sag_mm=Sag(0.1, 0.2), **sagging)
     bending = replace(result, elastic=elastic)
     poses = targets_near(2, result)

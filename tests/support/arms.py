@@ -66,6 +66,7 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
         Loads.none(len(q)),
         np.zeros(3),
         np.arange(12),
+        np.ones(6, dtype=bool),
     )
 
 

@@ -49,8 +49,7 @@ def warmed(
     truth, warming = simulate_warm_up(how), how.warming()
     session = cell_session(truth, "warm-up", seen="poses")
     whole = session.with_streams({"heat": warming.recorded(temperatures=temperatures)})
-    inputs, missing = inputs_of(whole, truth.robot.joints.shape[1])
-    assert inputs is not None, missing
+    inputs = inputs_of(whole, truth.robot.joints.shape[1])
     return Warmed(truth, how.heats, warming, session, calibrate(session, level=level), inputs)
 
 

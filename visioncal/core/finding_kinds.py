@@ -82,7 +82,7 @@ _KINDS = (
     Kind("misread_joints", 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     # The frames are by the poses, which a wrong model does not change.
     Kind("other_arm", REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
-    *map(Kind, ("exchanged_joints", "contradicting_joints", "base_link", "tool_frame")),
+    *map(Kind, ("contradicting_joints", "base_link", "tool_frame")),
     *map(Kind, ("level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.
     Kind(

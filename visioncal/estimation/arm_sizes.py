@@ -226,9 +226,8 @@ class _Blocks:
         """
         rms = self.nominal.rms
         levels = np.maximum(_LITTLE_NOISE * rms, LEAST_SIGMA)
-        motion = [
-            np.sqrt(np.sum(np.mean(self.columns(name)[:, :6] ** 2, axis=0))) for name in self.bases
-        ]
+        moved = (self.columns(name)[:, :6] for name in self.bases)
+        motion = [np.sqrt(np.sum(np.mean(columns**2, axis=0))) for columns in moved]
         typical = np.array([_TYPICAL[name] for name in self.bases])
         sizes = np.maximum(typical, np.linalg.norm(rms) / np.maximum(motion, LEAST_SIGMA))
         return np.asarray(np.log(np.append(np.tile(levels, len(self.nominal.before)), sizes)))
@@ -256,17 +255,16 @@ class _Blocks:
         """Without the block that has the least evidence; None where all have enough."""
         # These are the first harmonics of the joints' functions.
         fixed = {"eccentricity", _SECOND} if HARMONICS in self.bases else {_SECOND}
-        trials = [self.without(name, best.logs) for name in self.bases if name not in fixed]
-        # With the other sizes held, this is an upper bound of the gain.
-        values = []
-        for lesser, logs in trials:
-            values.append(np.inf)
+        trials = []
+        for name in (name for name in self.bases if name not in fixed):
+            lesser, logs = self.without(name, best.logs)
             # Residuals that nothing else explains can make the likelihood singular.
             with suppress(LinAlgError):
-                values[-1] = lesser.likelihood.model.at(logs, is_sloped=False).value
+                # With the other sizes held, this is an upper bound of the gain.
+                value = lesser.likelihood.model.at(logs, is_sloped=False).value
+                trials.append((value, lesser, logs))
         enough = best.value + 0.5 * SIGNIFICANT
-        for index in np.argsort(values).tolist():
-            lesser, logs = trials[index]
+        for _, lesser, logs in sorted(trials, key=lambda trial: trial[0]):
             with suppress(LinAlgError):
                 found = lesser.most_likely(logs, enough)
                 if found.value < enough:
@@ -288,9 +286,7 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     levels = np.exp(best.logs[:count]).reshape(-1, 2)
     sizes = np.sqrt(arm.shares @ np.exp(2.0 * best.logs[count:]))
     errors = {
-        name: ArmErrors(
-            basis, float(sizes[arm.slice_of(name)][0]), gain / len(arm.bases), of_links=True
-        )
+        name: ArmErrors(basis, float(sizes[arm.slice_of(name)][0]), gain, of_links=True)
         for name, basis in arm.bases.items()
     }
     if waves is None or HARMONICS not in errors:

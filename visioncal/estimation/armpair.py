@@ -1,12 +1,12 @@
 """Observations of a robot's arm: its stops, and the pair of frames observed across it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.armmodel import HARMONICS, ArmModel
+from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Noise, Observations, State
 from visioncal.robot import Loads
@@ -19,6 +19,7 @@ class ArmPair:
     problem: Problem
     state: State
     robot: str
+    rows: IntArray  # Rows of the pair's observations.
     observer: str  # The observing frame.
     observed: str  # The observed frame.
 
@@ -27,27 +28,14 @@ class ArmPair:
         """The pair with the most pose observations, if possible with no other robot between."""
 
         def rank(at: int) -> tuple[bool, int]:
-            group = problem.groups[at]
-            robots = [step.robot for step in group.path if step.robot]
-            pose_count = int(problem.observations.has_rotation[group.rows].sum())
-            return robots == [robot], pose_count
+            robots = [step.robot for step in problem.groups[at].path if step.robot]
+            pose_count = int(observations.has_rotation[problem.groups[at].rows].sum())
+            return robots == [robot], pose_count if robot in robots else -1
 
-        candidates = [
-            at
-            for at, group in enumerate(problem.groups)
-            if robot in {step.robot for step in group.path}
-        ]
-        row = int(problem.groups[max(candidates, key=rank)].rows[0])
         observations = problem.observations
-        return cls(problem, state, robot, observations.observers[row], observations.observed[row])
-
-    @property
-    def rows(self) -> IntArray:
-        """Rows of the pair's observations."""
-        observations = self.problem.observations
-        pairs = zip(observations.observers, observations.observed, strict=True)
-        own = (self.observer, self.observed)
-        return np.flatnonzero(np.array([pair == own for pair in pairs], dtype=bool))
+        rows = problem.groups[max(range(len(problem.groups)), key=rank)].rows
+        observer, observed = observations.observers[rows[0]], observations.observed[rows[0]]
+        return cls(problem, state, robot, rows, observer, observed)
 
     @property
     def is_observer_carried(self) -> bool:
@@ -164,7 +152,7 @@ class ArmData:
     at: FloatArray  # (3,) reference point of the target, in its frame [m].
     frames: IntArray  # (f,) columns of the unknown frames without a prior.
     # (6,) which components of the poses are measured (rotation, translation).
-    measured: Mask = field(default_factory=lambda: np.ones(6, dtype=bool))
+    measured: Mask
 
     @property
     def arm_covariance(self) -> FloatArray:
@@ -181,10 +169,6 @@ class ArmData:
         """The pair of frames between which the arm is observed."""
         return ArmPair.of(self.problem, self.state, self.robot)
 
-    def basis(self, q: FloatArray) -> FloatArray:
-        """(k, 6, p) Jacobian of the flange by the arm's errors."""
-        return self.model.basis(q)
-
     def place_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Jacobian of the carried point's position at (k, n) joint angles [rad].
 
@@ -192,14 +176,11 @@ class ArmData:
             (k, 3, f + p) by the chain's unknowns, and (k, 3, 6) by motions of the flange.
         """
         motions = np.broadcast_to(np.eye(6), (len(q), 6, 6))
-        perturbations = np.concatenate([self.basis(q), motions], axis=2)
+        perturbations = np.concatenate([self.model.basis(q), motions], axis=2)
         poses, pair_jacobian = self.pair.jacobian(self.model.base_from_flange(q), perturbations)
-        edges, errors = pair_jacobian.shape[2] - perturbations.shape[2], len(self.columns)
-        jacobian = np.zeros((len(q), 6, self.problem.size))
-        jacobian[:, :, :edges] = pair_jacobian[:, :, :edges]
-        jacobian[:, :, self.columns] = pair_jacobian[:, :, edges : edges + errors]
-        columns = [jacobian[:, :, self.chain], pair_jacobian[:, :, edges + errors :]]
-        by_both = self.pair.place_jacobian(poses, np.concatenate(columns, axis=2), self.at)
+        of_arm = pair_jacobian[:, :, -perturbations.shape[2] :]
+        jacobian = np.concatenate([pair_jacobian[:, :, self.frames], of_arm], axis=2)
+        by_both = self.pair.place_jacobian(poses, jacobian, self.at)
         return by_both[:, :, :-6], by_both[:, :, -6:]
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
@@ -210,33 +191,3 @@ class ArmData:
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
         variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
         return np.asarray(np.sqrt(variances))
-
-    def function_errors(self, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Joint function errors (n, k) beyond offset and ratio, with standard deviations [rad].
-
-        They are those at (k,) angles of every joint [rad].
-        """
-        model = self.model
-        count, chain = model.nominal.joint_count, model.bare.chain
-        turned = np.repeat(angles[:, None], count, axis=1)
-        errors = chain.effective(turned) - chain.functions[:, 0] - chain.functions[:, 1] * turned
-        waves = model.waves
-        if waves is None:
-            return errors.T, np.zeros_like(errors.T)
-        orders = len(waves.sizes) // (2 * count)
-        phases = np.arange(1, orders + 2) * angles[:, None]
-        columns = np.stack([np.sin(phases), np.cos(phases)], axis=2)
-        higher = model.weights[HARMONICS] * columns[:, 1:].reshape(len(angles), -1)
-        eccentric, harmonic = (model.columns_of(name) for name in ("eccentricity", HARMONICS))
-        variances = np.zeros((count, len(angles)))
-        for joint in range(count):
-            rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
-            determined = higher @ waves.directions[rows]
-            jacobian = np.zeros((len(angles), len(model.values)))
-            jacobian[:, harmonic] = determined
-            first = [eccentric.start + joint, eccentric.start + count + joint]
-            jacobian[:, first] = model.weights["eccentricity"] * columns[:, 0]
-            prior = np.sum((higher * waves.sizes[rows]) ** 2, axis=1)
-            variances[joint] = np.einsum("kp,pq,kq->k", jacobian, self.arm_covariance, jacobian)
-            variances[joint] += self.error_rad**2 * (prior - np.sum(determined**2, axis=1))
-        return errors.T, np.sqrt(np.maximum(variances, 0.0))

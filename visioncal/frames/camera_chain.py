@@ -24,6 +24,7 @@ from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge
+from visioncal.results.arm import FUNCTIONS
 from visioncal.vision.camera import intrinsics
 
 # Locating a pixel takes a millisecond; the arm's model is slow to import.
@@ -54,7 +55,9 @@ class ArmErrors:
         """
         result, fit = calibration.arm, calibration.joint_fit
         # The joint fit's covariance does not contain functions of the joints.
-        if fit is None or not calibration.arm_is_calibrated or result is None or result.functions:
+        if result is None or result.level == FUNCTIONS:
+            return None
+        if fit is None or not calibration.arm_is_calibrated:
             return None
         from visioncal.calibration.verification.calibration_prior import fitted_model
 

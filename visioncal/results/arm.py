@@ -1,6 +1,5 @@
 """Sections of a result on an arm: kinematics, errors, joint compliance and thermal drift."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Literal
@@ -9,13 +8,13 @@ import numpy as np
 
 from visioncal.core.choices import Convention
 from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
-from visioncal.core.number_format import figure, listed, percent
+from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel
 
-NOMINAL = "nominal"
+NOMINAL, FUNCTIONS = "nominal", "functions"
 # Number of standard deviations beyond which a change is significant.
 _SURE = 3.0
 
@@ -90,45 +89,6 @@ class WorkspacePlace:
     sigma_mm: float
 
 
-@dataclass(frozen=True)
-class JointFunction:
-    """Angle-dependent error of a joint, beyond offset and ratio."""
-
-    joint: str  # The joint's name.
-    error_mrad: tuple[float, ...]  # Error at equal steps of one turn from -180 degrees [mrad].
-    sigma_mrad: tuple[float, ...]  # Its standard deviation [mrad].
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointFunctions:
-    """Angle-dependent errors of the joints, as functions with a Gaussian process prior."""
-
-    size_mrad: float  # Their standard deviation [mrad].
-    length_deg: float  # Their correlation length in the joint's angle [deg].
-    joints: tuple[JointFunction, ...]  # One entry for each joint.
-
-
-Region = Literal["box", "ahead", "beside", "behind"]
-_WHERE = {
-    "box": "in the box of the stops",
-    "ahead": "before the base",
-    "beside": "beside the base",
-    "behind": "behind the base",
-}
-
-
-@dataclass(frozen=True)
-class CarriedRegion:
-    """Predicted errors of calibrated and nominal arm in a region of the workspace."""
-
-    # The box of the stops' flange positions; outside it, the part ahead of, beside or behind the
-    # base, the stops being ahead.
-    region: Region
-    sigma_mm: float  # Predicted error of the calibrated arm in another session (rms) [mm].
-    nominal_mm: float  # The same of the nominal arm [mm].
-    better: bool  # Whether the calibrated arm's is significantly smaller.
-
-
 @dataclass(frozen=True, kw_only=True)
 class CarriesOver:
     """Comparison of calibrated and nominal arm over the workspace."""
@@ -141,19 +101,16 @@ class CarriesOver:
     nominal_mm: float  # The same of the nominal arm [mm].
     session_mm: float  # Part of that for another session, as assumed for arms of this size [mm].
     better_share: float  # Share of the workspace where the calibrated arm is significantly better.
-    regions: tuple[CarriedRegion, ...]  # One entry for each region.
 
     @property
     def words(self) -> str:
         """The comparison in sentences."""
-        worse = [_WHERE[region.region] for region in self.regions if not region.better]
-        where = f"; {listed(worse)} it is not clearly better than as stated" if worse else ""
         return (
             f"Where it was measured, the calibrated arm errs by {figure(self.measured_mm)} mm (the "
             f"stated arm by {figure(self.measured_nominal_mm)} mm). Elsewhere "
             f"{figure(self.sigma_mm)} mm are predicted (the stated arm: {figure(self.nominal_mm)} "
             f"mm), {figure(self.session_mm)} mm of this for another session. The calibrated arm is "
-            f"clearly better in {percent(self.better_share)} of the workspace{where}."
+            f"clearly better in {percent(self.better_share)} of the workspace."
         )
 
 
@@ -218,8 +175,6 @@ class ArmResult(Section):
     # more than at other postures with the same flange position.
     measured_map: tuple[WorkspacePlace, ...] = ()
     carries_over: CarriesOver | None = None  # Comparison with the nominal arm over the workspace.
-    # Angle-dependent errors of the joints, at level `functions`.
-    functions: JointFunctions | None = None
     measured: tuple[JointRange, ...] = ()  # Ranges of the joints at the stops.
     observability: Observability | None = None  # Observability of the parameters at the stops.
     not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.
@@ -310,18 +265,6 @@ class Sag:
     most: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedStop:
-    """Load and deflection at one stop."""
-
-    view: int  # Number of its first view.
-    payload_kg: float  # Payload on the flange [kg].
-    sag_mm: float  # Flange deflection under the load [mm].
-    torque_nm: tuple[float, ...]  # Torques on the joints [N m].
-    # Deflection by joint from this stop alone [mrad], where it determines it.
-    bend_mrad: Mapping[str, float]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticResult(Section):
     """Joint compliance: `elastic` in calibration.json."""
@@ -331,7 +274,6 @@ class ElasticResult(Section):
     weight: str  # Whether the links' weight is from the model's masses, or unknown.
     payload_kg: tuple[float, float]  # Smallest and largest payload [kg].
     sag_mm: Sag  # Flange deflection under the loads of the stops.
-    stops: tuple[LoadedStop, ...]  # The stops with torques and deflections.
     # (n, 4 n) compliance times unknown masses and first moments of links (see `robot.bent_joints`);
     # None where the masses are known, or have little effect.
     weight_moments: Matrix | None = None
@@ -342,15 +284,6 @@ class ElasticResult(Section):
     def compliance(self) -> FloatArray:
         """(n,) compliance of the joints [rad/(N m)]."""
         return np.array([joint.compliance_rad_per_nm for joint in self.joints])
-
-    def bends(self, joint: int) -> list[tuple[float, float]]:
-        """A joint's torque [N m] and deflection [mrad], at the stops that determine the latter."""
-        name = self.joints[joint].joint
-        return [
-            (stop.torque_nm[joint], stop.bend_mrad[name])
-            for stop in self.stops
-            if name in stop.bend_mrad
-        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,15 +324,6 @@ class DriftPoint:
 
 
 @dataclass(frozen=True)
-class ObservedDrift:
-    """Drift of the flange observed at a stop in that posture [mm], with its time [s]."""
-
-    view: int
-    stamp_s: float
-    drift_mm: float
-
-
-@dataclass(frozen=True)
 class ViewDrift:
     """Drift of the flange at a view [mm], and the largest temperature rise of a link [K]."""
 
@@ -422,11 +346,7 @@ class ThermalResult(Section):
     not_determined: tuple[str, ...]
     residual_mm: DriftResidual  # Residuals without and with drift.
     likelihood_ratio: float  # Twice the gain in log-likelihood over an arm without drift.
-    rises_k: tuple[float, ...]  # (n,) range of each link's temperature over the views [K].
-    trained_s: float  # Duration of the views [s].
     course: tuple[DriftPoint, ...]  # Predicted drift over time.
-    # Drift observed at stops in the same posture; None in files of earlier versions.
-    seen: tuple[ObservedDrift, ...] | None = None
     views: tuple[ViewDrift, ...]  # Drift at each view.
 
     def model(self, robot: Robot) -> ThermalModel:

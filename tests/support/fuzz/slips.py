@@ -144,7 +144,7 @@ def _rows(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     pair = np.sort(rng.choice(len(told.joints), 2, replace=False))
     order = np.arange(len(told.joints))
     order[pair] = pair[::-1]
-    words = f"angles of views {pair[0]} and {pair[1]} are exchanged"
+    words = f"disagree in view {pair[0]}, view {pair[1]}"
     if told.poses is None:
         words = f"poses of view {pair[0]} and view {pair[1]} exchanged"
     return replace(told, joints=told.joints[order], words=words)

@@ -24,11 +24,7 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    held_shift,
-)
+from visioncal.estimation.solve import Solution, covariance_of, held_shift
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
@@ -123,13 +119,7 @@ def doubts_of_arms(
     for robot, arm in arms.items():
         for finding in (*_findings_on(arm, level), *results[robot].doubts):
             yield finding.of(_robot_name(arms, robot))
-    for found in step_finding(steps, cell, joint):
-        aside = [arm.heat.set_aside for arm in arms.values() if arm.heat and arm.heat.set_aside]
-        if found.kind == "moved_slowly" and aside:
-            words = f"Whether the arm drifts with its temperature was not looked for: {aside[0]}."
-            yield replace(found, words=f"{found.words} {words}")
-        else:
-            yield found
+    yield from step_finding(steps, cell, joint)
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmReport]) -> Iterator[str]:
@@ -142,16 +132,12 @@ def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmReport]
 
 
 def _findings_on(arm: RobotArm, level: str) -> Iterator[Finding]:
-    if arm.joints_rad is None and level not in ("auto", "hand-eye"):
-        yield Finding(
-            "level",
-            "It stays as it reports itself: its errors take joint angles and a known model.",
-            Remedy("Record joint angles, and name the arm as [robot] model in session.toml."),
-        )
-    elif arm.thermal is None and level == thermal.LEVEL:
-        words = "No data show how it drifts with its temperature: that stays in its noise."
-        step = Remedy("Record the joints' temperatures or currents in a stream, from a cold start.")
-        yield Finding("level", words, step)
+    is_cold = level == thermal.LEVEL and arm.thermal is None
+    if is_cold or (arm.joints_rad is None and level not in ("auto", "hand-eye")):
+        words = f"It stays as it reports itself: its rows lack what --level {level} needs."
+        step = "Record joint angles, and name the arm as [robot] model in session.toml"
+        step += "; record temp1_c ... or current1_a ... in a stream." * is_cold or "."
+        yield Finding("level", words, Remedy(step))
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
     if arm.errors is not None:

@@ -188,8 +188,6 @@ def assess_fit(
     covariance = sum(beside.values(), covariance_of(part, fit))
     held_out = left_out(cell_fit)
     (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
-    # The first view of each stop.
-    first = {row.station: row.view for row in reversed(cell_fit.cell.rows)}
     return FitAssessment(
         cell_fit,
         part,
@@ -198,7 +196,7 @@ def assess_fit(
         lens_errors(cell_fit),
         steps,
         {
-            name: arm.report(part, fit, covariance, middles, first, convention)
+            name: arm.report(part, fit, covariance, middles, convention)
             for name, arm in cell_fit.arms.items()
         },
         held_out,
@@ -346,7 +344,6 @@ def held_back_by_arm(cell_fit: CellFit, observed: Observed, robot: str) -> tuple
     if held is None or arm.kinematics is None:
         return ()
     nominal = arm.without_errors(held.problem)
-    nominal = arm.with_nominal_zero(nominal) or nominal
     before, after = (
         np.stack(pose_residuals(problem, _state_in(problem, state))[::-1], axis=1)
         for problem, state in (

@@ -48,7 +48,7 @@ def guess_from_camera_poses(
     # Misread joints say nothing about the poses.
     joint_poses = None
     if matched is None or not matched.misread:
-        joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
+        joint_poses = chain_poses(run.session, None if matched is None else matched.robot)
     if robot is None:
         poses = numbers_in(run.session, POSE)
         robot = robot_numbers(run) if run.clocks else poses

@@ -148,5 +148,4 @@ def put_on_one_clock(run: RunState) -> RunState:
 
 def check_joint_angles(run: RunState) -> RunState:
     """Refuses joint angles that fit the camera's poses only if they are read differently."""
-    drops = run.level != "hand-eye"
-    return check_joints(run, drops=drops, takes=drops and run.solver == "joint")
+    return check_joints(run, drops=run.level != "hand-eye")

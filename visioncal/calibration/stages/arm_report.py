@@ -1,17 +1,15 @@
 """What stops determine of a calibrated arm: its parameters, its accuracy, and remarks on both."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.calibration.guess.joints import JointReading
 from visioncal.calibration.stages import elastic
 from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.core.choices import Convention
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.armmodel import RIGID
 from visioncal.estimation.armpair import ArmData, ArmPair
@@ -31,28 +29,21 @@ from visioncal.results.arm import (
     ArmParameter,
     ArmResult,
     ArmSections,
-    CarriedRegion,
     CarriesOver,
-    JointFunction,
-    JointFunctions,
     JointRange,
     Observability,
-    Region,
     WorkspacePlace,
     WorkspaceSigma,
 )
 from visioncal.robot import convert_table, parallel_axes, table_from_document, table_of
 
-# Number of postures of a map of the accuracy, and of angles per turn of joint error functions.
-_PLACES, _ANGLES = 200, 180
+# Number of postures of a map of the accuracy.
+_PLACES = 200
 # Error of real arms between sessions (warm-up, wear, remounting), which one session does not show
 # [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.
 _SESSION_SHARE = 1.2e-4
 # The calibrated arm is better where its error is below this share of the nominal arm's.
 _BETTER = 0.8
-# Angles about the base from the centre of the stops: ahead below the first, behind above the
-# second [rad].
-_AHEAD, _BEHIND = np.pi / 3, 2 * np.pi / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,25 +58,20 @@ class ArmReport:
 def report_of(
     arm: ArmData,
     levels: SelectedArmLevel,
-    views: Sequence[int],
     convention: Convention | None,
-    zero: JointReading | None,
 ) -> ArmReport:
     """Reports a calibrated arm.
 
     Args:
         arm: The observations of the arm.
         levels: Its levels.
-        views: (m,) the view of each stop.
         convention: Convention of the arm's table; see `add_parameters`.
-        zero: Reading of a joint with a lost zero; None without one.
     """
     model, notes = arm.model, list[str]()
     result = replace(
         levels.result,
         robot=model.robot,
         backlash=elastic.plays_of(model, arm.arm_covariance),
-        functions=_functions_of(arm, levels),
         measured=tuple(
             JointRange(name, float(column.min()), float(column.max()))
             for name, column in zip(model.nominal.joint_names, arm.q.T, strict=True)
@@ -93,12 +79,12 @@ def report_of(
     )
     # With backlash and compliance alone the table stays nominal.
     if model.weights.keys() & set(RIGID):
-        result, advice = add_parameters(result, arm, convention, zero)
+        result, advice = add_parameters(result, arm, convention)
         with one_blas_thread():
             carried = _carries_over(arm, levels)
         result = replace(result, left_out=levels.left_out(), carries_over=carried)
         notes += [carried.words, advice] if advice else [carried.words]
-    springs = elastic.elastic_of(arm, levels.errors, views)
+    springs = elastic.elastic_of(arm, levels.errors)
     notes += elastic.play_remarks(result.backlash)
     notes += () if springs is None else elastic.remarks(springs)
     doubts = () if springs is None else tuple(elastic.doubts(springs))
@@ -106,10 +92,7 @@ def report_of(
 
 
 def add_parameters(
-    result: ArmResult,
-    arm: ArmData,
-    convention: Convention | None = None,
-    zero: JointReading | None = None,
+    result: ArmResult, arm: ArmData, convention: Convention | None
 ) -> tuple[ArmResult, str]:
     """Adds the parameters of an arm that the stops determine, and how accurate the arm is.
 
@@ -118,7 +101,6 @@ def add_parameters(
         arm: The observations of the arm.
         convention: Convention of the table; None for the stated one, or Hayati's where axes are
             nearly parallel, as it has no singularity there.
-        zero: Reading of a joint with a lost zero.
 
     Returns:
         The section, and which stops to add; empty where none would determine more.
@@ -156,10 +138,6 @@ def add_parameters(
     links, rows = arm.error_rad * model.weights.get("links", 1.0), []
     for parameter, sigma, by_row in zip(parameters, sigmas, jacobian, strict=True):
         stated, identified = parameter.value(before), parameter.value(after)
-        if zero is not None and parameter.name == "theta_rad":
-            # The fit starts at the zero that was found; changes are from the stated one.
-            scale = nominal.chain.functions[parameter.joint, 1]
-            stated -= float(scale * zero.zeros[parameter.joint])
         rows.append(
             ArmParameter(
                 joint=nominal.joint_names[parameter.joint],
@@ -205,22 +183,6 @@ def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobia
     return Jacobians(frames.reshape(-1, 12), errors.reshape(-1, columns.shape[2]))
 
 
-def _functions_of(arm: ArmData, levels: SelectedArmLevel) -> JointFunctions | None:
-    """Tables of an arm's joint error functions; None where none were found."""
-    if levels.functions is None:
-        return None
-    errors, sigmas = arm.function_errors(np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False))
-    rows = zip(arm.model.nominal.joint_names, 1e3 * errors, 1e3 * sigmas, strict=True)
-    return JointFunctions(
-        size_mrad=1e3 * levels.functions.sigma_rad,
-        length_deg=float(np.rad2deg(levels.functions.length_rad)),
-        joints=tuple(
-            JointFunction(name, tuple(error.tolist()), tuple(sigma.tolist()))
-            for name, error, sigma in rows
-        ),
-    )
-
-
 def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:
     """Computes where a calibrated arm is more accurate than the nominal one."""
     model, q = arm.model, postures(arm.model.robot)
@@ -237,14 +199,10 @@ def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:
     )
     # The calibrated arm's own error is independent of its difference from the nominal arm.
     squares = 1e6 * np.array([variances, np.sum(difference**2, axis=1) + variances])
-    regions = list(_regions(places, model.base_from_flange(arm.q, arm.loads)[:, :3, 3]))
-    box = regions[0][1]
-    sigma_mm, nominal_mm = np.sqrt(squares[:, ~box if (~box).any() else box].mean(axis=1)).tolist()
-    carried = []
-    for name, region in regions:
-        if region.any():
-            ours_mm, theirs_mm = np.sqrt(squares[:, region].mean(axis=1)).tolist()
-            carried.append(CarriedRegion(name, ours_mm, theirs_mm, ours_mm < _BETTER * theirs_mm))
+    stops = model.base_from_flange(arm.q, arm.loads)[:, :3, 3]
+    is_away = np.any((places < stops.min(axis=0)) | (places > stops.max(axis=0)), axis=1)
+    is_away |= not is_away.any()
+    sigma_mm, nominal_mm = np.sqrt(squares[:, is_away].mean(axis=1)).tolist()
     return CarriesOver(
         measured_mm=levels.result.chosen.held_out_mm,
         measured_nominal_mm=levels.result.nominal.held_out_mm,
@@ -252,7 +210,6 @@ def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:
         nominal_mm=nominal_mm,
         session_mm=1e3 * session_m,
         better_share=float(np.mean(squares[0] < _BETTER**2 * squares[1])),
-        regions=tuple(carried),
     )
 
 
@@ -263,15 +220,3 @@ def _carried_position(arm: ArmData, state: State, flange: FloatArray) -> FloatAr
     if pair.is_observer_carried:
         return invert(poses)[:, :3, 3]
     return np.asarray(poses[:, :3, :3] @ arm.at + poses[:, :3, 3])
-
-
-def _regions(places: FloatArray, stops: FloatArray) -> Iterator[tuple[Region, Mask]]:
-    """Masks (k,) of places in the stops' bounding box, and outside it by angle about the base."""
-    box = np.all((places >= stops.min(axis=0)) & (places <= stops.max(axis=0)), axis=1)
-    centre = stops.mean(axis=0)
-    angle = np.arctan2(places[:, 1], places[:, 0]) - np.arctan2(centre[1], centre[0])
-    angle = np.abs((angle + np.pi) % (2 * np.pi) - np.pi)
-    yield "box", box
-    yield "ahead", ~box & (angle < _AHEAD)
-    yield "beside", ~box & (angle >= _AHEAD) & (angle <= _BEHIND)
-    yield "behind", ~box & (angle > _BEHIND)

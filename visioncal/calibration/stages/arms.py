@@ -2,22 +2,17 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
-from visioncal.calibration.stages.kinematics import (
-    SelectedArmLevel,
-    allows_functions,
-    select_errors,
-)
-from visioncal.calibration.stages.reported_poses import move_to_arm
+from visioncal.calibration.stages.kinematics import ASKED, SelectedArmLevel, select_errors
 from visioncal.calibration.stages.thermal import HeatedStops, ThermalFit, drift_result, find_drift
 from visioncal.core.choices import Convention
-from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.errors import DataError
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import (
@@ -30,7 +25,7 @@ from visioncal.estimation.arm import (
     stops_of,
 )
 from visioncal.estimation.arm_sizes import most_orders
-from visioncal.estimation.armmodel import ArmModel, blocks_of
+from visioncal.estimation.armmodel import HARMONICS, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
@@ -43,8 +38,8 @@ from visioncal.session.table import loads_of
 
 # Rounding of written poses and joints [m, rad].
 _ROUNDING = 1e-5
-# Stops that differ by less are at one pose: a loaded arm may deflect by so much [m, rad].
-_SAME_M, _SAME_RAD = 0.02, 0.02
+# Fewest stops for functions of the joints.
+_FEWEST_FOR_FUNCTIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +74,8 @@ class RobotArm:
     ) -> Self:
         """Builds a nominal arm.
 
-        Args:
-            robot: Name of the robot in the problem.
-            reported: (s, 4, 4) reported `base_from_flange`; NaN where unknown.
-            views: The rows with its pose at the m stops where it is known.
-            matched: Model, matched with poses and joints; None where none is known.
-            recorded: The session, and the robot's name there.
+        `views` are the rows at the m stops with a pose, `recorded` the session and the robot's name
+        there.
         """
         known = {} if matched is None else matched.joints_rad
         joints = [known[view.number] for view in views if view.number in known]
@@ -177,10 +168,7 @@ class RobotArm:
     def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
         """Estimates the drift with temperature, where the session determines it.
 
-        Args:
-            problem: The observations, with this arm as reported.
-            start: Starting values.
-            asked: A key of `stages.kinematics.ASKED`.
+        The problem has this arm as reported; `asked` is a key of `stages.kinematics.ASKED`.
 
         Raises:
             DataError: The level requires the drift, and the session lacks its inputs.
@@ -194,22 +182,13 @@ class RobotArm:
         inputs = heat.inputs(asked)
         if inputs is None:
             return self
-        drift = find_drift(problem, start, self.robot, heat, inputs, self.matched.arm)
+        drift = find_drift(problem, start, self.robot, heat, inputs, self.matched.robot)
         return replace(self, thermal=drift)
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
         """Looks for posture-dependent errors, by the likelihood at the fit with the nominal arm."""
         errors = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
         return replace(self, errors=errors)
-
-    def with_nominal_zero(self, problem: Problem) -> Problem | None:
-        """A problem with a lost joint zero set to its nominal value; None where none is lost."""
-        matched, q = self.matched, self.joints_rad
-        if matched is None or matched.zero is None or q is None:
-            return None
-        poses = problem.poses[self.robot].copy()
-        poses[self.has_pose] = move_to_arm(poses[self.has_pose], q, matched.arm, matched.robot)
-        return problem.with_poses(self.robot, poses)
 
     def reports_matching_joints(self, agrees: Mask) -> Mask:
         """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).
@@ -218,7 +197,7 @@ class RobotArm:
         """
         if self.matched is None or self.joints_rad is None:
             return agrees
-        nominal = self.matched.arm.base_from_flange(self.joints_rad)
+        nominal = self.matched.robot.base_from_flange(self.joints_rad)
         tools, inliers = invert(nominal) @ self.reported[self.has_pose], agrees[self.has_pose]
         residuals = distances(tools, mean_transform(tools[inliers]))
         matches = agrees.copy()
@@ -261,7 +240,7 @@ class RobotArm:
             used.loads,
             middles.get(pair.observed, np.zeros(3)),
             every[edges],
-            measured=np.repeat([shows_pose, True], 3),
+            np.repeat([shows_pose, True], 3),
         )
 
     def report(
@@ -270,7 +249,6 @@ class RobotArm:
         fit: Solution,
         covariance: FloatArray,
         middles: Mapping[str, FloatArray],
-        views: Mapping[int, int],
         convention: Convention | None = None,
     ) -> ArmReport:
         """What was found of the arm.
@@ -280,21 +258,18 @@ class RobotArm:
             fit: Their fit.
             covariance: (p, p) its covariance.
             middles: (3,) centre of each printed target by its frame, in that frame [m].
-            views: The first view of each stop.
             convention: Convention of the arm's table; see `arm_report.add_parameters`.
         """
         stops, data = stops_of(problem, self.robot), self.data(problem, fit, covariance, middles)
-        seen = [views[stop] for stop in stops.tolist()]
         heat, levels, found = self.at(stops).heat, self.kinematics, ArmReport()
         sections = ArmSections(arm=None if levels is None else levels.result)
         if data is not None and levels is not None:
-            zero = None if self.matched is None else self.matched.zero
-            found = report_of(data, levels, seen, convention, zero)
+            found = report_of(data, levels, convention)
             sections = found.sections
         if self.errors is not None and self.errors.is_likely:
             sections = replace(sections, arm_errors=_size_of(self.errors))
         if self.drift is not None and heat is not None:
-            drift = drift_result(self.drift, self.robot, heat, problem, fit)
+            drift = drift_result(self.drift, heat)
             sections = replace(sections, thermal=drift)
         return replace(found, sections=sections)
 
@@ -307,7 +282,7 @@ class RobotArm:
         if self.matched is None or self.joints_rad is None:
             return self._by_stop(pose_basis(self.reported[self.has_pose]))
         if self.model is None:
-            return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
+            return self._by_stop(link_basis(self.matched.robot, self.joints_rad))
         return self._by_stop(self.model.basis(self.joints_rad, self.loads))
 
     @property
@@ -315,7 +290,7 @@ class RobotArm:
         """Jacobian (s, 6, n) of the flange by joint offsets; None without a model."""
         if self.matched is None or self.joints_rad is None:
             return None
-        nominal = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.has_pose])
+        nominal = ArmModel.of(self.matched.robot, self.joints_rad, self.reported[self.has_pose])
         model = self.model or nominal
         return self._by_stop(model.columns("offsets", self.joints_rad, self.loads))
 
@@ -329,24 +304,18 @@ class RobotArm:
         *,
         functions: bool = False,
     ) -> Self:
-        """Selects the errors of the arm's model by the data.
+        """Selects the errors of the arm's model by the data; see `select_errors`.
 
-        Args:
-            problem: The observations, with this arm as reported.
-            start: Starting values.
-            asked: A key of `stages.kinematics.ASKED`.
-            views: (n,) view of each observation.
-            noise: Noise levels to start from.
-            functions: Whether functions of the joints are among them, where stops suffice; where
-                none are significant, the arm stays as it is.
+        The problem has this arm as reported; `views` has the view of each observation. With
+        `functions` those of the joints are among them; where none are significant, the arm stays.
         """
         used = self.at(stops_of(problem, self.robot))
         q, every = used.joints_rad, self.joints_rad
         if self.matched is None or q is None or every is None or not len(q):
             return self
-        if functions and not allows_functions(asked, len(q)):
+        if functions and (HARMONICS not in ASKED[asked] or len(q) < _FEWEST_FOR_FUNCTIONS):
             return self
-        model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, used.loads)
+        model = ArmModel.of(self.matched.robot, q, used.reported).loaded(q, used.loads)
         bases = {
             name: self._by_stop(model.columns(name, every, self.loads))
             for name in blocks_of(model.nominal, self.loads)
@@ -362,7 +331,6 @@ class RobotArm:
             asked,
             noise,
             None if harmonics is None else self._by_stop(harmonics),
-            self.with_nominal_zero(problem),
             tuple(views[index] for index in mine),
         )
         if kinematics is None:
@@ -394,9 +362,8 @@ class RobotArm:
         """The arm with a calibrated model, and its errors linearised there."""
         if self.kinematics is None:
             return self
-        blocks = self.kinematics.errors.values()
-        arm, gain = replace(self, model=model), sum(block.gain for block in blocks)
-        return replace(arm, errors=ArmErrors(arm.basis, next(iter(blocks)).sigma, gain, True))
+        arm, first = replace(self, model=model), next(iter(self.kinematics.errors.values()))
+        return replace(arm, errors=replace(first, basis=arm.basis))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
         """(m, 6, p) spread over all stops, (s, 6, p): zero where the robot has no pose."""
@@ -407,17 +374,16 @@ class RobotArm:
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """Size of the errors, as a section of a calibration."""
-    units, sigmas = np.array([np.rad2deg(1.0), 1e3]), errors.sigma * np.array([1.0, LEVER_M])
-    is_of_flange = errors.fit_sigmas is not None and errors.white is not None
+    of: Literal["flange"] | None = None
+    sigmas = errors.sigma * np.array([1.0, LEVER_M])
     if errors.fit_sigmas is not None and errors.white is not None:
-        sigmas = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
-    deg, mm = (sigmas * units).tolist()
+        of, sigmas = "flange", np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
     return ArmErrorsResult(
-        sigma_mm=mm,
-        sigma_deg=deg,
+        sigma_mm=1e3 * float(sigmas[1]),
+        sigma_deg=float(np.rad2deg(sigmas[0])),
         likelihood_ratio=errors.gain,
         estimated=errors.is_estimated,
-        of="flange" if is_of_flange else None,
+        of=of,
     )
 
 
@@ -428,30 +394,13 @@ def arm_effects(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterat
 
 
 def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
-    """Refuses loads that determine no compliance.
+    """Refuses a level that the loads cannot give.
 
     Raises:
         DataError: Compliance is requested, and no load bends the joints.
-        DegenerateError: Loads change while an arm stands still.
     """
     for arm in arms.values():
-        kg, force_n = arm.loads.payload_kg, np.linalg.norm(arm.loads.force_n, axis=1)
-        poses, robot = arm.reported[arm.has_pose], arm.matched.robot if arm.matched else None
-        if len(poses) > 1 and (np.ptp(kg) > 0.0 or np.ptp(force_n) > 0.0):
-            shift, angle = distances(poses, poses[0])
-            if shift.max() <= _SAME_M and angle.max() <= _SAME_RAD:
-                by_mass = bool(np.ptp(kg))
-                changed = (
-                    f"{kg.min():g} to {kg.max():g} kg" if by_mass else f"0 to {force_n.max():g} N"
-                )
-                raise DegenerateError(
-                    f"the load changes ({changed}), and all {len(poses)} views are of one pose of "
-                    "the arm: where the frames are cannot be separated from how far the joints "
-                    "bend.",
-                    culprits=["payload_kg" if by_mass else "force_x_n"],
-                    next_step="Take the same loads to other poses, all over the workspace: ten or "
-                    "more.",
-                )
+        robot = arm.matched.robot if arm.matched else None
         if asked == "elastic" and robot and robot.masses is None and not arm.loads.any:
             raise DataError(
                 f"level 'elastic' needs to know what bends the arm: the model of {robot.name} does "

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from visioncal.core.number_format import figure, some_of
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import ArmErrors
@@ -14,45 +14,30 @@ from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.results.arm import (
-    ElasticResult,
-    Factor,
-    JointBacklash,
-    JointSpring,
-    LoadedStop,
-    Sag,
-)
+from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag
 
 # A compliance is determined where its sigma is below this share of its prior sigma, on a joint with
 # this torque [N m]; a joint has a stiffness where its compliance is this many sigmas.
 _DETERMINED, _LOADED_NM, _SURE = 0.5, 0.05, 2.0
-# Least torque at which a stop determines a joint's bend, as a share of the greatest torque.
-_LEAST_SHARE = 0.05
 
 
-def elastic_of(
-    arm: ArmData, errors: Mapping[str, ArmErrors], views: Sequence[int]
-) -> ElasticResult | None:
-    """Estimated springs of an arm, with loads and deflections at its stops; None for a rigid one.
+def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
+    """Estimated springs of an arm, with its loads and deflections; None for a rigid one.
 
     Args:
         arm: The observations of the arm.
         errors: Its errors with prior sizes, by block.
-        views: (m,) the view of each stop.
     """
     if not errors.keys() & {COMPLIANCE, WEIGHT}:
         return None
     model, loads, names = arm.model, arm.loads, arm.model.nominal.joint_names
     torques = model.robot.load_torques(model.bent(arm.q, loads), loads)
-    greatest = np.abs(torques).max(axis=0)
-    prior = errors[COMPLIANCE].sigma / model.torque_nm if COMPLIANCE in errors else 0.0
-    sigmas, bends = np.full(len(names), prior), np.full(torques.shape, np.nan)
-    if COMPLIANCE in model.weights:
-        unit = model.weights[COMPLIANCE] / model.torque_nm
+    greatest, sigmas, prior = np.abs(torques).max(axis=0), np.zeros(len(names)), 0.0
+    if COMPLIANCE in errors:
+        prior = errors[COMPLIANCE].sigma / model.torque_nm
         variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
+        unit = model.weights[COMPLIANCE] / model.torque_nm
         sigmas = np.minimum(unit * np.sqrt(variances), prior)
-        bends = torques * model.compliance + torques * unit * _corrections(arm)
-        bends[np.abs(torques) <= np.maximum(_LOADED_NM, _LEAST_SHARE * greatest)] = np.nan
     determined = (greatest > _LOADED_NM) & (sigmas < _DETERMINED * prior)
     is_stiff = determined & (model.compliance > 0.0) & (model.compliance >= _SURE * sigmas)
     springs = []
@@ -73,45 +58,15 @@ def elastic_of(
     rigid = model.robot.base_from_flange(arm.q)[:, :3, 3]
     deflection = model.base_from_flange(arm.q, loads)[:, :3, 3] - rigid
     sag_mm = 1e3 * np.linalg.norm(deflection, axis=1)
-    rows = zip(views, loads.payload_kg.tolist(), sag_mm.tolist(), torques.tolist(), strict=True)
     return ElasticResult(
         joints=tuple(springs),
         not_determined=tuple(spring.joint for spring in springs if not spring.determined),
         weight="unknown" if model.nominal.masses is None else "of the model's masses",
         payload_kg=(float(loads.payload_kg.min()), float(loads.payload_kg.max())),
         sag_mm=Sag(float(np.median(sag_mm)), float(sag_mm.max())),
-        stops=tuple(
-            LoadedStop(
-                view=view,
-                payload_kg=kg,
-                sag_mm=mm,
-                torque_nm=tuple(torque),
-                bend_mrad={
-                    name: 1e3 * float(bend)
-                    for name, bend in zip(names, bends_at_stop, strict=True)
-                    if np.isfinite(bend)
-                },
-            )
-            for (view, kg, mm, torque), bends_at_stop in zip(rows, bends, strict=True)
-        ),
         weight_moments=model.moments,
         payload_factor=_payload_factor(arm),
     )
-
-
-def _corrections(arm: ArmData) -> FloatArray:
-    """Correction (m, n) of each compliance's value by each stop alone; NaN where it shows none.
-
-    A partial residual of a regression (Larsen and McCleary 1972) is the fitted bend plus the
-    residual, weighted by its covariance, along the joint.
-    """
-    linear = arm.problem.linear(arm.state)
-    columns = linear.jacobian[:, :, arm.columns[arm.model.columns_of(COMPLIANCE)]]
-    weighted = np.linalg.solve(arm.problem.total_covariance(linear, arm.noise), columns)
-    is_at = (arm.problem.observations.stops == arm.stops[:, None]).astype(float)
-    gradient = is_at @ np.einsum("mij,mi->mj", weighted, linear.residuals)
-    information = is_at @ np.einsum("mij,mij->mj", weighted, columns)
-    return np.asarray(-gradient / np.where(information > 0.0, information, np.nan))
 
 
 def _payload_factor(arm: ArmData) -> Factor | None:
@@ -152,19 +107,11 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
             f"The joints bend under load: their stiffness is {words}. At these stops that moves "
             f"the flange by up to {figure(elastic.sag_mm.most)} mm."
         )
-    rigid, is_one = elastic.not_determined, len(elastic.not_determined) == 1
     if elastic.weight_moments is not None:
         yield (
             "The arm yields to its own weight, of which its model states nothing: how far is "
             "estimated at every posture, and counted. A payload_kg that changes, or mass_kg and "
             "com_m in the joints' table, determine the stiffness."
-        )
-    elif rigid:
-        which = "All joints" if len(rigid) == len(elastic.joints) else some_of(rigid)
-        yield (
-            f"{which} {'is' if is_one else 'are'} not seen to bend under the loads of these stops, "
-            f"and {'is' if is_one else 'are'} taken for rigid. A load of another direction, or "
-            "farther out, would show it."
         )
 
 

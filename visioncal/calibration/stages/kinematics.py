@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,18 +24,9 @@ from visioncal.estimation.armmodel import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import (
-    Solution,
-    fit_problem,
-    left_out_residuals,
-    starting_noise,
-)
-from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
+from visioncal.estimation.solve import Solution, fit_problem, left_out_residuals
+from visioncal.results.arm import FUNCTIONS, NOMINAL, ArmLevel, ArmResult, UnseenView
 
-# Prior sigma of a zero that was found from the target's poses, and of the other joints' zeros
-# [rad].
-_ZERO_SIGMA_RAD = 5e-4
 # The blocks of errors by what the user asks for: the quick one after a lost encoder, or all that
 # the data determine.
 _ALL = (*RIGID, COMPLIANCE, WEIGHT, BACKLASH, HARMONICS)
@@ -46,11 +37,7 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "thermal": _ALL,
     "auto": _ALL,
 }
-# Requests that leave the level of the geometry to the data.
-_AUTOMATIC = ("auto", "thermal")
-# The name of a level by the block of errors that it has and the ones before it lack, and the fewest
-# stops for functions of the joints.
-FUNCTIONS, _FEWEST_FOR_FUNCTIONS = "functions", 20
+# The name of a level by the block of errors that it has and the ones before it lack.
 _LEVEL_OF = {
     BACKLASH: "backlash",
     "offsets": "offsets",
@@ -72,18 +59,18 @@ class LevelFit:
     # robot's observations, in the fit and to first order without the observation's stop.
     squares: FloatArray
     has_rotation: Mask  # (m,) which observations include a rotation.
-    # The errors by block; empty for the nominal arm.
-    errors: Mapping[str, ArmErrors] = field(default_factory=dict)
-    gain: float = 0.0  # Twice the gain in log-likelihood over the nominal arm.
-    functions: JointFunctions | None = None  # Functions of the joints; None without any.
+    errors: Mapping[str, ArmErrors]  # The errors by block; empty for the nominal arm.
+    gain: float  # Twice the gain in log-likelihood over the nominal arm.
+    functions: JointFunctions | None  # Functions of the joints; None without any.
 
     @classmethod
     def of(
         cls, problem: Problem, state: State, robot: str, noise: Noise, sizes: ArmSizes | None
     ) -> "LevelFit":
         """Fits all unknowns with errors of some sizes; the nominal arm where `sizes` is None."""
+        errors = {} if sizes is None else sizes.errors
         if sizes is not None:
-            effects = [error.effect(robot, name) for name, error in sizes.errors.items()]
+            effects = [error.effect(robot, name) for name, error in errors.items()]
             problem = problem.with_effects([*problem.effects, *effects])
             noise = replace(noise, robots=sizes.levels)
         values = np.append(state.values, problem.start_values[len(state.values) :])
@@ -96,15 +83,8 @@ class LevelFit:
         squares = np.sum(np.stack(residuals, axis=1).reshape(-1, 2, 2, 3) ** 2, axis=3)
         is_point = np.array([name in problem.points for name in seen.observed], dtype=bool)
         has_rotation = seen.has_rotation & ~is_point
-        level = cls(fit, squares, has_rotation[rows])
-        if sizes is None:
-            return level
-        return replace(level, errors=sizes.errors, gain=sizes.gain, functions=sizes.functions)
-
-    @property
-    def held_out_mm(self) -> float:
-        """RMS of the residuals of left-out stops [mm]."""
-        return self.result.held_out_mm
+        gain, functions = (0.0, None) if sizes is None else (sizes.gain, sizes.functions)
+        return cls(fit, squares, has_rotation[rows], errors, gain, functions)
 
     @cached_property
     def result(self) -> ArmLevel:
@@ -193,7 +173,6 @@ def select_errors(
     asked: str,
     noise: Noise,
     harmonics: FloatArray | None = None,
-    stated: Problem | None = None,
     views: tuple[int, ...] = (),
 ) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
@@ -210,8 +189,6 @@ def select_errors(
         asked: A key of `ASKED`.
         noise: The noise's levels to start from.
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
-        stated: The observations with zeros as in the model, where `problem` has a shifted zero
-            corrected; None without one. Then offsets are the least level.
         views: The view of each of the robot's observations.
 
     Returns:
@@ -220,7 +197,7 @@ def select_errors(
     is_enough = len(stops_of(problem, robot)) >= FEWEST_STOPS
 
     def likely(blocks: Sequence[str]) -> ArmSizes | None:
-        own = {name: bases[name] for name in bases if name in blocks}
+        own = {name: basis for name, basis in bases.items() if name in blocks}
         waves = harmonics if HARMONICS in blocks else None
         with suppress(np.linalg.LinAlgError):
             if is_enough:
@@ -230,37 +207,21 @@ def select_errors(
     def fitted(sizes: ArmSizes | None) -> LevelFit:
         """The fit with errors of some sizes; the nominal one where it is no better."""
         with suppress(np.linalg.LinAlgError):
-            fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else start
-            return fit if fit.held_out_mm < start.held_out_mm else start
-        return start
+            fit = LevelFit.of(problem, state, robot, noise, sizes) if sizes else nominal
+            return fit if fit.result.held_out_mm < nominal.result.held_out_mm else nominal
+        return nominal
 
     # Numbers may be so large that their squares are none.
     with one_blas_thread(), np.errstate(over="ignore", invalid="ignore"):
         sizes = likely(ASKED[asked])
         if harmonics is not None and sizes is None:
             return None
-        nominal = start = LevelFit.of(problem, state, robot, noise, None)
-        fit = beyond = fitted(sizes)
-        if ASKED[asked] != _ALL:
-            beyond = fitted(likely(_ALL))
-        is_beyond = beyond.gain - fit.gain > SIGNIFICANT
-        if stated is not None:
-            # A shifted zero has a gain of its own.
-            nominal = LevelFit.of(stated, state, robot, noise, None)
-            values = [
-                robot_likelihood(part, level.fit.state, starting_noise(part)).white[1]
-                for part, level in ((stated, nominal), (problem, start))
-            ]
-            gain = 2.0 * (values[0] - values[1])
-            least = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
-            fit = replace(fit, errors=fit.errors or {"offsets": least}, gain=fit.gain + gain)
-    was_asked = asked not in _AUTOMATIC
+        nominal = LevelFit.of(problem, state, robot, noise, None)
+        fit = fitted(sizes)
+        beyond = fit if ASKED[asked] == _ALL else fitted(likely(_ALL))
+    is_beyond = beyond.gain - fit.gain > SIGNIFICANT
+    was_asked = asked not in ("auto", "thermal")
     return SelectedArmLevel(nominal, fit, was_asked, views, beyond if is_beyond else None)
-
-
-def allows_functions(asked: str, stops: int) -> bool:
-    """Whether a level allows functions of the joints, and there are enough stops for them."""
-    return HARMONICS in ASKED.get(asked, ()) and stops >= _FEWEST_FOR_FUNCTIONS
 
 
 def check_level(asked: str) -> None:
@@ -294,13 +255,15 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
 
 def doubts(kinematics: SelectedArmLevel) -> Iterator[Finding]:
     """Reports where other errors explain the views far better than those of the requested level."""
-    chosen, best = kinematics.fit, kinematics.beyond
-    if best is not None and best.held_out_mm < chosen.held_out_mm:
+    if kinematics.beyond is None:
+        return
+    chosen, best = kinematics.fit.result, kinematics.beyond.result
+    if best.held_out_mm < chosen.held_out_mm:
         yield Finding(
             "level",
-            f"The views speak for more than the arm's {kinematics.level}: with its "
-            f"{best.result.level} stops left out are predicted to {figure(best.held_out_mm)} mm "
-            f"instead of {figure(chosen.held_out_mm)} mm.",
+            f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
+            f"left out are predicted to {figure(best.held_out_mm)} mm instead of "
+            f"{figure(chosen.held_out_mm)} mm.",
             Remedy("Leave --level out.", CALIBRATE),
         )
 

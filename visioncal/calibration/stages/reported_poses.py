@@ -8,10 +8,9 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.guess.joints import JointReading
 from visioncal.calibration.stages.joints import MatchedJoints, match_joints
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert, pose_difference
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding
 from visioncal.robot import Robot
@@ -24,12 +23,6 @@ _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
 # Beyond any arm's reach [m]: beside nearer rows, one that is a thousand times as far, to within
 # this factor, is in millimetres.
 _OUT_OF_REACH_M, _ALIKE = 20.0, 5.0
-
-
-def move_to_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
-    """Converts poses (m, 4, 4) of a thing on one model's flange to those on another's."""
-    on_flange = invert(before.base_from_flange(q)) @ poses
-    return np.asarray(after.base_from_flange(q) @ on_flange)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +48,6 @@ class RobotReport:
         """Removes some views."""
         kept = {key: pose for key, pose in self.base_from_flange.items() if key not in views}
         return replace(self, base_from_flange=kept)
-
-    def with_zero(self, zero: JointReading) -> Self:
-        """Corrects a joint's zero, and the poses accordingly."""
-        before, joints = self.matched, self.joints_rad
-        if before is None or joints is None:
-            return self
-        after = replace(before, zero=zero)
-        views = list(self.base_from_flange)
-        q = np.array([joints[view] for view in views])
-        poses = np.array([self.base_from_flange[view] for view in views])
-        moved = move_to_arm(poses, q, before.arm, after.arm)
-        return replace(self, base_from_flange=dict(zip(views, moved, strict=True)), matched=after)
 
 
 def reported_poses(session: Session, robot: Robot | None) -> RobotReport:

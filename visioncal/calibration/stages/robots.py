@@ -13,7 +13,7 @@ from visioncal.calibration.guess.joints import (
     JointGuess,
     guess_joints,
 )
-from visioncal.calibration.stages.joints import EXPORT_ARM, MatchedJoints, zero_taken
+from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.motion import lacks_robot_state
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -114,11 +114,11 @@ def _label(session: Session, robot: str) -> str:
     return f"Robot {robot}" if len(session.robots) > 1 else ""
 
 
-def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
+def check_joints(observed: T, *, drops: bool) -> T:
     """Refuses joints that only another reading makes fit the cameras' observations.
 
     With `drops`, views are removed whose pose and joints contradict each other, where the joints
-    are right; with `takes`, a lost zero is corrected.
+    are right. A lost zero is named.
 
     Raises:
         DataError: Joints are misread.
@@ -143,16 +143,12 @@ def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
         if (zero := guess.zero) is None:
             error = _misread(observed, reported, matched, guess, "what the camera sees")
             raise error.within(f"robot {name}") if label else error
-        used = takes and matched.zero is None
         words = (
             f"The joint angles do not belong to {zero.robot.name} as they are declared. "
             f"{guess.sentence('what the camera sees')}"
         )
-        words, command = (f"{words} {zero_taken(zero)}", EXPORT_ARM) if used else (words, "")
-        finding = Finding("misread_joints", words, Remedy(zero.fix, command))
+        finding = Finding("misread_joints", words, Remedy(zero.fix))
         observed = observed.noting((), (finding.of(label),))
-        if used:
-            observed = observed.with_robot(name, observed.robots[name].with_zero(zero))
     return observed
 
 
@@ -190,7 +186,7 @@ def _guessed(
     if len(views) < FEWEST_JOINT_ROWS:
         return None
     q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, seen))
-    return guess_joints(matched.arm, q, poses, FITS_SEEN)
+    return guess_joints(matched.robot, q, poses, FITS_SEEN)
 
 
 def _contradicted_joints(

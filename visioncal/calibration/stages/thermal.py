@@ -8,33 +8,24 @@ streams, or else from columns of views.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.number_format import figure, some_of
+from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import Solution, fit_problem, starting_noise
-from visioncal.results.arm import (
-    DriftPoint,
-    DriftResidual,
-    JointDrift,
-    ObservedDrift,
-    ThermalResult,
-    ViewDrift,
-)
+from visioncal.estimation.solve import fit_problem, starting_noise
+from visioncal.results.arm import DriftPoint, DriftResidual, JointDrift, ThermalResult, ViewDrift
 from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Inputs, Kind, ThermalModel
 from visioncal.session import Session
@@ -83,28 +74,6 @@ class HeatedStops:
         views, stamps_s = self.views[rows], self.stamps_s[rows]
         return replace(self, q=self.q[rows], views=views, stamps_s=stamps_s)
 
-    @cached_property
-    def _read(self) -> tuple[Inputs | None, str]:
-        inputs, missing = inputs_of(self.session, self.q.shape[1], self.robot)
-        untimed = self.views[np.isnan(self.stamps_s)].tolist()
-        if inputs is not None and untimed:
-            missing = f"view {untimed[0]} has no stamp_s"
-        elif inputs is not None:
-            first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
-            least_s, most_s = self.stamps_s.min(), self.stamps_s.max()
-            if least_s < first_s - _BEYOND_S or most_s > last_s + _BEYOND_S:
-                missing = (
-                    f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views "
-                    f"were taken from {least_s:.10g} to {most_s:.10g} s"
-                )
-        return inputs, missing
-
-    @property
-    def set_aside(self) -> str:
-        """Why recorded inputs cannot be used; empty where they can, or none were recorded."""
-        inputs, missing = self._read
-        return "" if inputs is None else missing
-
     def inputs(self, asked: str) -> Inputs | None:
         """What heats the arm; None where not requested, or not determined by the session.
 
@@ -112,39 +81,41 @@ class HeatedStops:
             DataError: The level requires it, and the session lacks data.
             DegenerateError: The level requires it, and all views were taken about equally warm.
         """
-        inputs, missing = self._read
         if asked not in ("auto", LEVEL):
             return None
-        if inputs is None or missing:
+        try:
+            return self._informative_inputs()
+        except (DataError, DegenerateError):
             if asked == LEVEL:
-                raise missing_error(missing)
+                raise
             return None
-        why = self._uninformative(inputs)
-        if why and asked == LEVEL:
+
+    def _informative_inputs(self) -> Inputs:
+        """What heats the arm, where it warms up during the views."""
+        inputs = inputs_of(self.session, self.q.shape[1], self.robot)
+        if np.isnan(self.stamps_s).any():
+            raise missing_error(f"view {self.views[np.isnan(self.stamps_s)][0]} has no stamp_s")
+        first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
+        least_s, most_s = self.stamps_s.min(), self.stamps_s.max()
+        if least_s < first_s - _BEYOND_S or most_s > last_s + _BEYOND_S:
+            raise missing_error(
+                f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views were "
+                f"taken from {least_s:.10g} to {most_s:.10g} s"
+            )
+        links = _expected(inputs).links_c(inputs, self.stamps_s)
+        rise, least, unit = float(np.ptp(links, axis=0).max()), _LEAST_RISE_K, "K"
+        if inputs.kind == "currents":
+            rise, least, unit = 100.0 * rise / _RISE_K, 100.0 * _LEAST_SHARE, "% of the way"
+        if rise < least:
             raise DegenerateError(
-                f"thermal: {why}: the views do not show how the arm drifts.",
+                f"thermal: the joints warm up by at most {figure(rise)} {unit} in the "
+                f"{figure((most_s - least_s) / 3600.0)} h of the {len(self.q)} used stops, and "
+                f"{least:g} {unit} are needed: the views do not show how the arm drifts.",
                 culprits=["temperatures"],
                 next_step="Begin with a cold robot, let it work for an hour or more, and look at "
                 "the same few reference views every five to ten minutes.",
             )
-        return None if why else inputs
-
-    def _uninformative(self, inputs: Inputs) -> str:
-        """States why views were all taken about equally warm; empty where they were not."""
-        links = _expected(inputs).links_c(inputs, self.stamps_s)
-        rise = float(np.ptp(links, axis=0).max())
-        hours = float(np.ptp(self.stamps_s)) / 3600.0
-        during = f"in the {figure(hours)} h of the {len(self.stamps_s)} used stops"
-        words, of_way, least, unit = "the joints' temperatures change", "", _LEAST_RISE_K, "K"
-        if inputs.kind == "currents":
-            words, of_way = "by their currents the joints warm up", " of the way"
-            rise, least, unit = 100.0 * rise / _RISE_K, 100.0 * _LEAST_SHARE, "%"
-        return (
-            f"{words} by at most {figure(rise)} {unit}{of_way} {during}, and {least:g} {unit} are "
-            "needed"
-            if rise < least
-            else ""
-        )
+        return inputs
 
 
 def missing_error(
@@ -159,11 +130,11 @@ def missing_error(
     )
 
 
-def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
+def inputs_of(session: Session, joints: int, robot: str = "") -> Inputs:
     """Reads what heats an arm with some joints; temperatures come before currents.
 
-    Returns:
-        The inputs; or None, and what is missing.
+    Raises:
+        DataError: Neither is known of all joints together.
     """
     numbers = {
         view.stamp_s: view.numbers
@@ -176,25 +147,15 @@ def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | 
         for stamp_s, row in sorted(numbers.items())
     ]
     of_views = Stream((STAMP, *names), np.array(rows).reshape(len(rows), len(names) + 1))
-    tables, missing = [*streams_of(session, robot).values(), of_views], ""
-    columns = {name for table in tables for name in table.columns}
+    tables = [*streams_of(session, robot).values(), of_views]
     for kind, form in _FORMS.items():
-        names = [form.format(at + 1) for at in range(joints)]
         for table in tables:
-            stamps_s, heat = table.group(names)
+            stamps_s, heat = table.group([form.format(at + 1) for at in range(joints)])
             if len(stamps_s) >= _FEWEST_SAMPLES:
-                return _averaged(kind, stamps_s, heat, tables), ""
-        absent = [name for name in names if name not in columns]
-        if len(absent) < joints and not missing:
-            missing = (
-                f"{some_of(absent)} of {names[0]} ... {names[-1]} are missing"
-                if absent
-                else f"{names[0]} ... {names[-1]} are filled together in fewer than "
-                f"{_FEWEST_SAMPLES} rows with a time"
-            )
-    return None, missing or (
-        f"neither a stream nor timed rows of views.csv have temp1_c ... temp{joints}_c or "
-        f"current1_a ... current{joints}_a"
+                return _averaged(kind, stamps_s, heat, tables)
+    raise missing_error(
+        f"{_FEWEST_SAMPLES} rows of a stream, or of views.csv with a time, with all of temp1_c ... "
+        f"temp{joints}_c or current1_a ... current{joints}_a"
     )
 
 
@@ -392,29 +353,10 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
     )
-    # Currents determine only the product of a gain and a growth.
-    measured = fit.inputs.kind == "temperatures"
-    counted = ("growth", "drift") if measured else ("drift",)
-    names = [name for name in fit.not_determined if name.startswith(counted)]
-    if names:
-        yield (
-            f"The views do not determine {some_of(names, 6)}: what is known of arms, steel and "
-            "aluminium stands for these."
-        )
 
 
-def drift_result(
-    fit: ThermalFit, robot: str, stops: HeatedStops, problem: Problem, fitted: Solution
-) -> ThermalResult:
-    """A drift's coefficients and its course, as a section of a calibration.
-
-    Args:
-        fit: The drift.
-        robot: The robot in the problem.
-        stops: Its stops there, ascending.
-        problem: The inlier observations.
-        fitted: Their fit.
-    """
+def drift_result(fit: ThermalFit, stops: HeatedStops) -> ThermalResult:
+    """A drift's coefficients and its course, at a robot's stops, as a section of a calibration."""
     model, inputs = fit.model, fit.inputs
     columns = {
         "reference_c": model.reference_c,
@@ -454,46 +396,6 @@ def drift_result(
         not_determined=fit.not_determined,
         residual_mm=DriftResidual(without=1e3 * fit.before_m, with_drift=1e3 * fit.after_m),
         likelihood_ratio=fit.gain,
-        rises_k=tuple(fit.rises_k.tolist()),
-        trained_s=float(np.ptp(stops.stamps_s)),
         course=tuple(DriftPoint(*row) for row in np.stack(course, axis=1).tolist()),
-        seen=_observed_drift(fit, robot, stops, typical, problem, fitted.state),
         views=tuple(ViewDrift(*row) for row in by_view),
-    )
-
-
-def _observed_drift(
-    fit: ThermalFit,
-    robot: str,
-    stops: HeatedStops,
-    typical: FloatArray,
-    problem: Problem,
-    state: State,
-) -> tuple[ObservedDrift, ...]:
-    """Observed drift of the flange at the stops in the typical posture, by their first view.
-
-    The residual of a stop is attributed to its flange, and projected on the drift's direction: its
-    length alone would grow with noise.
-    """
-    pair, observations = ArmPair.of(problem, state, robot), problem.observations
-    places = np.unique(observations.stops[rows_of(problem, robot)])
-    places[np.abs(stops.q - typical).max(axis=1) >= _SAME_RAD] = -1
-    seen, first = np.unique(observations.stops[pair.rows], return_index=True)
-    _, chosen, at_stops = np.intersect1d(places, seen, return_indices=True)
-    if not len(chosen):
-        return ()
-    rows = pair.rows[first[at_stops]]
-    errors = pair.at(problem.poses[robot][places[chosen]])[0].by_errors
-    # A point alone does not separate a flange's rotation from its position: all counts as position.
-    used = observations.has_rotation[rows, None] | (np.arange(6) >= 3)
-    residuals = problem.linear(state).residuals[rows, :, None]
-    residual_m = -(np.linalg.pinv(errors * used[:, None]) @ residuals)[:, 3:, 0]
-    drift_m = fit.motion(stops)[chosen, :3, 3]
-    # With hardly any drift there is no direction: that of the largest drift is used for all.
-    lengths = np.linalg.norm(drift_m, axis=1)
-    direction = drift_m[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
-    observed_mm = 1e3 * (lengths + residual_m @ direction)
-    return tuple(
-        ObservedDrift(int(stops.views[at]), float(stops.stamps_s[at]), drift)
-        for at, drift in zip(chosen.tolist(), observed_mm.tolist(), strict=True)
     )

@@ -21,6 +21,7 @@ from visioncal.estimation.model_evidence import RepeatedStops
 from visioncal.estimation.pose_errors import posture_correlation
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.results import Calibration
+from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import BoardResult, FittedArm, JointFit, RigResult
 from visioncal.robot import Robot, WeightFunctions
 from visioncal.vision.targets import numbered_positions, target_from_document
@@ -116,7 +117,7 @@ class CalibrationPrior:
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
         )
         arm = self.calibration.arm
-        if arm is not None and arm.functions is not None:
+        if arm is not None and arm.level == FUNCTIONS:
             # Functions of the joints have the error of a left-out stop at a new stop.
             mm = max(mm, arm.chosen.held_out_mm / np.sqrt(3))
             deg = max(deg, (arm.chosen.held_out_deg or 0.0) / np.sqrt(3))

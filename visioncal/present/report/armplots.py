@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present.arms import hours, joint_words
+from visioncal.present.arms import hours
 from visioncal.present.report.plotting import (
     ACCENT,
     CHECK,
@@ -21,12 +21,11 @@ from visioncal.present.report.plotting import (
     colour_bar,
     dots,
     drawn,
-    few_ticks,
     legend,
     logarithmic,
     panels,
 )
-from visioncal.results.arm import ArmResult, ElasticResult, ThermalResult
+from visioncal.results.arm import ArmResult, ThermalResult
 
 # Gap between cross-validation views and hold-out views, in views; most labelled views.
 _GAP, _MOST_LABELS = 1.5, 25
@@ -36,8 +35,6 @@ _LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
 _LEAST = 1e-6
 # Half width of the drift's 95 % band in sigmas.
 _BAND = 1.96
-# Panels side by side.
-_PANELS = 3
 
 _BEFORE, _AFTER = CHECK, ACCENT
 
@@ -124,34 +121,4 @@ def course(thermal: ThermalResult) -> tuple[Figure, str]:
     axes.fill_between(times_h, drift_mm - band_mm, drift_mm + band_mm, color=ACCENT, alpha=0.2,
                       linewidth=0.0)  # fmt: skip
     axes.plot(times_h, drift_mm, color=ACCENT, linewidth=1.6)
-    seen = thermal.seen or ()
-    if seen:
-        places = [hours(thermal, observation.stamp_s) for observation in seen]
-        axes.plot(places, [observation.drift_mm for observation in seen], "o", color=INK,
-                  markersize=5.0)  # fmt: skip
-        legend(figure, [("line", ACCENT, "the model"), ("o", INK, "seen by the stops")])
     return figure, "Drift of the flange against time, with its 95 % band"
-
-
-@drawn
-def deflection_against_load(elastic: ElasticResult) -> tuple[Figure, str] | None:
-    """Deflection of each determined joint at each stop, against the torque on it."""
-    bending = {
-        spring: np.array(deflections)
-        for index, spring in enumerate(elastic.joints)
-        if spring.stiffness_nm_per_rad is not None and (deflections := elastic.bends(index))
-    }
-    if not bending:
-        return None
-    rows = -(-len(bending) // _PANELS)
-    figure, grid = panels(WIDE_IN, 2.3 * rows, rows, _PANELS)
-    for axes in grid.flat[len(bending) :]:
-        axes.set_visible(False)
-    for axes, (spring, points) in zip(grid.flat, bending.items(), strict=False):
-        torques_nm, bends_mrad = points.T
-        ends = np.array([min(torques_nm.min(), 0.0), max(torques_nm.max(), 0.0)])
-        axes.plot(ends, 1e3 * spring.compliance_rad_per_nm * ends, color=LINE, linewidth=1.6)
-        axes.plot(torques_nm, bends_mrad, "o", color=ACCENT, markersize=4.0)
-        axes.set(xlabel="torque [N m]", ylabel="bend [mrad]", title=joint_words(spring.joint))
-        few_ticks(axes, 5, 5)
-    return figure, "How far each joint bends over the torque on it"
