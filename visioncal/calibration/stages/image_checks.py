@@ -111,11 +111,11 @@ def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     counts = f"columns = {board.columns} and rows = {board.rows}"
     step = Remedy(f"In the target's .toml, write {counts}, or name another target.")
     if board.dictionary:
+        side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
         step = Remedy(
-            f"Measure the {kind_of(board).side}. In session.toml, write target = "
-            '"seen.toml", which this command makes with the measured figure [mm] in the place of '
-            "MEASURED.",
-            f"visioncal target check SESSION/{shlex.quote(view.image)} --square-mm MEASURED "
+            f"Measure the {side}, and where it is not {mm} mm as declared, change the figure in "
+            'the command. In session.toml, write target = "seen.toml", which it makes.',
+            f"visioncal target check SESSION/{shlex.quote(view.image)} --square-mm {mm} "
             "-o SESSION/seen.toml",
         )
     seen, stated = describe(identity), board_words(declared)
