@@ -8,10 +8,9 @@ from visioncal.calibration.stages.cell import pair_edges
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
 from visioncal.calibration.stages.image_checks import empty_rows, missing_images
 from visioncal.calibration.stages.kinematics import check_level_is_possible
-from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
 from visioncal.calibration.stages.readings import (
-    exchanged_points,
+    check_readings,
     probe_poses,
     read_instrument,
     read_instruments,
@@ -27,8 +26,8 @@ from visioncal.core.number_format import counted
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import STREAMS
 
-# Beginning of warnings about the robot's model; phrases in warnings about unknown names.
-_OF_MODEL, _UNKNOWN_NAMES = "session.toml: robot.model:", ("is ignored", "was not read")
+# Beginning of warnings about the robot's model.
+_OF_MODEL = "session.toml: robot.model:"
 _MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
@@ -88,10 +87,8 @@ def _suspicious(warning: str) -> Finding:
     """Turns a warning on reading the session into a finding, with a remedy where one is known."""
     if warning.startswith(_OF_MODEL):
         return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
-    file, _, rest = warning.partition(": ")
-    is_unknown = any(words in warning for words in _UNKNOWN_NAMES)
-    place = rest.partition(" ")[0] if is_unknown else "what this names"
-    return Finding("remark", warning, Remedy(f"In {file}, correct or delete {place}."))
+    file = warning.partition(": ")[0]
+    return Finding("remark", warning, Remedy(f"In {file}, correct or delete what this names."))
 
 
 def _reported(run: RunState) -> RunState:
@@ -105,16 +102,12 @@ def _reported(run: RunState) -> RunState:
     if not run.base_from_flange:
         of_model = [warning for warning in session.warnings if warning.startswith(_OF_MODEL)]
         step = _MODEL_STEP if of_model else " ".join(session.warnings)
-        stream = stream_of(session, "")
-        if stream and all(view.stamp_s is None for view in session.views):
-            step = (
-                f"Fill in stamp_s, when each image was taken, and {STREAMS}/{stream}.csv gives the "
-                "poses; or x_m to qw."
-            )
         raise DataError(
             " ".join([*of_model, f"session {session.name!r}: no view has a pose of the robot."]),
             culprits=run.lost_views,
-            next_step=step or "Fill in x_m to qw, or joint angles and [robot] model.",
+            next_step=step
+            or "Fill in x_m to qw, or joint angles and [robot] model; or, where a "
+            "stream has the poses, stamp_s, when each image was taken.",
         )
     views = tuple(run.base_from_flange)
     declared = {view.number: view.stop for view in session.views}
@@ -125,7 +118,9 @@ def _reported(run: RunState) -> RunState:
 def read_readings(run: RunState) -> RunState:
     """Reads the instruments' readings."""
     if run.mount == "instrument":
-        readings = read_instrument(run.session).without(run.repeats)
+        readings = read_instrument(run.session)
+        kept = {view: one for view, one in readings.views.items() if view not in run.repeats}
+        readings = replace(readings, views=kept)
         run = replace(run, readings=readings).noting(readings.rejections)
         check_read_joints(run, probe_poses(run.session, readings))
         if not readings.are_poses:
@@ -134,7 +129,7 @@ def read_readings(run: RunState) -> RunState:
                     f"solver {run.solver!r} needs poses, and the instrument reads places alone.",
                     next_step="Leave --solver out.",
                 )
-            run = run.noting(exchanged_points(run, readings))
+            check_readings(run, readings)
     read = read_instruments(run.session).items()
     not_used = run.reasons.keys() | run.repeats.keys()
     poses = {view: pose for view, pose in read if view not in not_used}
