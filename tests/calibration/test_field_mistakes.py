@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from support.commands import visioncal as run_command
-from support.marks import slow
 
 import visioncal
 from visioncal.core.errors import DegenerateError
@@ -199,66 +198,6 @@ def test_an_autofocus_is_no_lens_that_changed_midway(tmp_path):
     stops = with_lens(looks(count), longer)
     first = visioncal.calibrate(write(tmp_path / "focus", stops, noise_px=0.02)).verdict.causes[0]
     assert first.words.startswith("The lens changes its focal length by")
-
-
-def said_first(folder: Path) -> str:
-    """What calibrating says first; also where the rows that are right determine nothing."""
-    try:
-        return visioncal.calibrate(folder).verdict.top[0]
-    except visioncal.VisioncalError as error:
-        return str(error)
-
-
-def as_wxyz(pose: RigidTransform) -> RigidTransform:
-    """What a quaternion w, x, y, z is where x, y, z, w are read."""
-    turn = Rotation.from_quat(np.roll(pose.rotation.as_quat(), 1))
-    return RigidTransform.from_components(pose.translation, turn)
-
-
-def as_inverse(pose: RigidTransform) -> RigidTransform:
-    return pose.inv()
-
-
-@pytest.mark.parametrize(
-    ("written", "words"),
-    [(as_wxyz, "rotations as a quaternion w, x, y, z"), (as_inverse, "poses inverse")],
-)
-def test_poses_that_are_written_otherwise_from_some_view_on_are_named(tmp_path, written, words):
-    since = 13
-    folder = write(
-        tmp_path / "mixed",
-        looks(20),
-        reported=lambda poses: [*poses[:since], *map(written, poses[since:])],
-    )
-    said = f"From view {since} on, the robot's poses are not those of the others: with the robot's "
-    first = visioncal.doctor(folder).findings[0]
-    assert first.words.startswith(f"{said}{words}")
-    assert f"rows {since} to 19 of views.csv" in first.do.words
-    assert f"{said}{words}" in said_first(folder)
-
-
-@pytest.mark.parametrize(("late", "since"), [slow(False, 7), (True, 14)])
-def test_a_pose_that_is_missing_or_repeated_midway_is_named(tmp_path, late, since):
-    def reported(poses):
-        if late:
-            return [*poses[:since], *poses[since - 1 : -1]]
-        return [*poses[:since], *poses[since + 1 :], poses[0]]
-
-    lens = "" if late else STATED_LENS
-    folder = write(tmp_path / "lost", looks(20), lens, reported=reported)
-    first = visioncal.doctor(folder).findings[0]
-    assert first.words.startswith(f"From view {since} on, the robot's poses are not those of")
-    side, way, step = ("after", "up", 1) if late else ("before", "down", -1)
-    assert f"the robot's pose of a view one row {side} it" in first.words
-    assert first.words in said_first(folder)
-    assert f"In rows {since} to 19 of views.csv, move the poses {way} by one row" in first.do.words
-    # As it says, with the row that is left without a pose deleted:
-    header, *rows = (folder / "views.csv").read_text().splitlines()
-    cells = [row.split(",", 1) for row in rows]
-    to = range(since, 19) if late else range(since + 1, 20)
-    moved = [*cells[:since], *([cells[at][0], cells[at + step][1]] for at in to)]
-    (folder / "views.csv").write_text("\n".join([header, *map(",".join, moved)]) + "\n")
-    assert visioncal.calibrate(folder).verdict.status == "good"
 
 
 @pytest.mark.parametrize(("since", "size"), [(9, 1.01), (14, 25 / 30)])

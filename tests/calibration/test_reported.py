@@ -73,18 +73,3 @@ def test_one_row_whose_pose_and_joints_disagree_is_named():
     assert found.words.startswith(
         "Pose and joint angles disagree in view 5, by up to 300 mm and under 0.001 deg"
     )
-
-
-def test_rows_in_millimetres_beside_others_in_metres_are_named():
-    poses = CELL.robot.base_from_flange.copy()
-    poses[[2, 5], :3, 3] *= 1e3
-    reported = reported_poses(session(poses), None)
-    assert [rejection.view for rejection in reported.rejections] == [2, 5]
-    assert all(
-        "divide its x_m, y_m, z_m by 1000" in rejection.reason for rejection in reported.rejections
-    )
-    # They do not contradict the joint angles that are matched with the others.
-    assert not reported_poses(session(poses, CELL.robot.joints), ROBOT).warnings
-    # Where all are, it is a reading of the poses.
-    poses[:, :3, 3] *= 1e3
-    assert not reported_poses(session(poses), None).rejections

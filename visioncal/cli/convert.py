@@ -78,7 +78,7 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
             (
                 candidate.words,
                 candidate.fit.figures,
-                f"{candidate.fit.agreeing} of {candidate.rows}",
+                f"{candidate.fit.agreeing} of {len(candidate.of_rows)}",
             )
             for candidate in guess.candidates
         ],

@@ -292,9 +292,9 @@ BROKEN: Mapping[str, Mistake] = {
     "rows shifted by one": Mistake(
         _moved_cells((*POSITION, *QUATERNION), lambda n: [*range(1, n), 0]), "one row"
     ),
-    "two rows exchanged": Mistake(_moved_cells((*POSITION, *QUATERNION), _swapped), "exchanged"),
+    "two rows exchanged": Mistake(_moved_cells((*POSITION, *QUATERNION), _swapped), "disagree"),
     "the same pose in all rows": Mistake(
-        _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "one pose"
+        _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "one position"
     ),
     "one pose typed wrong": Mistake(_cell("z_m", (6,), "0.9"), "view 6"),
     "poses of the tool": Mistake(

@@ -175,12 +175,6 @@ def _left_handed(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(poses, robot=numbers(poses.true_robot * np.outer(mirror, mirror)))
 
 
-def _base_link(poses: Poses, _: np.random.Generator) -> Poses:
-    """Needs the joints: the chain is what the controller's poses would be."""
-    told = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses.true_robot
-    return replace(poses, robot=numbers(told), chain=poses.true_robot)
-
-
 def _board_mm(poses: Poses, _: np.random.Generator) -> Poses:
     camera = replace(poses.camera, positions=1e3 * poses.camera.positions)
     return replace(poses, camera=camera, true_scale=1e-3)
@@ -198,6 +192,5 @@ MISTAKES: Mapping[str, Plant] = {
     "rows in another order": _reordered,
     "matrices transposed": _transposed,
     "one axis left-handed": _left_handed,
-    "base_link for base": _base_link,
     "board's size in mm": _board_mm,
 }

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.cells import session_of
 
-from visioncal.calibration.pipeline.misread_poses import misread_pose_finding
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
@@ -84,11 +83,6 @@ class Identifiability:
             (*(warning.reason for warning in known.warnings), *known.notes, *known.reasons.values())
         )
 
-    def hinted(self) -> str:
-        """What the guess says of the poses that the joints lead to."""
-        hint = misread_pose_finding(self.seen())
-        return hint.reason if hint else ""
-
 
 Plant = Callable[[Identifiability, np.random.Generator], Identifiability]
 
@@ -140,13 +134,11 @@ def _encoder(told: Identifiability, rng: np.random.Generator) -> Identifiability
 
 
 def _rows(told: Identifiability, rng: np.random.Generator) -> Identifiability:
-    """The joints of two views exchanged; without poses the guess of poses names them."""
+    """The joints of two views exchanged, beside poses."""
     pair = np.sort(rng.choice(len(told.joints), 2, replace=False))
     order = np.arange(len(told.joints))
     order[pair] = pair[::-1]
     words = f"disagree in view {pair[0]}, view {pair[1]}"
-    if told.poses is None:
-        words = f"poses of view {pair[0]} and view {pair[1]} exchanged"
     return replace(told, joints=told.joints[order], words=words)
 
 
@@ -162,12 +154,9 @@ SLIPS: Mapping[str, Plant] = {
 }
 
 
-def is_named(told: Identifiability, name: str) -> bool:
+def is_named(told: Identifiability) -> bool:
     """Whether what was planted is named."""
-    said = told.said()
-    if name == "two rows exchanged" and told.poses is None:
-        said += told.hinted()
-    return told.words in said
+    return told.words in told.said()
 
 
 def with_tool(told: Identifiability, rng: np.random.Generator) -> Identifiability:

@@ -7,13 +7,12 @@ The likelihood is by which readings are compared: a view is gaussian, with the s
 of its own fit, or one of a few outliers, with a broad tail.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import SOLVERS
@@ -27,8 +26,8 @@ STARTS = 12
 # second would agree with any reading.
 _KEPT_SHARE, _FEWEST_KEPT = 0.7, 5
 _SUBSET = 4
-# Starts that are followed, concentration steps, and fits in one batch, which memory limits.
-_FOLLOWED, _STEPS, _BATCH = 3, 6, 64
+# Starts that are followed, and concentration steps.
+_FOLLOWED, _STEPS = 3, 6
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the equations of a view.
@@ -93,11 +92,10 @@ class Fit:
     @property
     def figures(self) -> str:
         """RMS residual of the kept rows, in words; distances in metres."""
-        shift_m, angle = self.rms
         if not self.is_readable:
             return "no rotations"
-        in_mm = mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle)))
-        return in_mm if shift_m < 1.0 else f"{figure(shift_m)} m{in_mm[in_mm.index(' and') :]}"
+        shift_m, angle = self.rms
+        return mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle)))
 
     @cached_property
     def log_likelihood(self) -> float:
@@ -158,11 +156,6 @@ def is_about_one_axis(rotations: FloatArray) -> bool:
     return bool(singular[2] < max(_SECOND_AXIS * singular[0], _LEAST_TURN_RAD))
 
 
-def no_fit(rows: int) -> Fit:
-    """The fit of rows that cannot be read: infinite residuals."""
-    return Fit(np.eye(4), np.eye(4), np.full(rows, np.inf), np.full(rows, np.pi), lever=1.0)
-
-
 def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[Fit]:
     """Solves `robot * x * camera = z` for k readings by the views that agree best.
 
@@ -173,17 +166,6 @@ def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[
         camera: (k, n, 4, 4) `cam_from_target`.
         starts: Number of random small subsets to start from, besides all views.
     """
-    size = max(_BATCH // (starts + 1), 1)
-    batches = (slice(at, at + size) for at in range(0, len(robot), size))
-    return [fit for part in batches for fit in _fits(robot[part], camera[part], starts)]
-
-
-def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
-    """The same for one reading, of (n, 4, 4) poses."""
-    return robust_fits(robot[None], camera[None], starts)[0]
-
-
-def _fits(robot: FloatArray, camera: FloatArray, starts: int) -> Iterator[Fit]:
     count = robot.shape[1]
     kept = _kept_count(count)
     lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
@@ -215,8 +197,10 @@ def _fits(robot: FloatArray, camera: FloatArray, starts: int) -> Iterator[Fit]:
         if not falls.any():
             break
         edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
-    for at, start in enumerate(sums.argmin(axis=1)):
-        yield distances(robot[at], camera[at], float(lever[at]), tuple(edges[at, start]))
+    return [
+        distances(robot[at], camera[at], float(lever[at]), tuple(edges[at, start]))
+        for at, start in enumerate(sums.argmin(axis=1))
+    ]
 
 
 def _away(

@@ -7,6 +7,7 @@ A reading of the joints is right where this holds for most rows.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -23,25 +24,18 @@ FEWEST_JOINT_ROWS = 5
 # Largest deviation of an arm from its model, as a share of its reach and an angle [rad]: 2 mm and 3
 # mrad a link add up to half of it. Another arm of the same shape deviates by as much again.
 _MODEL_DEVIATION = 0.03
-# Below these scores the declared reading is right: controllers print their poses more finely.
-# Cameras do not see better, and most mistakes leave more, unless they change nothing.
-_FLOOR = 1e-4
-_FITS, FITS_SEEN = 3.0 * _FLOOR, 2e-3
-# Ratio of the declared reading's score to that of one that replaces it.
-_STANDS_OUT = 3.0
-# Ratio to the best score within which readings are equivalent: the one with the fewest mistakes is
-# chosen. Equally simple ones within the second ratio are rivals.
-_EQUIVALENT, _RIVALS = 2.0, 1.5
+# Below the first score the declared reading is right: cameras do not see better, and most mistakes
+# leave more, unless they change nothing. Scores below the second are alike: controllers print their
+# poses no more finely.
+_FITS, _FLOOR = 2e-3, 1e-4
+# Ratio of the declared reading's score to that of one that replaces it, and ratio to the best score
+# within which readings are equivalent: those with the fewest mistakes are chosen.
+_STANDS_OUT, _EQUIVALENT = 3.0, 2.0
 # Rows of the first screening, readings refined, and the share of the declared score below which.
 _SCREENED, _REFINED, _REFINED_SHARE = 10, 6, 0.6
-# The scatter over a joint's zero falls from afar: it halves only some 30 degrees from its minimum.
-# Where most of it is gone as recorded, the zero is nearer than that. A shift of 180 degrees is left
-# out: it looks like an opposite sign of the joint before or behind it. From the fourth step on, a
-# zero that is right is seen, and with a larger score than the last at once; then the finest step.
-_STEP_RAD, _NEAR_RAD, _FARTHEST_RAD, _CLEAR_RAD, _FINEST_RAD = 0.25, 0.5, 2.75, 0.02, 1e-6
-_FAR_SCORE = 0.5
-# Outliers have residuals beyond this many scores.
-_OUTLIER = 5.0
+# Steps of a joint's zero from afar to the finest. A shift of 180 degrees is left out: it looks like
+# an opposite sign of the joint before or behind it.
+_STEP_RAD, _FARTHEST_RAD, _FINEST_RAD = 0.25, 2.75, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,52 +68,43 @@ def declared_reading(robot: Robot) -> JointReading:
 
 def joint_readings(robot: Robot) -> Iterator[JointReading]:
     """All other readings but lost zeros."""
-    revolute = ~robot.chain.prismatic
+
+    def entry(words: str, fix: str, mixing: FloatArray, *columns: int) -> JointReading:
+        return JointReading(robot, mixing, np.zeros(count), words, fix, columns)
+
+    count, same = robot.joint_count, np.eye(robot.joint_count)
     for factor, words, change in (
         (np.pi / 180.0, "in degrees", "pi / 180"),
         (180.0 / np.pi, "in radians that were taken for degrees", "180 / pi"),
     ):
-        columns = f"q1_rad to q{len(revolute)}_rad"
-        fix = f"Where the angles are recorded, multiply {columns} by {change}."
-        mixing = np.diag(np.where(revolute, factor, 1.0))
-        yield _entry(robot, mixing, f"the angles {words}", fix)
-    yield from (*_exchanges(robot), *_signs(robot), *_models(robot))
-
-
-def _entry(
-    robot: Robot, mixing: FloatArray, words: str, fix: str, columns: Sequence[int] = ()
-) -> JointReading:
-    return JointReading(robot, mixing, np.zeros(len(mixing)), words, fix, tuple(columns))
-
-
-def _exchanges(robot: Robot) -> Iterator[JointReading]:
-    count = robot.joint_count
-    for pair in combinations(range(count), 2):
-        order = [*range(count)]
-        order[pair[0]], order[pair[1]] = pair[1], pair[0]
-        both = " and ".join(f"q{at + 1}_rad" for at in pair)
+        fix = f"Where the angles are recorded, multiply q1_rad to q{count}_rad by {change}."
+        mixing = np.diag(np.where(robot.chain.prismatic, 1.0, factor))
+        yield entry(f"the angles {words}", fix, mixing)
+    for first, second in combinations(range(count), 2):
+        order = np.arange(count)
+        order[[first, second]] = second, first
+        both = f"q{first + 1}_rad and q{second + 1}_rad"
         fix = f"Exchange the headings {both} in views.csv (ROS's joint_states sort by name)."
-        yield _entry(robot, np.eye(count)[order], f"the columns {both} exchanged", fix, pair)
-
-
-def _signs(robot: Robot) -> Iterator[JointReading]:
+        yield entry(f"the columns {both} exchanged", fix, same[order], first, second)
     for at, name in enumerate(robot.joint_names):
-        signs = np.where(np.arange(robot.joint_count) == at, -1.0, 1.0)
         fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
-        yield _entry(robot, np.diag(signs), f"q{at + 1}_rad of the opposite sign", fix, [at])
-
-
-def _models(robot: Robot) -> Iterator[JointReading]:
-    same, other = np.eye(robot.joint_count), other_convention(robot)
+        yield entry(f"q{at + 1}_rad of the opposite sign", fix, np.diag(1.0 - 2.0 * same[at]), at)
+    other = other_convention(robot)
     if other is not None:
         table, convention = other
         fix = f'Write convention = "{convention}" into the table of {robot.name}.'
-        yield _entry(table, same, f"the table of {robot.name} read as {convention}", fix)
-    for name in robot_names():
-        model = load_robot(name)
-        if name != robot.name and model.joint_count == robot.joint_count:
-            fix = f'In session.toml, write [robot] model = "{name}".'
-            yield _entry(model, same, f"the arm a {name} and not a {robot.name}", fix)
+        words = f"the table of {robot.name} read as {convention}"
+        yield replace(entry(words, fix, same), robot=table)
+    for model in _built_in_robots():
+        if model.name != robot.name and model.joint_count == count:
+            fix = f'In session.toml, write [robot] model = "{model.name}".'
+            words = f"the arm a {model.name} and not a {robot.name}"
+            yield replace(entry(words, fix, same), robot=model)
+
+
+@cache
+def _built_in_robots() -> tuple[Robot, ...]:
+    return tuple(map(load_robot, robot_names()))
 
 
 def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
@@ -180,11 +165,8 @@ class JointGuess:
     def sentence(self, what: str) -> str:
         """States the finding; `what` is what the joints are compared with."""
         words = " or with ".join(reading.words for reading in self._readings)
-        residuals = self.best.fit.residuals
-        agree = int(np.sum(residuals <= _OUTLIER * self.best.score))
-        rows = f" in {agree} of {len(residuals)} views" if agree < len(residuals) else ""
         return (
-            f"With {words}, they fit {what} to {self.best.fit.figures}{rows}; as recorded, to "
+            f"With {words}, they fit {what} to {self.best.fit.figures}; as recorded, to "
             f"{self.declared.fit.figures}."
         )
 
@@ -194,14 +176,13 @@ class JointGuess:
         return " Or: ".join(reading.fix for reading in self._readings)
 
 
-def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
+def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     """Tries the common mistakes with joint angles and finds the one that explains the poses.
 
     Args:
         robot: The declared model.
         q: (m, n) joint angles as recorded [rad], of `FEWEST_JOINT_ROWS` rows or more.
         poses: (m, 4, 4) `base_from_flange` of the same rows, up to a constant on either side.
-        fits: Score at which the declared reading is accepted without trying others.
 
     Returns:
         The reading; the declared one where it is right, where no other is clearly better, or where
@@ -210,13 +191,14 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
     rows, recorded = thinned(np.arange(len(q))), declared_reading(robot)
     with one_blas_thread():
         (declared,) = _fitted([recorded], q, poses, rows, STARTS)
-        if declared.score <= fits or is_about_one_axis(poses[:, :3, :3]):
+        if declared.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
             return JointGuess(declared, declared)
         few = thinned(rows, _SCREENED)
         start, *tried = _fitted([recorded, *joint_readings(robot)], q, poses, few)
         tried.sort(key=lambda item: item.score * (1.0 + item.reading.cost))
-        tried = [*tried[:_REFINED], *_with_zeros(start, q, poses, few)]
-        near = [item.reading for item in tried if item.score < _REFINED_SHARE * start.score]
+        tried = [*tried[:_REFINED], *_with_zeros(robot, q, poses, few)]
+        limit = min(_REFINED_SHARE * start.score, _STANDS_OUT * _MODEL_DEVIATION)
+        near = [item.reading for item in tried if item.score < limit]
         tried = _fitted(near, q, poses, rows, STARTS)
     least = min((item.score for item in tried), default=np.inf)
     equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
@@ -224,18 +206,16 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _
     if least > _MODEL_DEVIATION or declared.score <= _STANDS_OUT * equivalent[0].score:
         return JointGuess(declared, declared)
     best, *others = equivalent
-    limit, cost = _RIVALS * best.score, best.reading.cost
-    rivals = (item.reading for item in others if item.reading.cost == cost and item.score < limit)
+    rivals = (item.reading for item in others if item.reading.cost == best.reading.cost)
     return JointGuess(declared, best, tuple(rivals))
 
 
 def _with_zeros(
-    start: FittedJoints, q: FloatArray, poses: FloatArray, rows: IntArray
+    robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray
 ) -> list[FittedJoints]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
-    robot, step = start.reading.robot, _STEP_RAD
-    farthest = _NEAR_RAD if start.score < _MODEL_DEVIATION else _FARTHEST_RAD
-    grid = np.arange(-farthest, farthest + step, step)
+    step = _STEP_RAD
+    grid = np.arange(-_FARTHEST_RAD, _FARTHEST_RAD + step, step)
     zeros = dict.fromkeys((np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist(), 0.0)
     best: list[FittedJoints] = []
     while zeros and step > _FINEST_RAD:
@@ -243,8 +223,8 @@ def _with_zeros(
         fits = _fitted(tried, q, poses, rows)
         of_joints = (fits[at : at + len(grid)] for at in range(0, len(fits), len(grid)))
         best = [min(of_joint, key=lambda item: item.fit.score) for of_joint in of_joints]
-        if step < _CLEAR_RAD or start.score > _FAR_SCORE:
-            best = [item for item in best if item.score < _REFINED_SHARE * start.score]
+        # Half a step from the right zero, poses scatter by less than a step.
+        best = [item for item in best if item.score < _MODEL_DEVIATION + step]
         zeros = {item.reading.columns[0]: float(item.reading.zeros.sum()) for item in best}
         step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0
     return best

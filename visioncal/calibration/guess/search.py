@@ -7,21 +7,21 @@ angle is also the same for a pose and its inverse: inverses, and all that concer
 distinguished by the fits.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import STARTS, Fit, no_fit, robust_fits
+from visioncal.calibration.guess.fit import STARTS, Fit, robust_fits
 from visioncal.calibration.guess.readings import (
     ROW_ORDERS,
     Change,
     Hypothesis,
     SideReading,
-    Turns,
     changes,
+    rewritten,
 )
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.transforms import invert
@@ -36,11 +36,9 @@ EVIDENCE = 0.5
 _CHANGE, IMPOSSIBLE = 4.0, 20.0
 # Plausible distances between camera and board [m].
 _BOARD_DISTANCE_M = (0.02, 30.0)
-# A stage hands on what is within this ratio of its best score, plus half a degree, which noisy
-# poses of few views add to any bound; and at most so many.
-_RATIO, _SLACK_RAD, _TURNED, _WITH_OTHERS, _REFINED = 3.0, 5e-3, 100, 16, 12
-# Relative penalty of a score per mistake; rewritten angles are tried where no reading is sure.
-_PENALTY, _FLOOR, _SURE = 0.3, 1e-4, 0.01
+# The screening and the first fits hand on at most so many readings, within this ratio of the best
+# score plus a quarter of a degree, which noisy poses of few views add to any bound.
+_TURNED, _REFINED, _RATIO, _SLACK = 100, 12, 3.0, 5e-3
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
 _PAIRS_SHARE = 0.35
 
@@ -59,7 +57,7 @@ class Recording:
     def declared(self) -> Hypothesis:
         """The declared reading."""
         robot, camera = (
-            SideReading(Turns(side.reading.rotation), side.reading.unit, side.reading.inverse)
+            SideReading(side.reading.rotation, side.reading.unit, side.reading.inverse)
             for side in (self.robot, self.camera)
         )
         return Hypothesis(robot, camera, self.mount)
@@ -91,46 +89,22 @@ class Candidate:
     labels: tuple[Hypothesis, ...] = field(default=(), repr=False)
 
     @property
-    def declared(self) -> Hypothesis:
-        """The declared reading."""
-        return self.recording.declared
-
-    @property
-    def differences(self) -> tuple[str, ...]:
-        """Words for each difference from the declared reading."""
-        return self.hypothesis.changes
-
-    @property
     def words(self) -> str:
         """The differences from the declared reading, in words."""
-        return "; ".join(self.differences) or "as declared"
-
-    @property
-    def rows(self) -> int:
-        """Number of views in the fit."""
-        return len(self.of_rows)
-
-    @property
-    def log_prior(self) -> float:
-        """Log prior odds, by the changes that it implies."""
-        impossible = IMPOSSIBLE * (not self.recording.is_likely(self.hypothesis))
-        return -_CHANGE * self.hypothesis.cost - impossible
+        return "; ".join(self.hypothesis.changes) or "as declared"
 
     @property
     def log_posterior(self) -> float:
         """Log posterior of the reading, up to a constant of the views."""
-        return EVIDENCE * self.fit.log_likelihood + self.log_prior
-
-    @property
-    def log_odds(self) -> float:
-        """Log posterior odds of the reading against none."""
-        return self.log_posterior - EVIDENCE * self.fit.unexplained
+        cost = self.hypothesis.cost
+        impossible = IMPOSSIBLE * (not self.recording.is_likely(self.hypothesis))
+        return EVIDENCE * self.fit.log_likelihood - _CHANGE * cost - impossible
 
     @property
     def board_scale(self) -> float:
         """Factor for the board's sizes, where images were measured; else 1."""
-        units = (side.camera.unit for side in (self.hypothesis, self.declared))
-        unit_m, declared_m = (UNITS_M[unit] for unit in units)
+        readings = self.hypothesis, self.recording.declared
+        unit_m, declared_m = (UNITS_M[reading.camera.unit] for reading in readings)
         return unit_m / declared_m if self.recording.is_measured else 1.0
 
 
@@ -143,9 +117,8 @@ def chains(
     robot, camera = recording.robot.rows(np.maximum(looked, 0)), recording.camera.rows(rows)
     by_robot = {side: side.poses(robot) for side in {reading.robot for reading in tried}}
     by_camera = {side: side.poses(camera) for side in {reading.camera for reading in tried}}
-    poses = np.empty((len(tried), len(rows), 4, 4))
-    for part, reading, index in zip(poses, tried, at.reshape(of_robot.shape), strict=True):
-        part[:] = by_robot[reading.robot][index]
+    both = zip(tried, at.reshape(of_robot.shape), strict=True)
+    poses = np.array([by_robot[reading.robot][index] for reading, index in both])
     outside = np.array([reading.mount == "eye-to-hand" for reading in tried])
     poses[outside] = invert(poses[outside])
     poses[of_robot < 0] = np.nan
@@ -157,8 +130,6 @@ def fitted(
 ) -> list[Candidate]:
     """Fits both edges under each of some readings, by the rows that are readable under it."""
     tried = [*tried]
-    if not tried:
-        return []
     robot, camera = chains(recording, tried, rows)
     readable = np.isfinite(robot).all(axis=(2, 3)) & np.isfinite(camera).all(axis=(2, 3))
     masks, groups = np.unique(readable, axis=0, return_inverse=True)
@@ -167,7 +138,8 @@ def fitted(
         members, count = np.flatnonzero(groups.ravel() == group), int(mask.sum())
         # A shift leaves a row without its partner.
         if count < FEWEST_ROWS - 1:
-            fits = [no_fit(count)] * len(members)
+            away = np.full(count, np.inf)
+            fits = [Fit(np.eye(4), np.eye(4), away, away, lever=1.0)] * len(members)
         else:
             part = np.ix_(members, np.flatnonzero(mask))
             fits = robust_fits(robot[part], camera[part], starts)
@@ -175,12 +147,6 @@ def fitted(
             of_all = replace(fit, lost=len(rows) - count)
             found[member] = Candidate(tried[member], recording, of_all, rows[mask])
     return [found[at] for at in range(len(tried))]
-
-
-def closes(recording: Recording) -> bool:
-    """Whether the chain closes as declared; true with too few rows to show it."""
-    rows = recording.common_rows
-    return len(rows) < FEWEST_ROWS or fitted(recording, [recording.declared], rows, 0)[0].fit.closes
 
 
 def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
@@ -193,92 +159,85 @@ def search(recording: Recording) -> list[Candidate]:
     """Finds the readings that close the chain best.
 
     Returns:
-        The declared reading first; then others, one for each class of readings that residuals
-        cannot distinguish.
+        The declared reading first; then others, the likeliest first, one for each class of readings
+        that residuals cannot distinguish.
     """
     rows, declared = thinned(recording.common_rows), recording.declared
-    for rewritten in (None, recording.robot.rows(rows)):
-        classes: dict[Hashable, tuple[Hypothesis, ...]] = {}
-        readings = _readings(recording, rows, rewritten)
-        for reading in sorted(readings, key=lambda reading: reading.cost):
-            key = reading.chain_class, recording.is_likely(reading)
-            classes[key] = (*classes.get(key, ()), reading)
-        labels = {of_class[0]: of_class for of_class in classes.values()}
-        screened = fitted(recording, labels, rows, 0)
-        least = min(item.fit.score for item in screened)
-        if least < _SURE:
+    mismatch, plain = _mismatch(recording, rows), [*changes(declared, recording.is_measured)]
+    tried = _undone(declared, [*product((None,), plain), *combinations(plain, 2)])
+    # Rewritten rotations are tried where no other reading is sure.
+    for strange in ([], [*rewritten(recording.robot.rows(rows))]):
+        tried += _undone(declared, product((None, *plain), strange))
+        likely = filter(recording.is_likely, _near(tried, [*map(mismatch, tried)], _TURNED))
+        classes: dict[Hashable, list[Hypothesis]] = {}
+        for reading in sorted([declared, *likely], key=lambda item: item.cost):
+            of_class = classes.setdefault((reading.chain_class, recording.is_likely(reading)), [])
+            of_class.append(reading)
+        labels = {of_class[0]: tuple(of_class) for of_class in classes.values()}
+        scores = [item.fit.score for item in fitted(recording, labels, rows, 0)]
+        if min(scores) <= _SLACK:
             break
-    limit = _RATIO * least + _SLACK_RAD
-    near = [item for item in screened if item.fit.score <= limit and item.hypothesis != declared]
-    near.sort(key=lambda item: (item.fit.score + _FLOOR) * (1.0 + _PENALTY * item.hypothesis.cost))
-    refined = [declared, *(item.hypothesis for item in near[:_REFINED])]
+    near = _near([*labels], scores, _REFINED)
+    refined = [declared, *(reading for reading in near if reading != declared)]
+    first, *others = fitted(recording, refined, rows, STARTS)
+    others.sort(key=lambda item: -item.log_posterior)
+    return [replace(item, labels=labels[item.hypothesis]) for item in (first, *others)]
+
+
+def _undone(
+    declared: Hypothesis, pairs: Iterable[tuple[Change | None, Change]]
+) -> list[Hypothesis]:
+    """The readings with one mistake, or two that go together, undone."""
     return [
-        replace(item, labels=labels.get(item.hypothesis, ()))
-        for item in fitted(recording, refined, rows, STARTS)
+        second.of(declared if first is None else first.of(declared))
+        for first, second in pairs
+        if first is None or first.goes_with(second)
     ]
 
 
-def _readings(
-    recording: Recording, rows: IntArray, rewritten: PoseNumbers | None
-) -> Iterator[Hypothesis]:
-    """The declared reading, and those with one or two mistakes that turn as the camera does."""
-    declared, is_measured = recording.declared, recording.is_measured
-    mismatch = _mismatch(recording, rows)
-    table = [*changes(declared, is_measured=is_measured, rewritten=rewritten)]
-    of_rotations = [change for change in table if change.is_of_rotations]
-    others = [change for change in table if not change.is_of_rotations]
-    # Rewritten angles are strange enough.
-    plain = [change for change in of_rotations if not change.is_rewritten]
-    turned: dict[tuple[Change, ...], Hypothesis] = {(): declared}
-    turned |= {(change,): change.of(declared) for change in of_rotations}
-    turned.update(_pairs(declared, plain))
-    away = {made: mismatch(reading) for made, reading in turned.items()}
-    limit = _RATIO * min(away.values()) + _SLACK_RAD
-    near = [made for made in turned if made and away[made] <= limit]
-    near.sort(key=lambda made: (away[made] + _FLOOR) * (1.0 + _PENALTY * turned[made].cost))
-    for rank, made in enumerate(((), *near[:_TURNED])):
-        reading = turned[made]
-        yield reading
-        if len(made) < 2 and rank <= _WITH_OTHERS:
-            with_made = (other for other in others if all(item.goes_with(other) for item in made))
-            yield from (other.of(reading) for other in with_made)
-    yield from (reading for _, reading in _pairs(declared, others))
-
-
-def _pairs(
-    declared: Hypothesis, table: Sequence[Change]
-) -> Iterator[tuple[tuple[Change, Change], Hypothesis]]:
-    for first, second in combinations(table, 2):
-        if first.goes_with(second):
-            yield (first, second), second.of(first.of(declared))
+def _near(tried: Sequence[Hypothesis], scores: Sequence[float], most: int) -> list[Hypothesis]:
+    """The readings whose scores are near the least, the best and simplest first."""
+    limit = _RATIO * min(scores) + _SLACK
+    near = [
+        ((score + _SLACK) * (1.0 + reading.cost), at)
+        for at, (reading, score) in enumerate(zip(tried, scores, strict=True))
+        if score <= limit
+    ]
+    return [tried[at] for _, at in sorted(near)[:most]]
 
 
 def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], float]:
     """Low quantile of the differences [rad] by which robot and camera turn under a reading."""
     of_camera = recording.camera.rows(rows)
 
+    # Transposed or mirrored rotations turn by the same angles.
     @cache
-    def by_robot(turns: Turns, order: str) -> FloatArray:
+    def by_robot(rotation: str, written: str, order: str) -> FloatArray:
         at = ROW_ORDERS[order](len(recording.robot))[rows]
-        rotations = turns.rotations(recording.robot.rows(np.maximum(at, 0)))
+        of_robot = recording.robot.rows(np.maximum(at, 0))
+        rotations = SideReading(rotation, written=written).rotations(of_robot)
         rotations[at < 0] = np.nan
-        return _relative_angles(rotations)
+        return relative_angles(rotations)
 
     @cache
-    def by_camera(turns: Turns) -> FloatArray:
-        return _relative_angles(turns.rotations(of_camera))
+    def by_camera(rotation: str) -> FloatArray:
+        return relative_angles(SideReading(rotation).rotations(of_camera))
+
+    @cache
+    def away(of_robot: tuple[str, str, str], of_camera: str) -> float:
+        difference = np.abs(by_robot(*of_robot) - by_camera(of_camera))
+        rank = int(_PAIRS_SHARE * len(difference))
+        return float(np.partition(np.nan_to_num(difference, nan=np.inf), rank)[rank])
 
     def mismatch(reading: Hypothesis) -> float:
-        robot = by_robot(reading.robot.turns, reading.order)
-        difference = np.nan_to_num(np.abs(robot - by_camera(reading.camera.turns)), nan=np.inf)
-        rank = int(_PAIRS_SHARE * len(difference))
-        return float(np.partition(difference, rank)[rank])
+        robot = reading.robot
+        return away((robot.rotation, robot.written, reading.order), reading.camera.rotation)
 
     return mismatch
 
 
-def _relative_angles(rotations: FloatArray) -> FloatArray:
-    """(p,) angles [rad] of the relative rotations of all pairs of views."""
+def relative_angles(rotations: FloatArray) -> FloatArray:
+    """(p,) angles [rad] of the relative rotations of all pairs of (n, 3, 3) rotations."""
     flat = rotations.reshape(-1, 9)
     traces = (flat @ flat.T)[np.triu_indices(len(flat), 1)]
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.misread_poses import (
-    may_be_misread,
     misread_pose_finding,
     misreadings,
     turned_boards,
@@ -33,8 +32,7 @@ def sought_misreading(state: RunState) -> tuple[RunState, Misreading]:
     sought = Misreading(state, finding)
     if finding is None:
         state = state.noting((), turned_boards(state))
-    # Where only some rows are exchanged, the others can still be fitted.
-    return replace(state, is_misread=finding is not None and not finding.views), sought
+    return replace(state, is_misread=finding is not None), sought
 
 
 def explained(
@@ -72,13 +70,14 @@ def explained(
 
 def with_likely_causes(state: RunState, sought: Misreading | None) -> RunState:
     """Adds to a poor verdict the misreading that explains it, and the board of lost views."""
-    if state.verdict is not None and sought is not None and may_be_misread(state):
+    verdict = state.verdict
+    if verdict is not None and verdict.status != "good" and sought is not None:
         hint = sought.finding
         if hint is None and state.mount is not None:
             hint = misread_pose_finding(sought.located)
         if hint is not None:
-            state = replace(state, verdict=explained_by(state.verdict, hint))
-    verdict = state.verdict
+            verdict = explained_by(verdict, hint)
+            state = replace(state, verdict=verdict)
     if verdict is None or all(finding.kind != "lost_views" for finding in verdict.findings):
         return state
     cause = unseen_cause(state)

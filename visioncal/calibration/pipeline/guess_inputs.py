@@ -1,9 +1,5 @@
 """Input of the search for misread poses: the camera's poses by images, the robot's numbers."""
 
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
@@ -12,17 +8,12 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.image_checks import because, unseen_cause
-from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray
-from visioncal.estimation.chain import chain
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
-
-# Stages that the camera's poses need; none uses the robot, whose poses may be misread.
-_SEEING = ("detect", "intrinsics", "pnp")
 
 
 def guess_from_camera_poses(
@@ -32,7 +23,7 @@ def guess_from_camera_poses(
     *,
     knows_mount: bool = True,
 ) -> Guess:
-    """Tries every plausible reading of a session's poses, with all alternatives of the camera's.
+    """Tries every plausible reading of a session's poses, with the camera's by each image alone.
 
     Args:
         run: The run, with the camera's poses.
@@ -50,17 +41,16 @@ def guess_from_camera_poses(
     if matched is None or not matched.misread:
         joint_poses = chain_poses(run.session, None if matched is None else matched.robot)
     if robot is None:
-        poses = numbers_in(run.session, POSE)
-        robot = robot_numbers(run) if run.clocks else poses
+        robot = _from_stream(run) if run.clocks else numbers_in(run.session, POSE)
         if joint_poses is not None and not robot.present.any():
             robot = PoseNumbers.of_poses(joint_poses, robot.places)
-    is_measured, mount = bool(run.corners), run.session.mount if knows_mount else None
-    choices = camera_pose_choices(run, robot) if camera is None else (camera,)
-    for poses in choices:
-        guess = guess_reading(robot, poses, mount, chain=joint_poses, is_measured=is_measured)
-        if not guess.stands_out and guess.declared.fit.closes:
-            break
-    return guess
+    return guess_reading(
+        robot,
+        _camera_numbers(run) if camera is None else camera,
+        run.session.mount if knows_mount else None,
+        chain=joint_poses,
+        is_measured=bool(run.corners),
+    )
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
@@ -72,35 +62,38 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
         robot = Robot.from_document(session.robot_document)
     if robot is None:
         return None
-    poses = np.full((len(session.views), 4, 4), np.nan)
-    for at, view in enumerate(session.views):
-        joints = view.joints_rad
-        if joints is not None and len(joints) == robot.joint_count:
-            poses[at] = robot.base_from_flange(joints[None])[0]
-    return poses if np.isfinite(poses).any() else None
+    joints = [view.joints_rad for view in session.views]
+    rows = [at for at, q in enumerate(joints) if q is not None and len(q) == robot.joint_count]
+    if not rows:
+        return None
+    poses = np.full((len(joints), 4, 4), np.nan)
+    poses[rows] = robot.base_from_flange(np.array([joints[at] for at in rows]))
+    return poses
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     """The numbers of a group of pose columns, one row a view; NaN where they are empty."""
     cells = [[view.numbers.get(name, np.nan) for name in columns] for view in session.views]
     numbers = np.array(cells, dtype=float)
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(session))
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places_of(session))
 
 
-def robot_numbers(run: RunState) -> PoseNumbers:
-    """The robot's poses at the views, also from its stream, as numbers; NaN where it has none."""
-    numbers = np.full((len(run.session.views), 7), np.nan)
+def _from_stream(run: RunState) -> PoseNumbers:
+    """The robot's poses at the views as quaternions; NaN where it has none."""
+    numbers = PoseNumbers.empty(_places_of(run.session))
     for at, view in enumerate(run.session.views):
         if view.number in run.base_from_flange:
             pose = RigidTransform.from_matrix(run.base_from_flange[view.number])
-            numbers[at] = [*pose.translation, *pose.rotation.as_quat()]
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(run.session))
+            numbers.positions[at], numbers.rotations[at] = pose.translation, pose.rotation.as_quat()
+    return numbers
 
 
 def with_camera_poses(run: RunState) -> RunState:
     """Runs the stages that the camera's poses need, whatever the robot's poses are."""
-    # The offset of a stream's clock is found by rotation angles, which no reading changes.
-    names = (*_SEEING, "robot", "clock") if waits_for_clock(run.session) else _SEEING
+    names = {"detect", "intrinsics", "pnp"}
+    if waits_for_clock(run.session):
+        # The offset of a stream's clock is found by rotation angles, which no reading changes.
+        names |= {"robot", "clock"}
     for stage in STAGES:
         if stage.name in names:
             try:
@@ -113,51 +106,20 @@ def with_camera_poses(run: RunState) -> RunState:
     return run
 
 
-def camera_pose_choices(run: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
-    """The camera's poses chosen by the declared robot poses, and then by the images alone."""
-    run = replace(run, poses=run.poses_of_one_board)
-    # They differ where an image allows several poses: misread robot poses would choose wrong ones.
-    if any(len(pose.cam_from_target) > 1 for pose in run.poses.values()):
-        # Where the declared robot poses do not allow a choice, the images alone remain.
-        with suppress(VisioncalError):
-            yield camera_numbers(_chosen(run, robot))
-    yield camera_numbers(run)
-
-
-def _chosen(run: RunState, robot: PoseNumbers) -> RunState:
-    """Chooses among the poses that an image allows by the declared robot poses."""
-    numbers = (view.number for view in run.session.views)
-    base_from_flange = dict(zip(numbers, robot.poses(), strict=True))
-    both = [pose for pose in run.poses.values() if np.isfinite(base_from_flange[pose.view]).all()]
-    problem = chain(
-        run.session.mount,
-        np.array([base_from_flange[view.view] for view in both]).reshape(-1, 4, 4),
-        np.array([view.cam_from_target[0] for view in both]).reshape(-1, 4, 4),
-    )
-    boards = [*run.session.boards.values()]
-    targets = {name: boards[both[0].board] for name in problem.observations.observed if boards}
-    initial = init_frames(problem, both, targets)
-    return replace(run, poses={view.view: view for view in initial.views})
-
-
-def camera_numbers(run: RunState) -> PoseNumbers:
+def _camera_numbers(run: RunState) -> PoseNumbers:
     """Poses of one board, the best of each view by its image, or as measured in the session."""
-    by_view = run.poses_of_one_board
-    if not run.corners:
-        numbers = numbers_in(run.session, MEASURED_CAM_POSE)
-        has_pose = np.array([view.number in by_view for view in run.session.views])[:, None]
-        return replace(
-            numbers,
-            positions=np.where(has_pose, numbers.positions, np.nan),
-            rotations=np.where(has_pose, numbers.rotations, np.nan),
-        )
-    poses = np.full((len(run.session.views), 4, 4), np.nan)
-    for at, view in enumerate(run.session.views):
+    by_view, views = run.poses_of_one_board, run.session.views
+    poses = np.full((len(views), 4, 4), np.nan)
+    for at, view in enumerate(views):
         if view.number in by_view:
             poses[at] = by_view[view.number].cam_from_target[0]
-    return PoseNumbers.of_poses(poses, places_of(run.session))
+    if run.corners:
+        return PoseNumbers.of_poses(poses, _places_of(run.session))
+    numbers = numbers_in(run.session, MEASURED_CAM_POSE)
+    numbers.positions[np.isnan(poses[:, 0, 0])] = np.nan
+    return numbers
 
 
-def places_of(session: Session) -> tuple[str, ...]:
+def _places_of(session: Session) -> tuple[str, ...]:
     """Names of a session's rows in messages."""
     return tuple(f"view {view.number}" for view in session.views)

@@ -65,16 +65,13 @@ class ObservedPoses(Observed):
 
     def arm_at(self, views: Sequence[int]) -> RobotArm:
         """The robot's arm at some views."""
-        return self.robot_arm.at(np.array([self._places[view] for view in views], dtype=np.int64))
+        places = {view: at for at, view in enumerate(self.base_from_flange)}
+        return self.robot_arm.at(np.array([places[view] for view in views], dtype=np.int64))
 
     @property
     def arm_at_stops(self) -> RobotArm:
         """The robot's arm at the stops of the used views, by the first view of each."""
         return self.arm_at(self.first_of_stops(self.used))
-
-    @cached_property
-    def _places(self) -> Mapping[int, int]:
-        return {view: at for at, view in enumerate(self.base_from_flange)}
 
     def problem(self, views: Sequence[int]) -> Problem:
         """The problem of some views, each with its first or chosen pose."""
@@ -126,11 +123,6 @@ class ObservedPoses(Observed):
         """
         own = any(self.poses[view].corners is None for view in views)
         keys: dict[tuple[int, int], int] = {}
-        both = ((self._stations[view], view if own else 0) for view in views)
+        stations = {row.view.number: row.station for row in self.timed.observations}
+        both = ((stations[view], view if own else 0) for view in views)
         return np.array([keys.setdefault(pair, len(keys)) for pair in both], dtype=np.int64)
-
-    @cached_property
-    def _stations(self) -> Mapping[int, int]:
-        return {
-            observation.view.number: observation.station for observation in self.timed.observations
-        }

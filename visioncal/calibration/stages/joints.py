@@ -7,12 +7,11 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances
 from visioncal.calibration.guess.joints import FEWEST_JOINT_ROWS, JointGuess, guess_joints
-from visioncal.calibration.guess.readings import HALF_TURN
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import GUESS, Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.robot import Robot, robot_names, with_base
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
@@ -21,6 +20,8 @@ from visioncal.session.table import reported_matrices
 # those with their own arm's calibration differ from the nominal model by up to the second. Beyond,
 # the model is of another arm.
 _AGREE, _CALIBRATED = (1e-3, 2e-3), (1e-2, 2e-2)
+# Half a turn of the base about its z.
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Ratio of the model's own base's residuals to those of another base that is preferred.
 _BETTER_BASE = 3.0
 # Outlier rows have residuals beyond this many medians.
@@ -148,7 +149,7 @@ def _base_and_flange(model: FloatArray, poses: FloatArray, guess: JointGuess | N
 
 def _with_base(matched: MatchedJoints, base: FloatArray) -> MatchedJoints:
     """Puts the arm into the frame of the poses, by the (4, 4) base of the model in it."""
-    name, (away_mm, away_deg) = matched.robot.name, pose_difference(HALF_TURN, base)
+    name, (away_mm, away_deg) = matched.robot.name, pose_difference(_HALF_TURN, base)
     matched = replace(matched, robot=with_base(matched.robot, base))
     if away_mm < 1e3 * _CALIBRATED[0] and away_deg < np.rad2deg(_CALIBRATED[1]):
         words = (
@@ -157,9 +158,8 @@ def _with_base(matched: MatchedJoints, base: FloatArray) -> MatchedJoints:
             "base. The results are in the frame of the poses, and so is the arm."
         )
         step = Remedy(
-            "To have them in the controller's base, write a copy of the session whose poses are "
-            "turned; to keep base_link, name a model that has it for its root.",
-            GUESS,
+            "To have them in the controller's base, record its poses in that; to keep base_link, "
+            "name a model that has it for its root."
         )
         return replace(matched, warnings=(*matched.warnings, Finding("base_link", words, step)))
     x, y, z = 1e3 * base[:3, 3]

@@ -20,9 +20,6 @@ from visioncal.session.table import reported_matrices
 # Largest difference of poses within a stop: the robot is standing still, but is reported with
 # noise.
 _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
-# Beyond any arm's reach [m]: beside nearer rows, one that is a thousand times as far, to within
-# this factor, is in millimetres.
-_OUT_OF_REACH_M, _ALIKE = 20.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +57,12 @@ def reported_poses(session: Session, robot: Robot | None) -> RobotReport:
             declared stop have different poses.
     """
     reported = reported_matrices(session.views)
-    in_mm = _in_millimetres(reported)
-    sound = [view for view in session.views if view.number not in in_mm]
-    matched = None if robot is None else match_joints(sound, robot)
+    matched = None if robot is None else match_joints(session.views, robot)
     rejections = []
     poses: dict[int, FloatArray] = {}
     for view in session.views:
         joints = view.joints_rad
-        if view.number in in_mm:
-            rejections.append(
-                Rejection(
-                    view.number,
-                    "its position looks like millimetres, and other rows are in metres: divide its "
-                    "x_m, y_m, z_m by 1000 in views.csv",
-                )
-            )
-        elif view.number in reported:
+        if view.number in reported:
             poses[view.number] = reported[view.number]
         elif joints is None or matched is None or matched.misread:
             rejections.append(Rejection(view.number, _no_pose(joints, matched)))
@@ -86,20 +73,6 @@ def reported_poses(session: Session, robot: Robot | None) -> RobotReport:
         _check_stops(session, poses)
     remarks = ((), ()) if matched is None else (matched.warnings, matched.notes)
     return RobotReport(poses, tuple(rejections), *remarks, matched)
-
-
-def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
-    """The views whose position is a thousand times as far as those of others."""
-    distances_m = {view: float(np.linalg.norm(pose[:3, 3])) for view, pose in poses.items()}
-    near = [value for value in distances_m.values() if value < _OUT_OF_REACH_M]
-    if not near:
-        return set()
-    low, high = min(near) / _ALIKE, max(near) * _ALIKE
-    return {
-        view
-        for view, value in distances_m.items()
-        if value >= _OUT_OF_REACH_M and low <= 1e-3 * value <= high
-    }
 
 
 def _no_pose(joints: FloatArray | None, matched: MatchedJoints | None) -> str:

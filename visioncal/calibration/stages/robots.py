@@ -9,7 +9,6 @@ import numpy as np
 from visioncal.calibration.guess.fit import distances
 from visioncal.calibration.guess.joints import (
     FEWEST_JOINT_ROWS,
-    FITS_SEEN,
     JointGuess,
     guess_joints,
 )
@@ -186,7 +185,7 @@ def _guessed(
     if len(views) < FEWEST_JOINT_ROWS:
         return None
     q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, seen))
-    return guess_joints(matched.robot, q, poses, FITS_SEEN)
+    return guess_joints(matched.robot, q, poses)
 
 
 def _contradicted_joints(

@@ -8,14 +8,13 @@ from typing import Any, Self
 import numpy as np
 
 from visioncal.calibration.guess import Candidate, Guess
-from visioncal.calibration.guess.readings import MIRROR_WORDS, Hypothesis
+from visioncal.calibration.guess.readings import Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
     numbers_in,
     with_camera_poses,
 )
-from visioncal.calibration.pipeline.misread_poses import session_is_mirrored
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
@@ -181,20 +180,22 @@ def reread(
 ) -> Session:
     """Applies a candidate reading to a session's poses; everything else stays the same.
 
-    For a mirror, corners.csv is mirrored back where it shows the board from behind. The session
-    notes the changes in `corrected`.
+    The session notes the changes in `corrected`.
 
     Raises:
         DataError: The resulting session is invalid; or the reading changes the robot's poses where
             only joint angles are recorded, or mirrors them without permission.
     """
     session = doubtful.session
-    corners = session.corner_table
     changes: tuple[str, ...] = ()
-    if _mirrors(candidate) and not mirrors_poses:
-        if corners is None or session.resolution is None or not session_is_mirrored(session):
-            raise _not_mirrored(candidate)
-        corners, changes, candidate = _mirrored_back(corners, session.resolution[0], candidate)
+    if candidate.hypothesis.robot.mirrored and not mirrors_poses:
+        raise DataError(
+            "Nothing was written: mirrored images are the usual cause, and then the robot's poses "
+            "are right.",
+            culprits=[candidate.words],
+            next_step="Turn the images back, and find their corners anew; only where the robot's "
+            "frame is left-handed, mirror its poses with --mirror-poses.",
+        )
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
     robot = doubtful.robot or numbers_in(session, POSE)
@@ -210,14 +211,15 @@ def reread(
     if camera.present.any():
         corrected = pose_cells(reading.camera.corrected(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
-    if candidate.differences:
+    if candidate.hypothesis.changes:
         changes += (f"The poses are read otherwise than declared: {candidate.words}.",)
     document, target = {**session.document, "mount": reading.mount}, session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
         document["target"] = "target.toml"
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
-    reread = _rewritten(session, document, cells, changes, corners, target).with_streams(streams)
+    reread = _rewritten(session, document, cells, changes, session.corner_table, target)
+    reread = reread.with_streams(streams)
     if not doubtful.knows_mount:
         changes += (f"The mount is taken for {reading.mount}.",)
     kept = (note for note in session.warnings if not _is_overruled(note, candidate))
@@ -231,7 +233,8 @@ def _is_overruled(note: str, candidate: Candidate) -> bool:
         return False
     start = note.replace("quaternions", "rotations").lower()
     return any(
-        start.startswith(" ".join(difference.split()[:3])) for difference in candidate.differences
+        start.startswith(" ".join(difference.split()[:3]))
+        for difference in candidate.hypothesis.changes
     )
 
 
@@ -272,43 +275,11 @@ def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
     return replace(stream, values=values)
 
 
-def _mirrors(candidate: Candidate) -> bool:
-    return candidate.hypothesis.robot.mirrored
-
-
-def _not_mirrored(candidate: Candidate) -> DataError:
-    """Error of a mirror without permission: with mirrored images, the poses are right."""
-    return DataError(
-        "Nothing was written: mirrored images are the usual cause, and then the robot's poses are "
-        "right.",
-        culprits=[candidate.words],
-        next_step="Turn the images back, and find their corners anew; only where the robot's "
-        "frame is left-handed, mirror its poses with --mirror-poses.",
-    )
-
-
-def _mirrored_back(
-    corners: CornerTable, width: int, candidate: Candidate
-) -> tuple[CornerTable, tuple[str, ...], Candidate]:
-    """Mirrored corners, the note for it, and the candidate without its mirror of the poses."""
-    px = corners.px.copy()
-    px[:, 0] = width - 1 - px[:, 0]
-    words = (
-        f"corners.csv is mirrored back: each u_px is {width - 1} less what it was, and the robot's "
-        "poses are not mirrored. Where it was v_px that counted from the wrong side, mirror v_px "
-        "instead: the camera's frame is turned by 180 deg about its z else."
-    )
-    reading = candidate.hypothesis
-    changes = tuple(change for change in reading.changes if change != MIRROR_WORDS)
-    reading = replace(reading, robot=replace(reading.robot, mirrored=False), changes=changes)
-    return replace(corners, px=px), (words,), replace(candidate, hypothesis=reading)
-
-
 def _check_applies(candidate: Candidate, session: Session, robot: PoseNumbers) -> None:
     """Refuses another reading of poses where only joint angles are recorded."""
     streamed = any(name in stream for stream in session.streams.values() for name in POSE)
     recorded = streamed or robot.present.any()
-    if not recorded and candidate.hypothesis.robot != candidate.declared.robot:
+    if not recorded and candidate.hypothesis.robot != candidate.recording.declared.robot:
         raise DataError(
             f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
             "alone, of which that cannot be said.",
