@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from support.commands import visioncal as run_command
 
 import visioncal
-from visioncal.core.errors import DegenerateError
 
 COLUMNS, ROWS, SQUARE_M, RESOLUTION = 9, 6, 0.03, (1280, 800)
 MATRIX, DISTORTION = (1105.0, 1103.0, 652.0, 388.0), (-0.11, 0.07, 0.0006, -0.0004, 0.0)
@@ -113,16 +112,17 @@ def write(
     return folder
 
 
-def test_an_arm_that_cannot_tilt_is_asked_for_its_lens(tmp_path):
+def test_an_arm_that_cannot_tilt_has_a_height_that_was_measured_with_its_lens_stated_or_not(
+    tmp_path,
+):
     stops = about_the_axis(18)
     measured = "[prior.flange_from_cam]\nz_m = 0.05\nsigma_m = 0.0005\n"
-    with pytest.raises(DegenerateError, match="Such motion does not determine the lens") as caught:
-        visioncal.calibrate(write(tmp_path / "open", stops, more=measured))
-    assert "role = intrinsics" in caught.value.next_step
-    # With its lens stated, the measured height is enough.
-    stated = visioncal.calibrate(write(tmp_path / "stated", stops, STATED_LENS, measured))
-    off = stated.transforms["flange_from_cam"].inv() * stops[0].flange_from_cam
-    assert 1e3 * np.linalg.norm(off.translation) < 1.5
+    # The corners alone leave the focal length open to 8 %, which is said, and counts.
+    for name, lens in (("open", ""), ("stated", STATED_LENS)):
+        found = visioncal.calibrate(write(tmp_path / name, stops, lens, measured))
+        off = found.transforms["flange_from_cam"].inv() * stops[0].flange_from_cam
+        assert 1e3 * np.linalg.norm(off.translation) < 1.5
+        assert found.verdict.status == "check" or name == "stated"
 
 
 def test_a_table_of_corners_that_was_cut_off_is_named(tmp_path):

@@ -558,21 +558,6 @@ def test_a_deleted_row_takes_its_corners_along(cube):
         Session.load(cube)
 
 
-def test_a_rig_that_is_seen_mirrored_is_named(tmp_path):
-    """Unlike a flat board, it fits no pose then."""
-    folder = write_rig(tmp_path / "rig", Rig("cube", lens=""))
-    header, *lines = (folder / "corners.csv").read_text().splitlines()
-    cells = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
-    turned = [{**cell, "u_px": str(1279.0 - float(cell["u_px"]))} for cell in cells]
-    rows = [",".join(mapping.values()) for mapping in turned]
-    (folder / "corners.csv").write_text("\n".join([header, *rows]) + "\n")
-    done = visioncal("calibrate", folder, "-o", tmp_path / "out")
-    assert done.status == 2
-    assert "seen mirrored" in done.err
-    assert "u_px counts to the right" in done.err
-    assert "one axis of the rig's table has the wrong sign" in done.err
-
-
 def test_tables_that_count_from_other_numbers_are_told_apart(cube):
     lines = (cube / "views.csv").read_text().splitlines()
     numbers = [int(line.partition(",")[0]) for line in lines[1:]]

@@ -12,37 +12,25 @@ from visioncal.core.types import IntArray
 from visioncal.estimation.observability import FEWEST_VIEWS, Turning
 
 
-def refuse_unconnected_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
+def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
     """Refuses a cell with a robot that is not connected to the rest.
-
-    Args:
-        cell: The cell.
-        lost: The unconnected frames.
-        seen: Whether there are observations that connect them, but too few or too poor.
 
     Raises:
         DegenerateError: A robot's base is among the unconnected frames.
     """
     # Where no row is left, the robot of the reference base is unconnected, too.
-    none_left = seen and all(row.seer in lost or row.seen in lost for row in cell.rows)
+    none_left = all(row.seer in lost or row.seen in lost for row in cell.rows)
     bases = [base for base in cell.tree.bases.values() if base in lost or none_left]
     if not bases:
         return
     untied = [base for base in bases if base in lost] or [*lost]
-    advice = [connection_advice(cell, base) for base in bases]
-    robots = "this robot" if len(bases) == 1 else "these robots"
-    why = f"no observation links {robots} to the rest of the cell"
-    if seen:
-        moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
-        why = (
-            f"the observations that link {robots} to the rest of the cell are too few, too much "
-            f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(moves)}"
-        )
-        advice = [
-            _tilting_advice(cell, base) or other for base, other in zip(bases, advice, strict=True)
-        ]
+    moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
+    advice = [_tilting_advice(cell, base) or connection_advice(cell, base) for base in bases]
     raise DegenerateError(
-        f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
+        f"cell: nothing ties {some_of(untied)} to {cell.reference}: the observations that link "
+        f"{'this robot' if len(bases) == 1 else 'these robots'} to the rest of the cell are too "
+        "few, too much alike, or wrong (it takes 3 stops or more, turned about two axes): "
+        f"{'; '.join(moves)}.",
         culprits=untied,
         next_step=" ".join(advice),
     )

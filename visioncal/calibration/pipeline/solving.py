@@ -27,14 +27,13 @@ from visioncal.calibration.stages.priors import with_loose_positions, without_mo
 from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
 from visioncal.calibration.stages.refine import refine_jointly, with_sizes
 from visioncal.core.choices import SolverName
-from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
+from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
     check_determined,
-    too_little_motion,
 )
 from visioncal.estimation.outliers import (
     InlierFit,
@@ -43,7 +42,7 @@ from visioncal.estimation.outliers import (
     refine_inliers,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Observations, State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -56,8 +55,6 @@ from visioncal.estimation.steps import find_steps, joints_of
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
 _ROUNDS, _CONVERGED_RAD = 4, 1e-7
-# A focal length with a larger relative sigma by the corners needs an arm that tilts.
-_UNDETERMINED_FOCAL = 0.02
 # Prior sigma of targets' sizes in the search for inliers, as a share: prints are scaled to fit a
 # page.
 _SIZE_SIGMA = 0.03
@@ -77,7 +74,7 @@ def solve(
     Raises:
         DataError: No arm has the data that the requested level needs.
         DegenerateError: A robot is linked to nothing, a frame may be in two places, or the motion
-            of one robot leaves a direction, or the lens, undetermined.
+            of one robot leaves a direction undetermined.
     """
     arms: Mapping[str, RobotArm] = arms_of(cell, observed.robots)
     check_arms(arms, level)
@@ -87,8 +84,6 @@ def solve(
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
     start = find_start(cell, observed)
-    if start.cell.mount is not None and start.cell.priors and not observed.is_misread:
-        _refuse_undetermined_lens(observed, start.problem, start.cell.mount)
     try:
         cell_fit = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
@@ -104,64 +99,34 @@ def solve(
 def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
-    if observed.is_misread:
-        inliers = all_as_inliers(start.problem, start.state)
-    else:
-        inliers = initial_inliers(start)
+    misread = observed.is_misread
+    inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
     initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)
     cell_fit = _fit_with_inliers(initial, observed)
-    cell_fit = replace(
-        cell_fit,
-        arms=with_drifts(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit, level),
-    )
+    if misread:
+        # Misread poses determine neither the arm nor which views are outliers.
+        inliers = with_camera_levels(cell, poses, cell_fit.inlier_fit)
+        return replace(cell_fit, inlier_fit=with_repeats(inliers))
+    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
         cell_fit = _fit_with_inliers(cell_fit, observed)
-    if not observed.is_misread and (found := _random_effects(cell_fit)):
+    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    corners = cell_fit.linearised_corners
+    rows = None if corners is None else cell_fit.frame_model.rows(corners)
+    if found := random_effects(problem, fit, cell_fit.arms, corners, rows):
         effects = (*clock_errors, *found)
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
-    # Misread poses determine neither the arm nor which views are outliers.
-    cell_fit = cell_fit if observed.is_misread else _calibrate_arms(cell_fit, observed, final)
-    if level != "hand-eye" and not observed.is_misread:
+    cell_fit = _calibrate_arms(cell_fit, observed, final)
+    if level != "hand-eye":
         cell_fit = _with_functions(cell_fit)
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
-    if observed.is_misread:
-        return cell_fit
-    return replace(
-        cell_fit,
-        arms=with_pose_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit),
-    )
-
-
-def _random_effects(cell_fit: CellFit) -> tuple[Effect, ...]:
-    """Errors that grow with time, reach or gravity, which the fit's residuals show."""
-    corners, model = cell_fit.linearised_corners, cell_fit.frame_model
-    rows = None if corners is None else model.rows(corners)
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
-    return random_effects(problem, fit, cell_fit.arms, corners, rows)
-
-
-def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
-    """Refuses a lens that neither corners nor turns about one axis with priors determine."""
-    poses = problem.poses[problem.robots[0]]
-    # Images of a sweep have no pose before its clock is known.
-    poses = poses[np.isfinite(poses[:, 0, 0])]
-    words, _ = too_little_motion(poses, mount) if len(poses) > 1 else ("", "")
-    for look in observed.cameras.values() if words else ():
-        if look.lens is None or look.lens.covariance is None:
-            continue
-        sigmas = np.sqrt(np.diag(look.lens.covariance)[:2]) / look.lens.camera.matrix[:2]
-        if (focal := float(sigmas.max())) > _UNDETERMINED_FOCAL:
-            raise DegenerateError(
-                f"{words} Such motion does not determine the lens, of which the corners leave the "
-                f"focal length open to {100.0 * focal:.1f} %.",
-                culprits=["camera.matrix"],
-                next_step="Give matrix and distortion in [camera]; or add images of the board held "
-                "by hand, tilted by 30 to 45 degrees about different axes, with role = intrinsics.",
-            )
+    return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, problem, fit))
 
 
 def _without_misreported(
@@ -372,7 +337,10 @@ def initial_inliers(start: Start) -> InlierFit:
     # Before the lenses are fitted, cameras disagree about one stop by more than their corners say:
     # a board shrunk to nothing would reconcile them, and all stops would be explained.
     problem = _with_camera_levels(cell, start.poses, problem)
-    if printed := _printed_targets(observations) if movable else []:
+    # Targets whose corners were seen: other poses have no known covariance.
+    pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
+    printed = list(dict.fromkeys(target for target, sensor in pairs if sensor < 0 and movable))
+    if printed:
         # Otherwise all observations of a board of another size would be outliers.
         problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
         state = State(state.edges, problem.start_values)
@@ -437,12 +405,6 @@ def with_repeats(inliers: InlierFit) -> InlierFit:
     """Fits with a shared error of repeated views of a fixed board by a fixed camera."""
     # Moved frames were searched without it: differences of such views do not contain it.
     return replace(inliers, problem=replace(inliers.problem, with_repeats=True)).refitted()
-
-
-def _printed_targets(observations: Observations) -> list[str]:
-    """Targets whose corners were seen: other poses have no known covariance."""
-    pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
-    return list(dict.fromkeys(target for target, sensor in pairs if sensor < 0))
 
 
 def _with_priors(cell: Cell, inliers: InlierFit) -> InlierFit:

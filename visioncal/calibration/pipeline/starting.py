@@ -10,9 +10,8 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.errors import DegenerateError
 from visioncal.core.types import Target
-from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
+from visioncal.estimation.observability import refuse_too_few
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
 from visioncal.session import frame_name
@@ -52,25 +51,24 @@ def find_start(cell: Cell, observed: Observed) -> Start:
         DataError: No observation gave a pose.
         DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    cell, lost = _connected_part(_with_poses(cell, observed))
+    cell = _with_poses(cell, observed)
     views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount)
-        _refuse_few_of_each(cell)
     tied = init_frames(problem, views, targets_of(cell))
     chosen = {view.view: view for view in tied.views}
-    if tied.untied:
-        refuse_unconnected_robots(cell, tied.untied, seen=True)
-        cell = _without_frames(cell, tied.untied)
+    cell = cell.without({rejection.view: rejection.reason for rejection in tied.rejections})
+    branches, linked = cell.tree.branches, cell.connected_frames()
+    lost = [name for name in branches if name not in linked or name in tied.untied]
+    refuse_unconnected_robots(cell, lost)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    cell, unlinked = _connected_part(
-        cell.without({rejection.view: rejection.reason for rejection in tied.rejections})
-    )
+    cell = _without_frames(cell, lost)
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
-    return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *unlinked))
+    untied = tuple(name for name in lost if not branches[name].robot)
+    return Start(cell, poses, problem, problem.start(tied.edges), untied)
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:
@@ -133,17 +131,6 @@ def _is_sensed(seer: str, view: ViewPoses) -> bool:
     return seer.startswith("instrument") or not view.covariance.any()
 
 
-def _connected_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
-    """The part of a cell that observations connect, and the frames outside."""
-    tied = cell.connected_frames()
-    unlinked = tuple(branch for branch in cell.tree.branches if branch not in tied)
-    refuse_unconnected_robots(cell, unlinked)
-    branches = cell.tree.branches
-    return _without_frames(cell, unlinked), tuple(
-        name for name in unlinked if not branches[name].robot
-    )
-
-
 def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     tree = cell.tree.without(frames)
     kept = tree.branches.keys()
@@ -157,17 +144,3 @@ def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     poses = {name: pose for name, pose in cell.poses.items() if name in robots}
     priors = tuple(prior for prior in cell.priors if {prior.first, prior.second} <= kept)
     return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
-
-
-def _refuse_few_of_each(cell: Cell) -> None:
-    """Refuses several targets none of which is seen in enough views for a start."""
-    targets = [row.seen for row in cell.rows]
-    counts = {name: targets.count(name) for name in dict.fromkeys(targets)}
-    if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
-        shares = ", ".join(f"{name.partition('_')[2]} in {count}" for name, count in counts.items())
-        raise DegenerateError(
-            f"hand-eye: of several targets, at least one must be seen in {FEWEST_VIEWS} views, to "
-            f"begin with; here {shares}.",
-            culprits=[count.replace("_", " ", 1) for count in counts],
-            next_step="Add views of one of them, tilted about different axes.",
-        )

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.observed import CameraObservations, Observed, 
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import listed, with_stop_means, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
@@ -35,8 +35,6 @@ _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
 # [share], by more sigmas than a bent board causes, and the residual falls below this share.
 _DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
 _OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
-# Views that show how exact the template's corners are.
-_SAMPLE = 4
 # Advice for corners without images.
 COUNTED_BACKWARDS = (
     "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
@@ -114,17 +112,8 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
             seen.progress("dense", count, len(refused))
     if not found:
         return seen, detections
-    # Weights are relative to corners of the template, where it has some.
-    sigmas = [dense.sigma_px for dense in found.values()]
-    sample = [rows[view] for view in list(detections.corners)[:_SAMPLE] if rows[view].image]
-    if sample:
-        sigmas = []
-    for view in sample:
-        image, board = image_of(session, view), session.boards[session.board_of(view)]
-        if not isinstance(image, Rejection):
-            at = detections.corners[view.number]
-            sigmas.append(kind_of(board).refine(image, board, at.ids, at.px).sigma_px)
-    typical_px = float(np.nanmedian(np.concatenate(sigmas)))
+    # The noise of each view is estimated later.
+    typical_px = float(np.nanmedian(np.concatenate([dense.sigma_px for dense in found.values()])))
     corners = dict(detections.corners) | {
         view: Corners(view, at.ids, at.px, at.width_px, typical_px / at.sigma_px)
         for view, at in found.items()
@@ -159,11 +148,7 @@ def estimate_lenses(seen: T) -> T:
         else:
             of = frame if several else ""
             with _naming(of):
-                try:
-                    fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
-                except VisioncalError:
-                    _refuse_mirrored(seen, frame, fitted, np.inf)
-                    raise
+                fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
             lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
             seen = seen.noting(fit.rejections, (warning.of(of) for warning in fit.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
@@ -192,13 +177,11 @@ def locate_targets(seen: T) -> T:
         with _naming(of):
             free = 0 if lens.covariance is None else len(lens.covariance)
             fit = estimate_poses(fitted, targets, lens.camera, free)
-        if fit.sigma_px > _DOUBTFUL_PX:
-            other = None if lens.estimated else _other_lens(look, targets, fitted, fit.sigma_px)
+        if fit.sigma_px > _DOUBTFUL_PX and not lens.estimated:
+            other = _other_lens(look, targets, fitted, fit.sigma_px)
             if other is not None:
                 lens, fit, finding = other
                 seen = seen.noting((), (finding.of(of),))
-            elif fit.sigma_px > _WRONG_LENS_PX:
-                _refuse_mirrored(seen, frame, fitted, fit.sigma_px)
         holdout = {view: px for view, px in corners.items() if view in seen.held_back}
         held = measure_poses(holdout, targets, lens.camera, fit.sigma_px)
         poses |= {view.view: view for view in (*fit.views, *held)}
@@ -244,32 +227,6 @@ def _other_lens(
     )
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     return result, poses, Finding("other_lens", words, Remedy(do))
-
-
-def _refuse_mirrored(
-    seen: Observed, frame: str, corners: Mapping[int, Corners], sigma_px: float
-) -> None:
-    """Refuses corners that fit a pose only with left and right exchanged."""
-    # Mirrored corners of a flat target fit a pose behind it, which the robot's motion reveals.
-    look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
-    if look.resolution is None or not any(target.is_rig for target in targets):
-        return
-    last = look.resolution[0] - 1.0
-    mirrored = {
-        view: replace(at, px=np.stack([last - at.px[:, 0], at.px[:, 1]], axis=1))
-        for view, at in corners.items()
-    }
-    try:
-        fit = estimate_intrinsics(mirrored, targets, look.resolution, look.table.model)
-    except VisioncalError:
-        return
-    if fit.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
-        return
-    raise DataError(
-        "The target is seen mirrored: its corners fit no pose as they are, and to "
-        f"{figure(fit.sigma_px)} px with left and right exchanged.",
-        next_step=f"{COUNTED_BACKWARDS} Or one axis of the rig's table has the wrong sign.",
-    )
 
 
 @contextmanager
