@@ -112,9 +112,7 @@ def write(
     return folder
 
 
-def test_an_arm_that_cannot_tilt_has_a_height_that_was_measured_with_its_lens_stated_or_not(
-    tmp_path,
-):
+def test_an_arm_that_cannot_tilt_takes_a_measured_height(tmp_path):
     stops = about_the_axis(18)
     measured = "[prior.flange_from_cam]\nz_m = 0.05\nsigma_m = 0.0005\n"
     # The corners alone leave the focal length open to 8 %, which is said, and counts.

@@ -237,6 +237,17 @@ def test_the_start_is_near_the_truth():
     assert np.abs(off[:, 1]).max() < 0.02
 
 
+def test_a_camera_in_one_hand_and_a_board_in_the_other_place_three_frames():
+    rng = np.random.default_rng(14)
+    cell = world(rng, 20)
+    sights = [("cam_left", "target_b", stop) for stop in range(20)]
+    cell = replace(cell, parents={**cell.parents, "cam_left": "flange_a"}, pairs=sights)
+    edges = network(observed(cell, rng)).edges
+    for name in ("base_b", "cam_left", "target_b"):
+        off = np.linalg.inv(cell.truth[name]) @ edges[name]
+        assert np.linalg.norm(off[:3, 3]) < 0.02
+
+
 def test_a_sound_cell_has_nothing_left_out_and_nothing_moved():
     _, problem = problem_of(8)
     found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)

@@ -31,19 +31,6 @@ class Start:
     untied: tuple[str, ...]  # Frames that no observation links to the rest.
 
 
-def _with_poses(cell: Cell, observed: Observed) -> Cell:
-    """Drops the observations that gave no pose."""
-    missing = {
-        row.view: cell.reasons.get(row.view, "nothing was found in its image")
-        for row in cell.rows
-        if row.view not in observed.poses
-    }
-    cell = cell.without(missing)
-    if not cell.rows:
-        raise nothing_seen(observed)
-    return cell
-
-
 def find_start(cell: Cell, observed: Observed) -> Start:
     """Initialises all frames, and chooses each view's pose by them.
 
@@ -51,7 +38,11 @@ def find_start(cell: Cell, observed: Observed) -> Start:
         DataError: No observation gave a pose.
         DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    cell = _with_poses(cell, observed)
+    lost = {row.view for row in cell.rows} - observed.poses.keys()
+    nothing = "nothing was found in its image"
+    cell = cell.without({view: cell.reasons.get(view, nothing) for view in lost})
+    if not cell.rows:
+        raise nothing_seen(observed)
     views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
@@ -60,14 +51,14 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     chosen = {view.view: view for view in tied.views}
     cell = cell.without({rejection.view: rejection.reason for rejection in tied.rejections})
     branches, linked = cell.tree.branches, cell.connected_frames()
-    lost = [name for name in branches if name not in linked or name in tied.untied]
-    refuse_unconnected_robots(cell, lost)
+    apart = [name for name in branches if name not in linked or name in tied.untied]
+    refuse_unconnected_robots(cell, apart)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    cell = _without_frames(cell, lost)
+    cell = _without_frames(cell, apart)
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
-    untied = tuple(name for name in lost if not branches[name].robot)
+    untied = tuple(name for name in apart if not branches[name].robot)
     return Start(cell, poses, problem, problem.start(tied.edges), untied)
 
 

@@ -13,7 +13,7 @@ board that looks the same turned is tried in every orientation, and all views to
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, product
+from itertools import product
 from typing import Self
 
 import numpy as np
@@ -45,11 +45,9 @@ CLEAR_RATIO = 3.0
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 # Most orientations of boards that are tried.
 _MOST_TRIED = 256
-# Fewest stops at which points are read to determine them and the instrument; least extent of points
-# in the second direction that places an instrument [m].
-_FEWEST_STOPS, _SPREAD_M = 4, 0.02
-# Assumed sigma of these starts [m].
-_ROUGH_M = 1e-2
+# Fewest stops at which points are read to determine them and the instrument; assumed sigma of these
+# starts [m].
+_FEWEST_STOPS, _ROUGH_M = 4, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,13 +255,13 @@ class _Growth:
 
     def _found(self, joined: _Joined) -> list[_Relation]:
         """More relations, by what is joined."""
-        return (
-            [*chain.from_iterable(self._solved(joined, pair, 1) for pair in self.oriented)]
-            or [*self._by_points(joined)]
-            or [*chain.from_iterable(self._solved(joined, pair, 2) for pair in self.oriented)]
-            or [*chain.from_iterable(self._solved(joined, pair, 3) for pair in self.oriented)]
-            or [*self._partly_solved(joined)]
-        )
+        for count in (1, 2, 3):
+            found = [one for pair in self.oriented for one in self._solved(joined, pair, count)]
+            if count == 1:
+                found = found or [*self._by_points(joined)]
+            if found:
+                return found
+        return [*self._partly_solved(joined)]
 
     def _known(self) -> Iterator[_Relation]:
         """The stated transforms."""
@@ -281,7 +279,7 @@ class _Growth:
         unknown, parts = [], [np.eye(4)[None]]
         for at, segment in enumerate(pair.segments):
             if at:
-                parts[-1] = parts[-1] @ invert(_robot_part(self.problem, pair.robots[at - 1], rows))
+                parts[-1] = parts[-1] @ _robot_part(self.problem, pair.robots[at - 1], rows)
             if (known := joined.between(*segment)) is not None:
                 parts[-1] = parts[-1] @ known
             else:
@@ -377,7 +375,7 @@ class _Growth:
                 readings.setdefault(pair.seer, []).append((points[:, 0], read))
         for name, parts in readings.items():
             points, read = (np.concatenate(pair) for pair in zip(*parts, strict=True))
-            if len(read) >= FEWEST and spreads(points)[0][1] > _SPREAD_M:
+            if len(read) >= FEWEST and spreads(points)[0][1] > AGREE_M:
                 of_seer = self.problem.tree.body(name)
                 yield _Relation(of_seer, name, align(points, read)[None], _ROUGH_M)
 
@@ -394,9 +392,9 @@ class _Growth:
 
 
 def _robot_part(problem: Problem, step: PathStep, rows: IntArray) -> FloatArray:
-    """The inverse (m, 4, 4) of the robot's part of a chain, in some observations."""
+    """The robot's part (m, 4, 4) of a chain, in some observations."""
     robot = problem.poses[step.robot][problem.observations.stops[rows]]
-    return robot if step.is_up else invert(robot)
+    return invert(robot) if step.is_up else robot
 
 
 def init_frames(
@@ -446,7 +444,7 @@ def _distances(problem: Problem, candidates: Candidates, tied: InitialFrames) ->
         if is_enough and len(robots) == 1 and candidates.valid[rows, 1:].any():
             # A fit to most views is more precise than one to the earliest.
             picks, robot = distances[rows].argmin(axis=1), _robot_part(problem, robots[0], rows)
-            distances[rows] = settled_distances(robot, candidates.take(rows), picks)
+            distances[rows] = settled_distances(invert(robot), candidates.take(rows), picks)
     return distances
 
 

@@ -125,11 +125,15 @@ def check_joints(observed: T, *, drops: bool) -> T:
     for name, reported in observed.robots.items():
         pairs, label = pairs_of(observed, name), _label(observed.session, name)
         matched, joints = reported.matched, reported.joints_rad or {}
+        # `base_from_flange` up to the two unknown edges: `cam_from_target` of a fixed camera, its
+        # inverse of a fixed target.
         seen = {
-            view: _as_flange(poses.cam_from_target[0], pairs[0].mount)
+            view: poses.cam_from_target[0]
             for view, poses in (pairs[0].poses if pairs else {}).items()
             if view in joints
         }
+        if pairs and pairs[0].mount == "eye-in-hand":
+            seen = {view: invert(pose) for view, pose in seen.items()}
         if matched is None or not seen:
             continue
         guess = _guessed(matched, joints, seen, {*matched.contradicting, *observed.held_back})
@@ -208,12 +212,6 @@ def _contradicted_joints(
         by_joints, by_pose = both.residuals
         if by_pose < by_joints:
             yield Rejection(view, f"{reason}, with which the camera agrees")
-
-
-def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
-    """`base_from_flange` up to the two unknown edges."""
-    # For a fixed camera it is `cam_from_target`, for a fixed target its inverse.
-    return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
 
 
 def _misread(
