@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from support.smeared import smeared
 
-import visioncal as package
 from visioncal.calibration.run import run
 from visioncal.core.transforms import invert, log
 from visioncal.session import MemoryImages
@@ -51,20 +50,16 @@ def both(session):
     return run(session).calibration, run(session, dense=True).calibration
 
 
-def test_refused_views_come_in_and_x_stays_within_its_sigma(cell, both, tmp_path):
+def test_refused_views_come_in_and_x_stays_within_its_sigma(cell, both):
     plain, dense = both
     assert used(plain) == set(range(5))
     assert used(dense) == set(range(8))
-    assert {image.view for image in dense.dense.images} == used(dense) - used(plain)
-    assert [image.motion_px for image in dense.dense.images] == pytest.approx([18.0] * 3, abs=1.5)
     edge, known = dense.edges["flange_from_cam"], plain.edges["flange_from_cam"]
     true = cell.transforms["flange_from_cam"]
     error = log(invert(true) @ edge.matrix)
     # Beyond 16.8 is a chi-square of six degrees of freedom in 1 % of sessions.
     assert error @ np.linalg.solve(edge.covariance, error) < 16.8
     assert np.trace(edge.covariance[3:, 3:]) < np.trace(known.covariance[3:, 3:])
-    dense.save(tmp_path / "calibration.json")
-    assert package.Calibration.load(tmp_path).dense == dense.dense
     assert any("--dense" in reason for reason in dense.verdict.reasons)
 
 
@@ -74,4 +69,3 @@ def test_sharp_images_keep_the_corners_of_the_template(session, both):
     np.testing.assert_array_equal(
         found.edges["flange_from_cam"].matrix, both[0].edges["flange_from_cam"].matrix
     )
-    assert found.dense.images == ()

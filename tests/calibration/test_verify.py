@@ -20,7 +20,6 @@ from visioncal.calibration.verification.calibration_prior import CalibrationPrio
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
 from visioncal.calibration.verification.prediction import (
-    checked_state,
     predict_detected,
     predict_stops,
 )
@@ -140,7 +139,7 @@ def test_one_stop_is_no_robot_that_scatters(place):
     found = checked(place, rng, Change(board=knock(rng, 2.0, 0.0)), stops=1)
     assert not found.passed
     assert {"camera", "board"} <= set(names(found))
-    assert "This stop does not separate that from" in verdict_of(found).reasons[1]
+    assert "1 stop cannot separate that from" in verdict_of(found).reasons[1]
 
 
 def test_a_board_that_was_turned_by_much_is_told(place):
@@ -225,7 +224,7 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     calibration = result_of(calibrated(cell.only(range(FITTED)), joints=False))
     prior_calibration = CalibrationPrior.of(calibration)
     # Without joint angles, its errors are in the noise of a look.
-    assert prior_calibration.arm == "none"
+    assert prior_calibration.fit.arm is None
     assert np.linalg.eigvalsh(prior_calibration.covariance)[0] > -1e-12
     rng = np.random.default_rng(8)
     for _ in range(4):
@@ -345,7 +344,7 @@ def test_other_cells_are_refused_by_what_differs():
         (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
     ):
         with pytest.raises(DataError, match=words):
-            checked_state(wrong, prior_calibration)
+            predict_stops(wrong, prior_calibration)
     known = known_again(place.cell, np.random.default_rng(9))
     with pytest.raises(DataError, match="no joint angles"):
         predict_detected(
@@ -356,7 +355,7 @@ def test_other_cells_are_refused_by_what_differs():
         predict_detected(
             known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration
         )
-    with pytest.raises(DataError, match="an older version"):
+    with pytest.raises(DataError, match="holds no fit"):
         CalibrationPrior.of(replace(place.calibration, joint_fit=None))
     spoilt = replace(place.calibration.joint_fit, covariance=np.eye(1))
     with pytest.raises(DataError, match="joint_fit cannot be read"):

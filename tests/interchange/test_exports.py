@@ -21,6 +21,7 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera
+from visioncal.estimation.lens_field import displacements
 from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, export
 from visioncal.results import CameraResult, Edge
 from visioncal.vision.camera import normalise, project_with_jacobian
@@ -294,7 +295,7 @@ def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens()
 def test_a_field_that_nobody_notices_leaves_the_lens_as_it_was_given():
     result = with_field(SAMPLE)
     field = replace(result.camera.field, field_px=1e-3, breathing=0.0)
-    count = field.columns(result.camera.camera, np.zeros((1, 2)), None).shape[2]
+    count = displacements(np.zeros((1, 2)), result.camera.camera, 0.0, field.levels).shape[2]
     names = ("coefficients", "root", "intrinsics_covariance", "edge_covariance")
     field = replace(field, **{name: getattr(field, name)[:count] for name in names})
     small = replace(result, camera=replace(result.camera, field=field))

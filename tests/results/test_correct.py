@@ -387,7 +387,8 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
         return done.err
 
     good = write_poses(table, poses).read_text()
-    assert "look like millimetres" in refused(good.replace(",0.", ",400."))
+    far = "x_m,y_m,z_m,qx,qy,qz,qw\n400,100,200,0,1,0,0\n"
+    assert "Positions are in metres" in refused(far)
     assert "Write metres" in refused(good.replace("x_m,y_m,z_m", "x_mm,y_mm,z_mm"))
     assert "qw are missing" in refused(good.replace(",qw", ",q4"))
     assert "column z_m: it is empty" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,,0,0,0,1\n")

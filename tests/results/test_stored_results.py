@@ -46,7 +46,7 @@ def test_sections_have_types_and_none_where_nothing_was_computed():
     assert arm.elastic.weight_moments is None
     assert arm.joint_fit.covariance.shape == (len(arm.joint_fit.covariance),) * 2
     assert arm.uncertainty.radius95_mm > arm.uncertainty.total_mm > 0.0
-    assert (arm.clock, arm.thermal, arm.board, arm.dense) == (None,) * 4
+    assert (arm.clock, arm.thermal, arm.board) == (None,) * 3
     warm = Calibration.from_json(stored("warm"), "warm")
     assert warm.thermal.heated_by == "temperatures"
     assert warm.drift.growth_per_k == pytest.approx(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.transforms import exp
+from visioncal.estimation.lens_field import displacements
 from visioncal.results import Calibration
 from visioncal.results.lens import LensField
 from visioncal.vision.camera import intrinsics, with_intrinsics
@@ -24,7 +25,7 @@ def with_field(calibration: Calibration, seed: int = 0) -> Calibration:
         intrinsics_covariance=np.zeros((0, 9)),
         edge_covariance=np.zeros((0, 12)),
     )
-    count = field.columns(lens.camera, np.zeros((1, 2)), None).shape[2]
+    count = displacements(np.zeros((1, 2)), lens.camera, 0.0, field.levels).shape[2]
     field = replace(
         field,
         coefficients=rng.standard_normal(count),

@@ -26,7 +26,6 @@ class Sources:
     # The problem's columns with the prior uncertainty of effects, by the source. Columns of no
     # source do not count.
     columns: Mapping[str, IntArray] = field(default_factory=dict)
-    priors: str = "priors"  # The source of hand-measured frames.
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +84,7 @@ def covariance_by_source(
         _, jacobian = problem.prior_rows(prior, state)
         prior_info = prior_info - jacobian.T @ jacobian
         response = jacobian @ gain.columns
-        parts[sources.priors] += response.T @ response
+        parts["priors"] += response.T @ response
     owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for name, columns in sources.columns.items():
         share = np.where(np.isin(owned, columns), 0.5, 0.0)

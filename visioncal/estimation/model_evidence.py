@@ -71,7 +71,7 @@ class CalibrationPosterior:
 class ChangeHypothesis:
     """A change that may have happened since the calibration, of p unknowns."""
 
-    name: str
+    name: str  # Its kind in one word, and what it is of, as `joint 3`.
     units: FloatArray  # (p,) the size of each unknown, for a change of one metre.
     # (n, 6, p) right perturbations of the measured poses that undo it; None for none.
     by_sensor: FloatArray | None = None
@@ -80,6 +80,12 @@ class ChangeHypothesis:
     start: FloatArray | None = None  # (p,) start of the search; None for zero.
     # Factors on the noise of the stops, where larger noise is the change.
     noise_factors: tuple[float, ...] = (1.0,)
+    at: int = 0  # Index of the board or joint.
+
+    @property
+    def kind(self) -> str:
+        """Its kind."""
+        return self.name.partition(" ")[0]
 
 
 @dataclass(frozen=True, eq=False)

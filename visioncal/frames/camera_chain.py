@@ -66,8 +66,8 @@ class ArmErrors:
             return None
         lens_size = len(intrinsics(calibration.camera.camera))
         free = [at for at in fit.looks if at < lens_size]
-        # Between the camera's edge and the lens is the first board's edge, where there is one.
-        lens_start = 12 if fit.boards else 6
+        # Between the camera's edge and the lens are the boards' edges.
+        lens_start = 6 + 6 * len(fit.boards)
         fitted = [*range(6), *(lens_start + fit.looks.index(at) for at in free)]
         kept = [*range(6), *(6 + at for at in free)]
         arm = slice(len(fit.covariance) - len(fit.arm.values), None)

@@ -113,7 +113,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
     head: dict[str, Any] = {
         "schema": SCHEMA,
         "session": SessionForm(calibration.session_name, calibration.session_sha256),
-        "joint_covariance": JointCovariance.of(calibration.edges, calibration.joint_covariance),
+        "joint_covariance": JointCovariance(tuple(calibration.edges), calibration.joint_covariance),
         "conditions": calibration.conditions,
     }
     cell, validation = calibration.cell, calibration.validation

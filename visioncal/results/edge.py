@@ -1,6 +1,5 @@
 """Transform with covariance, and their form in files."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -91,8 +90,9 @@ def _covariance_fault(matrix: FloatArray) -> str:
     """Why a matrix is no covariance; empty for one."""
     variance = np.diagonal(matrix)
     scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
+    fault = "is no covariance"
     if matrix.shape[0] != matrix.shape[1] or (variance < 0.0).any():
-        return "is no covariance"
+        return fault
     with np.errstate(over="ignore"):
         scaled = matrix / scale[:, None] / scale
     if (
@@ -100,7 +100,7 @@ def _covariance_fault(matrix: FloatArray) -> str:
         or np.abs(scaled - scaled.T).max(initial=0.0) > _ROUNDING
         or (len(scaled) and np.linalg.eigvalsh(scaled)[0] < -_ROUNDING)
     ):
-        return "is no covariance"
+        return fault
     return ""
 
 
@@ -181,8 +181,3 @@ class JointCovariance:
 
     order: tuple[str, ...]
     matrix: Covariance
-
-    @classmethod
-    def of(cls, edges: Mapping[str, Edge], matrix: FloatArray) -> "JointCovariance":
-        """Form of the joint covariance of some transforms."""
-        return cls(tuple(edges), matrix)

@@ -58,17 +58,10 @@ class LensField(Section):
     # (m, 6 e) cross-covariance with the transforms in the order of `joint_covariance`.
     edge_covariance: Matrix
 
-    def columns(self, camera: Camera, px: FloatArray, distance_m: float | None) -> FloatArray:
-        """(n, 2, m) Jacobian of pixel displacements by the coefficients [px].
-
-        Args:
-            camera: The intrinsics.
-            px: (n, 2) the pixels.
-            distance_m: Depth of the imaged points; None for the mean distance.
-        """
-        levels = LensLevels(self.field_px, self.length, self.breathing, self.jitter)
-        relative_distance = 0.0 if distance_m is None else distance_m / self.distance_m - 1.0
-        return displacements(px, camera, relative_distance, levels)
+    @property
+    def levels(self) -> LensLevels:
+        """Its sizes."""
+        return LensLevels(self.field_px, self.length, self.breathing, self.jitter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,18 +135,20 @@ class CameraResult:
         return np.asarray(low + low.T + np.diag(np.diag(covariance)))
 
     def displacements(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
-        """(n, 2, m) Jacobian of pixel displacements by the field's coefficients [px]."""
-        if self.field is None:
-            return np.zeros((len(px), 2, 0))
-        return self.field.columns(self.camera, px, distance_m)
-
-    def in_model(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
-        """(n, 2) pixels without the displacement field, as the lens model has them [px].
+        """(n, 2, m) Jacobian of pixel displacements by the field's coefficients [px].
 
         Args:
             px: (n, 2) the pixels.
             distance_m: Depth of the imaged points; None for the mean distance.
         """
+        field = self.field
+        if field is None:
+            return np.zeros((len(px), 2, 0))
+        relative_distance = 0.0 if distance_m is None else distance_m / field.distance_m - 1.0
+        return displacements(px, self.camera, relative_distance, field.levels)
+
+    def in_model(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
+        """(n, 2) pixels without the displacement field, as the lens model has them [px]."""
         if self.field is None:
             return px
         return np.asarray(px - self.displacements(px, distance_m) @ self.field.coefficients)

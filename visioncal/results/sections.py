@@ -15,8 +15,6 @@ from visioncal.results.edge import Covariance
 from visioncal.vision.targets import corner_positions
 
 _BEND = "bow_"
-# Absent in files of earlier versions.
-_LATER = "shear"
 # 95 % intervals by name of the noise level.
 Intervals = Mapping[str, tuple[float, float]]
 
@@ -75,13 +73,13 @@ class BoardResult(Section):
 
     def __post_init__(self) -> None:
         for name in BOARD_NAMES:
-            if name not in self.shape and name != _LATER:
+            if name not in self.shape:
                 raise ValueError(f"shape.{name} is missing")
 
     @property
     def values(self) -> FloatArray:
         """(10,) shape parameters in the order of `BOARD_NAMES`."""
-        return np.array([self.shape.get(name, 0.0) for name in BOARD_NAMES])
+        return np.array([self.shape[name] for name in BOARD_NAMES])
 
     @property
     def is_bent(self) -> bool:
@@ -178,9 +176,8 @@ class CellUncertainty(Section):
 class FittedArm:
     """Arm error parameters of a fit."""
 
-    # Kind of the parameters: errors of the reported `poses`, of all `links`, or parameters of the
-    # calibrated `model`.
-    of: Literal["poses", "links", "model"]
+    # Kind of the parameters: errors of all `links`, or parameters of the calibrated `model`.
+    of: Literal["links", "model"]
     values: Vector  # (k,) estimates, zero for the nominal arm.
     # For a model, prior standard deviations by parameter block.
     weights: Mapping[str, float] | None = None
@@ -214,8 +211,7 @@ class JointFit(Section):
     boards: tuple[str, ...]  # Names of the targets that the fit places; empty without a target.
     looks: tuple[int, ...]  # Indices of the free parameters of lens and targets.
     arm: FittedArm | None = None  # The arm's errors; None where none were estimated.
-    # (k, k) of both transforms, of lens and targets, of further targets' poses relative to the
-    # first, and of the arm's errors.
+    # (k, k) of the transforms, of lens and targets, and of the arm's errors.
     covariance: Covariance
     stops: FittedStops | None = None  # Its stops; None of a part of a whole cell.
 
@@ -231,24 +227,6 @@ class CellJointFit(Section):
     # Errors of each calibrated arm, by robot.
     arms: Mapping[str, FittedArm] = field(default_factory=dict)
     covariance: Covariance  # (k, k) of the transforms, then of cameras, targets and arms.
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageBlur:
-    """Blur of an image."""
-
-    view: int  # The view's number.
-    sigma_px: float  # Standard deviation of the blur of lens and defocus [px].
-    motion_px: float  # Length of the motion blur [px].
-    motion_deg: float  # Its direction, from the image's x [deg].
-    pixel_noise: float  # Standard deviation of a pixel, once the image is reduced [grey levels].
-
-
-@dataclass(frozen=True, kw_only=True)
-class DenseResult(Section):
-    """Views whose corners are by all pixels of their images: `dense`."""
-
-    images: tuple[ImageBlur, ...]  # Blur of each image.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -290,8 +268,6 @@ class CalibrationSections(ArmSections):
     means: Mapping[str, float] = field(default_factory=dict)
     # Parameters of the fit and their covariance, for verification.
     joint_fit: JointFit | None = None
-    # Views whose corners are by all pixels of their images; None where not asked for.
-    dense: DenseResult | None = None
     touch_test: TouchTest | None = None  # Result of a touch test.
     # Unknown sections, kept as they are.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)

@@ -69,33 +69,20 @@ class ViewResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeerAndSeen:
-    """Observer and observed object of an observation, by kind and name."""
+class CellView:
+    """Result of one observation of a whole cell, with names instead of frames."""
 
     camera: str | None = None  # Name of the camera; None for an instrument.
     instrument: str | None = None  # Name of the instrument; None for a camera.
     target: str | None = None  # Name of the observed target; None for a point.
     point: str | None = None  # Name of the measured point; None for a target.
+    # The robots between observer and observed object.
+    robots: Annotated[tuple[str, ...], KEPT] = ()
+    figures: Annotated[ViewResult, INLINE]  # The other fields.
 
     def __post_init__(self) -> None:
         if (self.camera or self.instrument) is None or (self.target or self.point) is None:
             raise ValueError("camera or instrument, or target or point, is missing")
-
-
-def _names(view: ViewResult) -> dict[str, Any]:
-    """Names of observer and observed object, by kind."""
-    seer = "camera" if frames_of_kind([view.seer], "camera") else "instrument"
-    seen = "target" if frames_of_kind([view.seen], "target") else "point"
-    return {seer: object_name(view.seer, seer), seen: object_name(view.seen, seen)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellView(SeerAndSeen):
-    """Result of one observation of a whole cell, with names instead of frames."""
-
-    # The robots between observer and observed object.
-    robots: Annotated[tuple[str, ...], KEPT] = ()
-    figures: Annotated[ViewResult, INLINE]  # The other fields.
 
     @classmethod
     def of(cls, tree: Mapping[str, str], view: ViewResult) -> "CellView":
@@ -103,21 +90,19 @@ class CellView(SeerAndSeen):
         connected = {view.seer, view.seen} <= tree.keys()
         robots = robots_between(tree, view.seer, view.seen) if connected else ()
         named = tuple(robot or "robot" for robot in robots)
-        return cls(robots=named, figures=replace(view, seer="", seen=""), **_names(view))
+        seer = "camera" if frames_of_kind([view.seer], "camera") else "instrument"
+        seen = "target" if frames_of_kind([view.seen], "target") else "point"
+        names: dict[str, Any] = {
+            seer: object_name(view.seer, seer),
+            seen: object_name(view.seen, seen),
+        }
+        return cls(robots=named, figures=replace(view, seer="", seen=""), **names)
 
     def result(self, tree: Mapping[str, str]) -> ViewResult:
         """The observation; inverse of `of`."""
         names = ((kind, getattr(self, kind)) for kind in _KINDS)
         seer, seen = (frame_of_object(tree, kind, name) for kind, name in names if name is not None)
         return replace(self.figures, seer=seer, seen=seen)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairResiduals(SeerAndSeen):
-    """Residuals of left-out views of one target by one camera [mm, deg, px]."""
-
-    views: int
-    rms: Annotated[Rms, INLINE]
 
 
 @dataclass(frozen=True)
@@ -127,29 +112,13 @@ class Validation:
     method: str  # How views were left out, in words.
     held_out: Rms  # Residuals of all used views, left out in turn.
     holdout: Rms | None = None  # Residuals of the views that the session declares as `holdout`.
-    # In a whole cell, residuals of left-out views by camera and target.
-    pairs: tuple[PairResiduals, ...] = ()
 
     @classmethod
-    def of(cls, method: str, views: Sequence[ViewResult], *, by_pair: bool = False) -> "Validation":
-        """Validation of a whole cell from the residuals of its observations.
-
-        Args:
-            method: How they were left out; empty where they were not.
-            views: The observations.
-            by_pair: Whether to list pairs of camera and target.
-        """
+    def of(cls, method: str, views: Sequence[ViewResult]) -> "Validation":
+        """Validation from the residuals of views; `method` is empty where none were left out."""
         if not method:
             return cls(_NOT_LEFT_OUT, rms_of(views), holdout_rms(views))
-        groups: dict[tuple[str, str], list[ViewResult]] = {}
-        for view in views if by_pair else ():
-            if view.left_out_mm is not None:
-                groups.setdefault((view.seer, view.seen), []).append(view)
-        pairs = tuple(
-            PairResiduals(views=len(group), rms=left_out_rms(group), **_names(group[0]))
-            for group in groups.values()
-        )
-        return cls(method, left_out_rms(views), holdout_rms(views), pairs)
+        return cls(method, left_out_rms(views), holdout_rms(views))
 
     @property
     def is_of_unseen(self) -> bool:

@@ -28,12 +28,8 @@ _SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
 
 def left_out(cell_fit: CellFit) -> HeldOutResiduals:
     """Residuals of the inliers, each by a fit without its stop, to first order."""
-    fit, used, mount = (
-        cell_fit.inlier_fit.fit,
-        np.flatnonzero(cell_fit.inlier_fit.used),
-        cell_fit.cell.mount,
-    )
-    part = cell_fit.inlier_problem
+    fit, part, mount = cell_fit.inlier_fit.fit, cell_fit.inlier_problem, cell_fit.cell.mount
+    used = np.flatnonzero(cell_fit.inlier_fit.used)
 
     def refit(kept: Mask) -> State:
         if cell_fit.solver == "joint" or mount is None:
@@ -119,11 +115,7 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
 
 def _sources(cell_fit: CellFit) -> Sources:
     """Sources of uncertainty by camera, robot and board; without names for a single pair."""
-    problem, optics, mount = (
-        cell_fit.inlier_fit.problem,
-        cell_fit.camera_parameters,
-        cell_fit.cell.mount,
-    )
+    problem, mount = cell_fit.inlier_fit.problem, cell_fit.cell.mount
     columns = defaultdict[str, list[int]](list)
     for name, column in problem.effect_columns.items():
         if name != LENSES:
@@ -142,15 +134,13 @@ def _sources(cell_fit: CellFit) -> Sources:
         )
     # A sensor that moved remains one sensor.
     seers = {observer: observer.partition("@")[0] for observer in observers}
+    optics = cell_fit.camera_parameters
     of_corners = () if optics is None else optics.problems
-    return Sources(
-        {
-            key: f"{'pixels' if frame in of_corners else 'readings'} of {frame}"
-            for key, frame in seers.items()
-        },
-        {robot: f"robot {robot}" for robot in problem.robots},
-        by_source,
-    )
+    sensors = {
+        key: f"{'pixels' if frame in of_corners else 'readings'} of {frame}"
+        for key, frame in seers.items()
+    }
+    return Sources(sensors, {robot: f"robot {robot}" for robot in problem.robots}, by_source)
 
 
 def _shape_columns(cell_fit: CellFit) -> dict[str, IntArray]:

@@ -3,7 +3,7 @@
 It includes the joint fit, as a later verification of the same cell needs it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -21,7 +21,7 @@ from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects
-from visioncal.core.transforms import adjoint, apply, invert, log
+from visioncal.core.transforms import apply, log
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.estimation.arm import misfit_jacobian
@@ -45,10 +45,8 @@ from visioncal.results.sections import (
     CellDetails,
     CellJointFit,
     CellUncertainty,
-    DenseResult,
     FittedArm,
     FittedStops,
-    ImageBlur,
     InstrumentResult,
     JointFit,
     PointResult,
@@ -96,15 +94,12 @@ def result_of(run: RunState) -> Calibration:
         views=answer.views,
         rms=rms_of(answer.views),
         validation=Validation.of(
-            answer.held_out.method if was_left_out or is_pair else "",
-            answer.views,
-            by_pair=not is_pair,
+            answer.held_out.method if was_left_out or is_pair else "", answer.views
         ),
         verdict=verdict,
         boards=boards,
         rigs=rigs,
         cell=cell,
-        dense=_dense(run),
         need=need_met(findings.need, findings.judged_picks, whole=cell is not None),
     )
     sections = _sections_of_pair(run, names, boards, rigs) if is_pair else {}
@@ -185,23 +180,6 @@ def _sections_of_pair(
     }
 
 
-def _dense(run: RunState) -> DenseResult | None:
-    if run.dense is None:
-        return None
-    return DenseResult(
-        images=tuple(
-            ImageBlur(
-                view=view,
-                sigma_px=found.blur_px,
-                motion_px=float(np.hypot(*found.motion_px)),
-                motion_deg=float(np.rad2deg(np.arctan2(*found.motion_px[::-1])) % 180.0),
-                pixel_noise=found.noise,
-            )
-            for view, found in run.dense.items()
-        )
-    )
-
-
 def _views(run: RunState) -> tuple[ViewResult, ...]:
     """Result of each view of the session, in its order."""
     results = {view.view: view.of_pair for view in run.assessment.views}
@@ -241,7 +219,7 @@ def _joint_fit(run: RunState) -> JointFit | None:
     boards, seen = run.session.boards, run.cell_fit.linearised_corners
     unknown = run.assessment.problem.unknown
     names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in unknown]
-    covariance, by_noise = _written_covariance(run)
+    covariance, by_noise = _fit_covariance(run)
     return JointFit(
         targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),
@@ -303,29 +281,31 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _written_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
-    """Covariance of the unknowns as they are written, and of the arm's that are not estimated.
+def _fitted_columns(run: RunState, arms: Iterable[RobotArm]) -> IntArray:
+    """Columns of a fit's edges, of free values of lenses and boards, and of arms' errors."""
+    problem, seen = run.assessment.problem, run.cell_fit.linearised_corners
+    columns = [np.arange(6 * len(problem.unknown))]
+    columns += [] if seen is None else [run.cell_fit.columns_of(seen.free)]
+    for arm in arms:
+        of_arm = problem.effect_columns.get(f"arm of {arm.robot}", slice(0, 0))
+        errors = np.arange(of_arm.start, of_arm.stop)
+        columns.append(errors if arm.model is None else errors[arm.model.is_kept])
+    return np.concatenate(columns)
+
+
+def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
+    """Covariance of a fit's unknowns, and of the arm's that are not estimated.
 
     The second is the part by noise, and by errors that change with time.
     """
-    # Further boards are written relative to the first; clocks and drift are left out.
-    answer, arm, seen = run.assessment, run.robot_arm, run.cell_fit.linearised_corners
-    problem, boards, rows = answer.problem, answer.state.edges[1:], np.eye(answer.problem.size)
-    # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
-    further = [
-        rows[6:12] - adjoint(invert(boards[0]) @ boards[at]) @ rows[6 * at + 6 : 6 * at + 12]
-        for at in range(1, len(boards))
-    ]
-    of_errors = rows[problem.effect_columns.get(f"arm of {arm.robot}", slice(0, 0))]
-    of_errors = of_errors if arm.model is None else of_errors[arm.model.is_kept]
-    optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
-    written = np.concatenate([rows[:12], rows[optics], *further, of_errors])
+    answer, arm, errors = run.assessment, run.robot_arm, run.robot_arm.errors
+    columns = _fitted_columns(run, [arm])
     by_noise = answer.covariance - sum(answer.covariance_by_source.values(), np.zeros(()))
-    parts = [np.asarray(written @ part @ written.T) for part in (answer.covariance, by_noise)]
-    errors = arm.errors
+    parts = [part[np.ix_(columns, columns)] for part in (answer.covariance, by_noise)]
     if errors is None or errors.is_estimated:
         return parts[0], parts[1]
-    jacobian = written @ misfit_jacobian(problem, answer.state, answer.noise, arm.robot, errors)
+    misfit = misfit_jacobian(answer.problem, answer.state, answer.noise, arm.robot, errors)
+    jacobian = misfit[columns]
     size, variance = jacobian.shape[1], errors.sigma**2
     lasting = jacobian[:, errors.is_time_correlated]
     parts[1] += variance * lasting @ lasting.T
@@ -382,11 +362,8 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
     intrinsics of which only a part is uncertain (the matrix and not the distortion) have zeros for
     the rest.
     """
-    cell_fit, covariance, edges = (
-        run.cell_fit,
-        run.assessment.covariance,
-        6 * len(run.assessment.edges),
-    )
+    cell_fit, covariance = run.cell_fit, run.assessment.covariance
+    edges = 6 * len(run.assessment.edges)
     seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
     # Measured poses need no camera, but later use of the result may.
     cameras = {
@@ -418,22 +395,26 @@ def _joint_fit_of_cell(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
     cell_fit, answer = run.cell_fit, run.assessment
     seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
-    columns, arms = [*range(6 * len(answer.edges))], dict[str, FittedArm]()
     cameras, targets = dict[str, tuple[int, ...]](), dict[str, tuple[int, ...]]()
     if seen is not None and optics is not None:
-        columns += cell_fit.columns_of(seen.free).tolist()
         for name, at in optics.lenses.items():
             cameras[object_name(name, "camera")] = _relative_indices(seen.free, at)
         for name, shape in _shape_slices(run).items():
             targets[name] = _relative_indices(seen.free, shape)
-    for robot, arm in cell_fit.arms.items():
-        fitted = _fitted_arm(run, arm)
-        effect = answer.problem.effect_columns.get(f"arm of {arm.robot}")
-        if fitted is not None and arm.model is not None and effect is not None:
-            arms[robot or "robot"] = fitted
-            columns += np.arange(effect.start, effect.stop)[arm.model.is_kept].tolist()
-    covariance = answer.covariance[np.ix_(columns, columns)]
-    return CellJointFit(cameras=cameras, targets=targets, arms=arms, covariance=covariance)
+    arms = {
+        robot or "robot": (arm, fitted)
+        for robot, arm in cell_fit.arms.items()
+        if arm.model is not None and f"arm of {arm.robot}" in answer.problem.effect_columns
+        for fitted in [_fitted_arm(run, arm)]
+        if fitted is not None
+    }
+    columns = _fitted_columns(run, [arm for arm, _ in arms.values()])
+    return CellJointFit(
+        cameras=cameras,
+        targets=targets,
+        arms={robot: fitted for robot, (_, fitted) in arms.items()},
+        covariance=answer.covariance[np.ix_(columns, columns)],
+    )
 
 
 def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:

@@ -1,7 +1,7 @@
 """Verifies a calibration with a few new stops, and ranks what may have changed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from visioncal.calibration.verification.change_hypotheses import (
     CAMERA,
     NOISE,
     PAIRS,
-    Cause,
     causes_of,
 )
 from visioncal.calibration.verification.prediction import (
@@ -29,6 +28,7 @@ from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
 from visioncal.estimation.model_evidence import (
     CalibrationPosterior,
+    ChangeHypothesis,
     HypothesisEvidence,
     evidence_of,
     undone,
@@ -48,7 +48,7 @@ _ANYWHERE = 1.0
 class Suspect:
     """A change that may have happened."""
 
-    cause: Cause
+    cause: ChangeHypothesis
     probability: float  # Posterior probability among all changes.
     explained: HypothesisEvidence  # Fit and evidence of the change.
 
@@ -62,7 +62,6 @@ class Suspect:
 class Check:
     """Result of verifying a calibration with a few new stops."""
 
-    calibration: Calibration  # The calibration.
     predicted: PredictedStops  # The stops.
     prior: CalibrationPrior  # The calibration as a prior.
     # (m, 6) displacement of each board from its calibrated pose, by each observation (rotation
@@ -70,7 +69,6 @@ class Check:
     residuals: FloatArray
     remaining: FloatArray  # (m, 6) the same with the likeliest change undone, where one was found.
     repeated: int  # Number of the calibration's stops that are repeated.
-    log_evidence: float  # Logarithm of the likelihood ratio of any change to none.
     unchanged: HypothesisEvidence  # Fit and evidence without a change.
     p_value: float  # Probability of a misfit at least as large if nothing has changed.
     suspects: tuple[Suspect, ...]  # All changes that were compared, the likeliest first.
@@ -78,6 +76,11 @@ class Check:
     # nothing has changed.
     named: tuple[Suspect, ...]
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration."""
+        return self.prior.calibration
 
     @property
     def passed(self) -> bool:
@@ -160,17 +163,21 @@ def check(
                 next_step="Leave --board-moved out: each board is compared by itself, and the one "
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
-        change = mean_transform(predicted.away(prior))
-        prior = prior.with_board_at(prior.state.edges[1] @ change, _ANYWHERE)
+        x, z = prior.state.edges
+        seen = replace(prior.state, edges=np.stack([x, z @ mean_transform(predicted.away(prior))]))
+        covariance = prior.covariance.copy()
+        covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
+        covariance[6:12, 6:12] = _ANYWHERE**2 * np.eye(6)
+        prior = replace(prior, state=seen, covariance=covariance)
     elif with_repeats:
         stops = problem.observations.stops
         repeated = prior.repeated(problem.poses[ROBOT][stops], predicted.boards, stops)
-    noise = prior.noise(from_corners=predicted.from_corners)
+    noise = prior.noise(from_corners=not problem.is_combined)
     belief = CalibrationPosterior(prior.state, prior.covariance, noise, prior.freedom, repeated)
     causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)
     with one_blas_thread():
         unchanged = evidence_of(problem, belief)
-        explanations = [evidence_of(problem, belief, cause.columns) for cause in causes]
+        explanations = [evidence_of(problem, belief, cause) for cause in causes]
     # Kinds of causes have equal prior probabilities, and causes of one kind.
     kinds = [cause.kind for cause in causes]
     priors = np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
@@ -180,26 +187,28 @@ def check(
         Suspect(causes[index], float(np.exp(scores[index] - evidence)), explanations[index])
         for index in np.argsort(-scores, kind="stable")
     )
-    log_evidence = evidence - unchanged.likelihood
-    named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_separated(suspects)
+    is_changed = evidence - unchanged.likelihood >= np.log(_LIMITS.likelihood_ratio)
+    named = _not_separated(suspects) if is_changed else ()
     changes = remaining = log(predicted.away(prior))
     if named:
-        columns = named[0].cause.columns
-        corrected = undone(problem, columns, named[0].explained.values)
-        remaining = log(board_changes(corrected, with_change(belief.state, columns)))
+        likeliest = named[0].cause
+        corrected = undone(problem, likeliest, named[0].explained.values)
+        remaining = log(board_changes(corrected, with_change(belief.state, likeliest)))
+    best, freedom = suspects[0], suspects[0].explained.freedom
+    # Without degrees of freedom, or by larger noise, everything is explained.
+    limit = f_limit(_LIMITS.unexplained, freedom, prior.freedom) if freedom > 0 else np.inf
+    is_explained = best.cause.kind == NOISE or best.explained.misfit < max(freedom, 1) * limit
     return Check(
-        prior.calibration,
         predicted,
         prior,
         changes,
         remaining,
         0 if repeated is None else len(repeated.repeats),
-        log_evidence,
         unchanged,
         float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
         suspects,
         named,
-        _is_explained(suspects[0], prior.freedom),
+        bool(is_explained),
     )
 
 
@@ -227,12 +236,3 @@ def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
         )
     ]
     return (best, *rivals)
-
-
-def _is_explained(best: Suspect, freedom: float) -> bool:
-    """Whether a change leaves residuals no larger than noise; true without degrees of freedom."""
-    remaining = best.explained.freedom
-    if best.cause.kind == NOISE or remaining < 1:
-        return True
-    limit = f_limit(_LIMITS.unexplained, remaining, freedom)
-    return bool(best.explained.misfit < remaining * limit)

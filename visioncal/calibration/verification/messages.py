@@ -1,7 +1,6 @@
 """Verdict of a check in sentences, and as verify.json."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from visioncal.calibration.verification.change_hypotheses import (
     JOINT,
     LENGTH,
     NOISE,
-    PAIRS,
     REPLACED,
     SIZE,
     VIEW,
@@ -30,20 +28,15 @@ from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
-# Parts of a motion of fewer sigmas are not mentioned.
+# Sigmas beyond which a part of a motion is mentioned; nearly every check detects twice as many.
 _MENTIONED = 3.0
-# Fewest stops that locate camera and board roughly, so that more stops can be planned.
-_LEAST_STOPS = 3
-# Sigmas of a camera's motion that nearly every check detects.
-_SURE = 6.0
 # Thermal expansion of aluminium and steel, in shares a kelvin.
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
-SCHEMA = 1
 # Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
 _SIZE_WORDS = (
-    "{board} is {percent} % {larger} (sigma {percent_sigma}) than it was: it was printed again or "
+    "the {board} is {percent} % {larger} (sigma {sigma}) than it was: it was printed again or "
     "exchanged"
 )
 _ANOTHER_BOARD = Remedy(
@@ -68,8 +61,7 @@ _KINDS = {
     SIZE: (_SIZE_WORDS, _ANOTHER_BOARD),
     REPLACED: (_SIZE_WORDS + "; its middle {moved}", _ANOTHER_BOARD),
     JOINT: (
-        "{joint} off by {offset} {unit} (sigma {offset_sigma}) from what it reads: its encoder "
-        "slipped, or its zero was lost",
+        "{joint} off by {offset} from what it reads: its encoder slipped, or its zero was lost",
         Remedy(
             "Look whether the joint keeps its zero (a coupling that slips does so again), then "
             f"{_ANEW}",
@@ -77,8 +69,8 @@ _KINDS = {
         ),
     ),
     LENGTH: (
-        "all lengths of the arm {longer} by {percent} % (sigma {percent_sigma}), as {aluminium:.0f}"
-        " K do to aluminium and {steel:.0f} K to steel",
+        "all lengths of the arm are {percent} % {longer} (sigma {sigma}), as by {aluminium:.0f} K "
+        "of aluminium or {steel:.0f} K of steel",
         Remedy(
             "Let the arm come to the temperature at which it was calibrated, or calibrate it at "
             "the one at which it works."
@@ -102,43 +94,20 @@ _KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class MeasuredMove:
-    """Estimated motion of a camera or board; its fields are those of verify.json."""
-
-    moved_mm: float  # Distance [mm].
-    sigma_mm: float  # Its standard deviation [mm].
-    along: str  # Its direction in words.
-    turned_deg: float  # Angle [deg].
-    sigma_deg: float  # Its standard deviation [deg].
-    about: str  # Its axis in words.
-
-    @property
-    def words(self) -> str:
-        """The significant parts of the motion, in words."""
-        shift = (
-            f"moved by {figure(self.moved_mm)} mm (sigma {figure(self.sigma_mm)}) along "
-            f"{self.along}"
-        )
-        turn = (
-            f"turned by {figure(self.turned_deg)} deg (sigma {figure(self.sigma_deg)}) about "
-            f"{self.about}"
-        )
-        parts = [shift] * (self.moved_mm > _MENTIONED * self.sigma_mm)
-        parts += [turn] * (self.turned_deg > _MENTIONED * self.sigma_deg)
-        return " and ".join(parts) or shift
-
-
 def verdict_of(check: Check) -> Verdict:
     """Verdict of a check: whether the calibration holds, what changed, and what to do."""
-    doubts = tuple(_doubts(check))
+    doubts: tuple[Finding, ...] = ()
+    if check.predicted.stops < CheckLimits.stops:
+        words = f"{_stops(check)} can hardly tell one change from another."
+        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
+        doubts = (Finding("few_stops", words, step),)
     if check.passed:
         findings = (Finding(AGREEMENT, _agreement(check)), *doubts)
         return Verdict("check" if doubts else "good", findings)
     likeliest, *others = check.named
-    kind, words = likeliest.cause.kind, change_words(check, likeliest)
-    advice = _runnable(check, _KINDS[kind][1])
-    reasons = [Finding(kind, _sentence(words), advice, probability=likeliest.probability)]
+    kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
+    step = _runnable(check, _KINDS[kind][1])
+    reasons = [Finding(kind, words, step, probability=likeliest.probability)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
     if not check.explained:
@@ -152,11 +121,11 @@ def _runnable(check: Check, step: Remedy) -> Remedy:
     """Drops a remedy's command where these stops do not allow it."""
     session, stops = check.predicted.observed.session, check.predicted.stops
     of_images = any(view.image for view in session.views)
-    is_lens_known = not of_images or session.camera is not None
-    is_planned = of_images and stops >= _LEAST_STOPS and check.calibration.robot is not None
+    is_lens_known = session.camera is not None or not of_images
     allowed = {
         CALIBRATE_ANEW: stops >= CheckLimits.stops and is_lens_known,
-        PLAN: is_planned and is_lens_known,
+        # Three stops locate camera and board roughly, so that more can be planned.
+        PLAN: of_images and is_lens_known and stops >= 3 and check.calibration.robot is not None,
     }
     return step if allowed.get(step.command, True) else Remedy(step.words)
 
@@ -168,71 +137,82 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A rotation of the base about the first axis, or of the tool about the last, is equivalent.
         return Finding("rivals", f"No stops separate that from {named}.", Remedy("Look at both."))
-    count = check.predicted.stops
-    these = "This stop does" if count == 1 else f"These {count} stops do"
     step = _runnable(check, Remedy("Verify with stops all over the workspace.", PLAN))
-    return Finding("rivals", f"{these} not separate that from {named}.", step)
+    return Finding("rivals", f"{_stops(check)} cannot separate that from {named}.", step)
 
 
 def change_words(check: Check, suspect: Suspect) -> str:
     """A change with its estimates, as a part of a sentence."""
-    kind, values = suspect.cause.kind, suspect.explained.values
-    sigmas = np.sqrt(np.diag(suspect.explained.covariance))
-    facts: dict[str, Any] = {"name": suspect.name, "factor": suspect.explained.noise_factor}
-    if kind in (SIZE, REPLACED, LENGTH):
-        share, is_more = abs(float(values[-1])), values[-1] > 0.0
-        facts |= {
-            "board": f"the board {suspect.name.partition(' ')[2]}".strip(),
-            "larger": "larger" if is_more else "smaller",
-            "longer": "longer" if is_more else "shorter",
-            "percent": figure(1e2 * share),
-            "percent_sigma": figure(1e2 * float(sigmas[-1])),
-            "aluminium": share / _ALUMINIUM,
-            "steel": share / _STEEL,
-        }
-    if kind == JOINT:
-        robot, unit, scale = check.calibration.calibrated_robot, *_unit(check, suspect)
-        offset = scale * float(values[0])
+    found, robot = _estimates(check, suspect), check.calibration.calibrated_robot
+    share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
+    facts = {
+        "name": suspect.name,
+        "board": f"board {suspect.name.partition(' ')[2]}".strip(),
+        "moved": _moved_words(found.get(CAMERA, found)),
+        "other": _moved_words(found.get(BOARD, {})),
+        "larger": "larger" if share > 0.0 else "smaller",
+        "longer": "longer" if share > 0.0 else "shorter",
+        "percent": figure(1e2 * abs(share)),
+        "sigma": figure(1e2 * sigma),
+        "aluminium": abs(share) / _ALUMINIUM,
+        "steel": abs(share) / _STEEL,
+        "factor": found.get("noise_factor", 1.0),
+    }
+    if suspect.cause.kind == JOINT:
+        unit = "mm" if "offset_mm" in found else "deg"
+        offset, sigma = found[f"offset_{unit}"], found[f"sigma_{unit}"]
+        sign = "+" if offset > 0.0 else "-"
         facts |= {
             "joint": suspect.name if robot is None else joint_words(suspect.cause.at, robot),
-            "offset": f"{'+' if offset > 0.0 else '-'}{figure(abs(offset))}",
-            "offset_sigma": figure(scale * float(sigmas[0])),
-            "unit": unit,
+            "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
-    words = [move.words for move in motions(check, suspect).values()]
-    facts |= dict(zip(("moved", "other"), words, strict=False))
-    return _KINDS[kind][0].format(**facts)
+    return _KINDS[suspect.cause.kind][0].format(**facts)
 
 
-def _unit(check: Check, suspect: Suspect) -> tuple[str, float]:
-    """Unit of a joint's offset, and its size in SI units inverted."""
-    robot = check.calibration.calibrated_robot
-    is_prismatic = robot is not None and robot.chain.prismatic[suspect.cause.at]
-    return ("mm", 1e3) if is_prismatic else ("deg", float(np.rad2deg(1.0)))
+def _moved_words(move: Mapping[str, Any]) -> str:
+    """The significant parts of a motion, in words."""
+    if "moved_mm" not in move:
+        return ""
+    (is_shifted, shift), (is_turned, turn) = (
+        (size > _MENTIONED * sigma, f"by {figure(size)} {unit} (sigma {figure(sigma)}) {way}")
+        for size, sigma, unit, way in (
+            (move["moved_mm"], move["sigma_mm"], "mm", f"along {move['along']}"),
+            (move["turned_deg"], move["sigma_deg"], "deg", f"about {move['about']}"),
+        )
+    )
+    parts = [f"moved {shift}"] * (is_shifted or not is_turned) + [f"turned {turn}"] * is_turned
+    return " and ".join(parts)
 
 
-def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
-    """Estimated motions of the camera, a board, or the board of one view, by name."""
-    kind, values = suspect.cause.kind, suspect.explained.values
-    if kind not in (CAMERA, BOARD, VIEW, *PAIRS):
-        return {}
-    grown = float(values[6]) if kind == REPLACED else 0.0
-    names = (CAMERA, BOARD) if kind == BOTH else (suspect.name,)
-    return {name: _motion(check, suspect, 6 * at, grown) for at, name in enumerate(names)}
+def _estimates(check: Check, suspect: Suspect) -> dict[str, Any]:
+    """Estimates of a change for verify.json: millimetres, degrees, shares."""
+    kind, explained = suspect.cause.kind, suspect.explained
+    if kind == NOISE:
+        return {"noise_factor": explained.noise_factor}
+    if kind == BOTH:
+        return {CAMERA: _motion(check, suspect, 0), BOARD: _motion(check, suspect, 6)}
+    value, sigma = float(explained.values[-1]), float(np.sqrt(explained.covariance[-1, -1]))
+    if kind == JOINT:
+        robot = check.calibration.calibrated_robot
+        is_prismatic = robot is not None and robot.chain.prismatic[suspect.cause.at]
+        unit, scale = ("mm", 1e3) if is_prismatic else ("deg", float(np.rad2deg(1.0)))
+        return {f"offset_{unit}": scale * value, f"sigma_{unit}": scale * sigma}
+    share = {"share": value, "sigma": sigma} if kind in (LENGTH, SIZE, REPLACED) else {}
+    return share | (_motion(check, suspect, 0) if kind not in (LENGTH, SIZE) else {})
 
 
-def _motion(check: Check, suspect: Suspect, first: int, grown: float) -> MeasuredMove:
-    """Motion by a twist among a change's values, with a board's growth as a share."""
-    part, edges = slice(first, first + 6), check.prior.state.edges
-    in_hand, targets = check.calibration.mount == "eye-in-hand", [*check.prior.targets.values()]
-    board, point = suspect.cause.at, np.zeros(3)
-    is_camera = suspect.cause.kind in (CAMERA, BOTH) and first == 0
+def _motion(check: Check, suspect: Suspect, first: int) -> dict[str, Any]:
+    """Estimated motion of a camera or board, by the six values of a change from `first` on."""
+    cause, explained, edges = suspect.cause, suspect.explained, check.prior.state.edges
+    part, targets = slice(first, first + 6), [*check.prior.targets.values()]
+    is_camera, point = cause.kind in (CAMERA, BOTH) and first == 0, np.zeros(3)
     if targets and not is_camera:
         # A board's motion is that of its middle.
-        point = corner_positions(targets[check.prior.boards[board]]).mean(axis=0)
-    rotation = edges[0 if is_camera else 1 + board, :3, :3]
-    parent = "tool" if in_hand == is_camera else "base"
-    twist, covariance = suspect.explained.values[part], suspect.explained.covariance[part, part]
+        point = corner_positions(targets[check.prior.boards[cause.at]]).mean(axis=0)
+    rotation = edges[0 if is_camera else 1 + cause.at, :3, :3]
+    parent = "tool" if (check.calibration.mount == "eye-in-hand") == is_camera else "base"
+    twist, covariance = explained.values[part], explained.covariance[part, part]
+    grown = float(explained.values[6]) if cause.kind == REPLACED else 0.0
     moved = exp(twist)
     shift = moved[:3, :3] @ point * (1.0 + grown) + moved[:3, 3] - point
     # Jacobian of the point with respect to the twist, through its right perturbation.
@@ -240,14 +220,14 @@ def _motion(check: Check, suspect: Suspect, first: int, grown: float) -> Measure
     jacobian = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ right
     metres, sigma_m, along = _length(shift, jacobian @ covariance @ jacobian.T, rotation)
     rad, sigma_rad, about = _length(twist[:3], covariance[:3, :3], rotation)
-    return MeasuredMove(
-        1e3 * metres,
-        1e3 * sigma_m,
-        f"the {parent}'s {along}",
-        float(np.rad2deg(rad)),
-        float(np.rad2deg(sigma_rad)),
-        f"the {parent}'s {about}",
-    )
+    return {
+        "moved_mm": 1e3 * metres,
+        "sigma_mm": 1e3 * sigma_m,
+        "along": f"the {parent}'s {along}",
+        "turned_deg": float(np.rad2deg(rad)),
+        "sigma_deg": float(np.rad2deg(sigma_rad)),
+        "about": f"the {parent}'s {about}",
+    }
 
 
 def _length(
@@ -271,23 +251,16 @@ def _signed_axis(vector: FloatArray) -> str:
 
 def _agreement(check: Check) -> str:
     turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
-    sure, verb = _SURE * check.camera_sigma, "agrees" if check.predicted.stops == 1 else "agree"
+    sure = 2.0 * _MENTIONED * check.camera_sigma
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     again = f" ({check.repeated} of them where the calibration's stood)" if check.repeated else ""
+    verb = "agrees" if check.predicted.stops == 1 else "agree"
     return (
         f"{_stops(check)}{again} {verb} with the calibration: off by {off_mm} mm and {off_deg} deg "
         f"(rms); by chance alone it is more in {figure(100 * check.p_value)} % of checks. A camera "
         f"that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
         f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
     )
-
-
-def _doubts(check: Check) -> Iterator[Finding]:
-    if check.predicted.stops < CheckLimits.stops:
-        verb = "distinguishes" if check.predicted.stops == 1 else "distinguish"
-        words = f"{_stops(check)} hardly {verb} one change from another."
-        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
-        yield Finding("few_stops", words, step)
 
 
 def _stops(check: Check) -> str:
@@ -312,7 +285,7 @@ def to_document(
     verdict = verdict or verdict_of(check)
     others = [suspect for suspect in listed_suspects(check) if suspect not in check.named]
     return {
-        "schema": SCHEMA,
+        "schema": 1,
         "passed": check.passed,
         "calibration": {
             "session": calibration.session_name,
@@ -325,7 +298,6 @@ def to_document(
         "changes": [_change(check, suspect) for suspect in check.named],
         "others": [_change(check, suspect) for suspect in others],
         "explained": check.explained,
-        "log10_evidence": check.log_evidence / float(np.log(10.0)),
         "misfit": check.misfit,
         "degrees_of_freedom": check.unchanged.freedom,
         "p_value": check.p_value,
@@ -362,17 +334,6 @@ def listed_suspects(check: Check) -> tuple[Suspect, ...]:
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
-    """A change for the JSON document, with its estimates: millimetres, degrees, shares."""
-    kind, explained = suspect.cause.kind, suspect.explained
-    document: dict[str, Any] = {"cause": suspect.name, "probability": suspect.probability}
-    moves = {name: vars(move) for name, move in motions(check, suspect).items()}
-    document |= moves if kind == BOTH else next(iter(moves.values()), {})
-    if kind == NOISE:
-        return {**document, "noise_factor": explained.noise_factor}
-    value, sigma = float(explained.values[-1]), float(np.sqrt(explained.covariance[-1, -1]))
-    if kind in (LENGTH, SIZE, REPLACED):
-        return {**document, "share": value, "sigma": sigma}
-    if kind == JOINT:
-        unit, scale = _unit(check, suspect)
-        return {**document, f"offset_{unit}": scale * value, f"sigma_{unit}": scale * sigma}
-    return document
+    """A change for the JSON document, with its estimates."""
+    estimates = _estimates(check, suspect)
+    return {"cause": suspect.name, "probability": suspect.probability, **estimates}

@@ -12,8 +12,8 @@ from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import counted, figure, listed, mm_and_deg
-from visioncal.core.transforms import invert, pose_difference
+from visioncal.core.number_format import counted, listed
+from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
@@ -28,12 +28,9 @@ from visioncal.session import Session
 from visioncal.session.kinds import COLUMN
 from visioncal.vision.targets import numbered_positions, target_document
 
-# Models whose flanges differ by less are of the same robot; tables are written with six digits.
-_ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
-_POSTURES = 5
+# Models whose flanges move alike to this [m and rad] are of the same robot: tables have six digits.
+_ONE_ROBOT = 1e-5
 _STAGES = {stage.name: stage.run for stage in STAGES}
-# Growth of the corners' noise since the calibration beyond which a warning is given.
-_MENTIONED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +49,6 @@ class PredictedStops:
         return len(self.problem.poses[ROBOT])
 
     @property
-    def joints_rad(self) -> FloatArray | None:
-        """(s, n) joint angles of the stops [rad]; None where not all have them."""
-        return self.observed.arm_at_stops.joints_rad
-
-    @property
     def boards(self) -> IntArray:
         """(m,) index of each observation's board among the calibration's."""
         return np.array(
@@ -66,11 +58,6 @@ class PredictedStops:
     def away(self, prior: CalibrationPrior) -> FloatArray:
         """(m, 4, 4) change of its board's edge, on the right, by each observation."""
         return board_changes(self.problem, prior.state)
-
-    @property
-    def from_corners(self) -> bool:
-        """Whether the target's poses come from corners, whose noise is known."""
-        return not self.problem.is_combined
 
 
 def predict_stops(
@@ -91,48 +78,26 @@ def predict_stops(
         DataError: The session is of another mount, camera, target or robot, lacks joint angles that
             the calibrated arm needs, or shows no target.
     """
-    run = _STAGES["robot"](checked_state(session, prior, progress))
-    run = _STAGES["detect"](run)
-    rejected = {key: why for key, why in (without or {}).items() if key not in run.held_back}
-    return predict_detected(run.noting(Rejection(*pair) for pair in rejected.items()), prior)
-
-
-def checked_state(
-    session: Session, prior: CalibrationPrior, progress: Progress | None = None
-) -> RunState:
-    """Initial state of a run, once it is checked that the session is of the same cell.
-
-    Raises:
-        DataError: The session is of another mount, target or robot.
-    """
-    calibration = prior.calibration
-    check_mount(session, calibration)
-    session = _with_calibrated_targets(session, prior)
-    document, robot = session.robot_document, calibration.robot
-    if robot is not None and document is not None:
-        check_robot(session, Robot.from_document(document), robot)
-    if robot is not None:
+    check_mount(session, prior.calibration)
+    session, calibrated = _with_calibrated_targets(session, prior), prior.calibration.robot
+    if calibrated is not None:
+        if session.robot_document is not None:
+            check_robot(session, Robot.from_document(session.robot_document), calibrated)
         # The calibrated robot has its base in the frame of the poses.
-        session = replace(session, robot_document=robot.document)
-    return RunState(session, progress)
+        session = replace(session, robot_document=calibrated.document)
+    run = _STAGES["detect"](_STAGES["robot"](RunState(session, progress)))
+    rejected = ((key, why) for key, why in (without or {}).items() if key not in run.held_back)
+    return predict_detected(run.noting(Rejection(*pair) for pair in rejected), prior)
 
 
 def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     """Does what `predict_stops` does, once targets have been detected."""
-    calibration, detected = prior.calibration, run.cameras
-    lens = calibration.camera
+    detected, lens = run.cameras, prior.calibration.camera
     for frame, look in detected.items():
-        if look.resolution is None:
-            continue
-        if lens is None:
-            raise _other_target(
-                f"session {run.session.name!r} has images; calibration "
-                f"{calibration.session_name!r} holds no camera.",
-                "Give the target's poses (cft_x_m ...) as when it was calibrated.",
-            )
-        check_resolution(run.session, calibration, look.resolution)
-        plain = CameraResult(lens.camera, estimated=False)
-        run = run.with_camera(frame, replace(_in_lens_model(look, lens, {}), lens=plain))
+        if lens is not None and look.resolution is not None:
+            check_resolution(run.session, prior.calibration, look.resolution)
+            plain = CameraResult(lens.camera, estimated=False)
+            run = run.with_camera(frame, replace(_in_lens_model(look, lens, {}), lens=plain))
     if lens is not None and lens.field is not None and lens.field.breathing != 0.0:
         # Breathing is corrected to the calibration's mean distance, by rough poses.
         positions = numbered_positions(tuple(run.session.boards.values()))
@@ -181,11 +146,9 @@ def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses
     """
     observed = replace(observed, calibrated=replace(observed.robot_arm, model=prior.model))
     arm, session = observed.robot_arm, observed.session
-    if prior.arm == "none":
+    if prior.fit.arm is None:
         return observed
-    if prior.arm == "poses":
-        arm = replace(arm, joints_rad=None)
-    elif arm.joints_rad is None:
+    if arm.joints_rad is None:
         missing = [view.number for view in session.views if view.joints_rad is None]
         without = f"{counted(len(missing), 'view', ('has', 'have'))} no joint angles."
         raise DataError(
@@ -247,10 +210,11 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
         DataError: They are others, or it is not known which of several is shown.
     """
     calibrated, shown, label = prior.targets, session.boards, f"session {session.name!r}"
-    if not calibrated and any(view.image or view.has_corners for view in session.views):
+    is_seen = any(view.image or view.has_corners for view in session.views)
+    if is_seen and (not calibrated or prior.calibration.camera is None):
         raise _other_target(
             f"{label} has images; calibration {prior.calibration.session_name!r} was made from "
-            "measured poses, and does not say of which target.",
+            "measured poses.",
             "Give the target's poses (cft_x_m ...) as when it was calibrated.",
         )
     names = ", ".join(name or "one without a name" for name in calibrated)
@@ -260,17 +224,14 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
     alike = [name for name in calibrated if only and not _differences(prior, name, only)]
     name = alike[0] if len(alike) == 1 else ""
     for shown_name, target in shown.items() if calibrated and not name else ():
-        other = f"{label}: target {shown_name or target.name!r}"
-        if shown_name not in calibrated:
+        differences = _differences(prior, shown_name, target) if shown_name in calibrated else []
+        if differences or shown_name not in calibrated:
+            has = f": it has {listed(differences)}" if differences else ""
             raise _other_target(
-                f"{other} is none of those that were calibrated with ({names}).",
-                "Name it as in the calibration's session, or verify with views of that target "
-                "alone.",
-            )
-        if differences := _differences(prior, shown_name, target):
-            raise _other_target(
-                f"{other} was calibrated with other values: it has {listed(differences)}.",
-                "Verify with the target that was calibrated with, as it was described then.",
+                f"{label}: target {shown_name or target.name!r} is none of those that were "
+                f"calibrated with ({names}){has}.",
+                "Describe and name it as in the calibration's session, or verify with views of "
+                "that target alone.",
             )
     if len(calibrated) < 2 and len(shown) < 2:
         return session
@@ -306,19 +267,16 @@ def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
     Raises:
         DataError: They differ.
     """
-    apart = f"{stated.joint_count} joints, not {calibrated.joint_count}"
     if stated.joint_count == calibrated.joint_count:
-        q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, calibrated.joint_count))
+        q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, calibrated.joint_count))
         # Motions are compared: the calibrated base may have been moved to the frame of the poses.
         ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
         between = [invert(array[0]) @ array for array in (ours, theirs)]
-        off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
-        if off[0] <= _ONE_ROBOT_MM and off[1] <= _ONE_ROBOT_DEG:
+        if np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT:
             return
-        apart = f"its flange up to {mm_and_deg(*off.tolist())} off"
     raise DataError(
-        f"session {session.name!r} names robot {stated.name}, which has {apart}: it is another "
-        f"robot, or another tip, than the calibrated {calibrated.name}.",
+        f"session {session.name!r} names robot {stated.name}, which moves its flange otherwise: it "
+        f"is another robot, or another tip, than the calibrated {calibrated.name}.",
         culprits=["session.toml: robot.model"],
         next_step="Name the robot and tip as in the calibration's session.",
     )
@@ -333,11 +291,4 @@ def _warnings(observed: ObservedPoses, prior: CalibrationPrior) -> Iterator[str]
             "The calibrated arm drifts with its temperature, and a check takes it for as warm as "
             f"it was at the start (about {cold_c:.0f} deg C): one at work looks longer, or as if "
             "its joints had slipped. Verify with the arm as warm as then."
-        )
-    before, now = prior.calibration.noise.get("pixel_px"), observed.pixel_px
-    if before is not None and now is not None and now > _MENTIONED * max(before, 1e-3):
-        yield (
-            f"The corners scatter by {figure(now)} px around the target's poses, and by "
-            f"{figure(before)} px when it was calibrated: look whether the lens is clean, sharp "
-            "and as it was."
         )

@@ -15,7 +15,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.results.compensation.correction import FAR_M, WIDE_RAD, Corrected
+from visioncal.results.compensation.correction import Corrected
 from visioncal.robot import Robot
 from visioncal.session.columns import POSE, QUATERNION, joint_columns
 
@@ -58,31 +58,6 @@ def read_targets(path: Path, robot: Robot) -> Targets:
         reader.complete(joints)
     reader.check()
     places = tuple(map(table.place, range(len(poses))))
-    distances = np.linalg.norm(poses[:, :3], axis=1)
-    turns = np.where(robot.chain.prismatic, 0.0, np.abs(np.nan_to_num(seeds))).max(axis=1)
-    for sizes, most, words, step in (
-        (
-            distances,
-            FAR_M,
-            f"its position is {{:.4g}} m from the base, and no arm reaches "
-            f"{FAR_M:g} m: these look like millimetres",
-            "Write metres.",
-        ),
-        (
-            turns,
-            WIDE_RAD,
-            "a joint stands at {:.4g} rad, more than two turns: these look like degrees",
-            "Write radians.",
-        ),
-    ):
-        beyond = np.flatnonzero(sizes > most).tolist()
-        if beyond:
-            raise DataError(
-                f"{places[beyond[0]]}: {words.format(sizes[beyond[0]])}.",
-                culprits=[places[row] for row in beyond],
-                next_step=step,
-            )
-    # After the units, since a table with exchanged columns has wrong norms as well.
     reader.unit(QUATERNION)
     reader.check()
     rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
