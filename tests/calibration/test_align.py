@@ -159,7 +159,7 @@ def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
     cell = simulate(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
     found = aligned(cell)
     (words,) = [reason for reason in found.verdict.reasons if "pushed" in reason]
-    assert "by way of flange_b from stop 10 on" in words
+    assert "did not stand at stop 10 and after where its pose says" in words
     assert "as if base_b had been pushed by 5" in words
     assert not found.cell.moved
     assert off(cell, found, "base_a", "base_b")[1] < 22.0

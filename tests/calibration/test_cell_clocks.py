@@ -33,9 +33,6 @@ def test_the_offset_of_one_camera_is_found_by_the_motion(found):
     assert clock.sigma_s < 1e-4
     # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
     assert abs(clock.camera_minus_robot_s - AHEAD_S) < 3 * clock.sigma_s
-    ahead_ms = 1e3 * clock.camera_minus_robot_s
-    said = f"{CLOCK}: the fit of the whole cell has the camera's clock {ahead_ms:+.2f} ms ahead"
-    assert any(reason.startswith(said) for reason in found.verdict.reasons)
 
 
 def test_the_clock_of_one_camera_and_robot_goes_with_them(found):

@@ -147,7 +147,6 @@ def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path, monkey
     first = visioncal.calibrate(write(tmp_path / "bumped", stops)).verdict.causes[0]
     assert first.kind == "moved_at_once"
     assert first.words.startswith("The camera moved at once: from view 9 on, it is 1.9 mm and")
-    assert "Another tool frame in the controller would look the same." in first.words
     assert first.do.words.endswith("or calibrate the 9 views before it alone.")
     options = ("calibrate", "bumped", "-o", "before", "--no-report", "--no-recording")
     monkeypatch.chdir(tmp_path)
@@ -205,7 +204,7 @@ def test_a_board_that_was_exchanged_midway_is_no_thing_that_moved(tmp_path, size
     folder = write(tmp_path / "board", stops)
     if since == 14:
         warned = visioncal.doctor(folder).findings[0]
-        assert "from view 14 to view 18, something stood elsewhere or was set" in warned.words
+        assert "Views 14, 15, 16, 17, 18 disagree with the others" in warned.words
         assert "visioncal calibrate" in warned.do.command
     first = visioncal.calibrate(folder).verdict.causes[0]
     # Of unlike parts, the views of the smaller one are left out.

@@ -182,7 +182,7 @@ def test_sigmas_weigh_the_corners(tmp_path):
         (1.1, "good", "", 1.1 * NOISE_PX),
         (0.4, "check", "corners.csv states 0.08 px", NOISE_PX),
         # More than would be doubted, if it were measured.
-        (5.0, "good", "corners.csv states 1 px", 5.0 * NOISE_PX),
+        (5.0, "good", "", 5.0 * NOISE_PX),
     ],
 )
 def test_the_verdict_says_where_the_corners_contradict_what_is_stated(
@@ -640,7 +640,7 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
     found = [cause.words for cause in result.verdict.causes if cause.kind == "board_size"]
     assert bool(found) == (size != 1.0)
     for name in found:
-        said = re.search(r"is ([0-9.]+) % smaller than the table .* \(sigma ([0-9.]+) %\)", name)
+        said = re.search(r"is ([0-9.]+) % smaller than stated \(sigma ([0-9.]+) %\)", name)
         percent, sigma = map(float, said.groups())
         assert abs(percent - 0.4) < 4.0 * sigma < 0.1
     assert (result.verdict.status == "good") == (size == 1.0)

@@ -120,5 +120,5 @@ def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named():
     (words,) = [reason for reason in verdict.reasons if "exchanged" in reason]
     assert words.startswith("Views 4 and 9 are exchanged: the image of each fits the pose in the")
     (words,) = [reason for reason in verdict.reasons if reason.startswith("View 7 was left out")]
-    assert "its image is of stop 2; its pose or its image is wrong" in words
+    assert "its image is of stop 2; its pose or its reading is wrong" in words
     assert set(known.reasons) == {4, 7, 9}

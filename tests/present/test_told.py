@@ -101,7 +101,7 @@ def moved(cell: Calibration) -> Calibration:
     return with_cell(
         joint,
         tree={**cell.cell.tree, former: "cell"},
-        moved=(Moved("cam_top", former, 4, 5, 0.58, 0.03, ("target_plate",)),),
+        moved=(Moved("cam_top", former, 4, 5, 0.58, 0.03),),
         untied=(UnconnectedFrame("cam_<far>", "Let it see target_plate."),),
         robots={"a": RobotResult(arm=ArmResult(level="offsets", levels=levels))},
     )

@@ -2,10 +2,11 @@
 
 import typer
 
-from visioncal.calibration.pipeline.checkup import doctor, next_command, to_document
+from visioncal.calibration.pipeline.checkup import doctor, to_document
 from visioncal.cli.console import EXIT_BAD, answer, print_json, with_run_paths
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import DoctorOptions
+from visioncal.core.verdict import CALIBRATE, with_paths
 
 
 def doctor_command(options: DoctorOptions) -> None:
@@ -23,7 +24,7 @@ def doctor_command(options: DoctorOptions) -> None:
                 if finding.do.command:
                     answer("", f"   {finding.do.command}")
         if found.is_sound:
-            command = next_command(found, options.session)
+            command = with_paths(CALIBRATE, options.session, "out")
             answer(f" Next: {command}", "Nothing is wrong.", "bold green")
     if not found.is_sound:
         raise typer.Exit(EXIT_BAD)

@@ -94,7 +94,7 @@ _KINDS = (
     # Views.
     Kind(EXCHANGED, 1e-6, leaves_out=True, order=-1),
     Kind("wrong_pose", 1e-3, leaves_out=True),
-    Kind("something_moved", 1e-3, leaves_out=True),
+    Kind("something_moved", 1e-4, leaves_out=True),
     Kind("wrong_views", 1e-3),
     Kind("holdout", 1e-3),
     # Frames.

@@ -17,9 +17,6 @@ _CORNER_SIGMAS = 8.0
 _VIEW_RATIO = 5.0
 # Least rejection limits [px]: smaller errors do no harm.
 _CORNER_FLOOR_PX, _VIEW_FLOOR_PX = 0.5, 1.0
-# A view that loses more than this share of its corners is rejected as a whole; so is one whose
-# remaining corners do not determine its pose.
-_CORNER_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +52,8 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
             reasons[view] = (
                 f"residual too large: {rms[at]:.2f} px (limit {limit:.2f}, set by the other views)"
             )
-        elif kept[at] < (1 - _CORNER_SHARE) * stack.counts[at] or (
+        # So is a view that loses half of its corners, or whose others do not determine its pose.
+        elif 2.0 * kept[at] < stack.counts[at] or (
             kept[at] < stack.counts[at] and not determines_pose(stack.points[rows][passes[rows]])
         ):
             reasons[view] = (

@@ -23,11 +23,10 @@ FEWEST = 3
 _LEAST_SHARE = 0.25
 # Number of observations whose implied change is tried as a candidate.
 _CANDIDATES = 24
-_FALSE_ALARM, FALSE_MOVE = 1e-3, 1e-4
+# Shares of sessions in which an inlier is rejected, and in which a frame seems to have moved.
+FALSE_ALARM, FALSE_MOVE = 1e-3, 1e-4
 # Factor on the noise, which a share of the stops underestimates.
 _MARGIN = 2.0
-# Share of the gain at which another frame may be the one that moved.
-_RIVAL_SHARE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +36,28 @@ class Move:
     frame: str  # The frame's name before the move.
     twin: str  # Its name from the move on.
     stop: int  # The first stop after the move.
-    change: FloatArray  # (4, 4) its new pose in its own old frame: as first estimated.
-    rivals: tuple[str, ...] = ()  # Frames whose move would explain as much.
 
 
-def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solution]:
-    """The problem in which a moved frame is two frames, and its state."""
-    rows = problem.observations.stops >= move.stop
+def moved(
+    problem: Problem, fit: Solution, frame: str, stop: int, change: FloatArray
+) -> tuple[Problem, Solution, Move]:
+    """The problem in which a frame is two frames from a stop on, its state, and the move.
+
+    `change` (6,) is the new pose in the frame's own old pose, as a twist.
+    """
+    first, _, number = frame.partition("@")
+    count = int(number or 1) + 1
+    while (twin := f"{first}@{count}") in problem.tree.branches:
+        count += 1
     split = replace(
         problem,
-        tree=problem.tree.with_twin(move.frame, move.twin),
-        observations=problem.observations.renamed(move.frame, move.twin, rows),
+        tree=problem.tree.with_twin(frame, twin),
+        observations=problem.observations.renamed(frame, twin, problem.observations.stops >= stop),
     )
     frames = problem.frames(fit.state)
-    frames[move.twin] = frames[move.frame] @ move.change
+    frames[twin] = frames[frame] @ exp(change)
     edges = np.array([frames[name] for name in split.unknown])
-    return split, replace(fit, state=State(edges, fit.state.values))
+    return split, replace(fit, state=State(edges, fit.state.values)), Move(frame, twin, stop)
 
 
 def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
@@ -62,7 +67,7 @@ def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
 
 def _noise_limit(among: int) -> float:
     """Limit of the squared distance of noise, for `among` observations."""
-    return _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / among, 6))
+    return _MARGIN**2 * float(chi2_limit(FALSE_ALARM / among, 6))
 
 
 def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
@@ -122,17 +127,10 @@ def unmoved(
     return merged, replace(fit, state=state), remaining
 
 
-def twin_name(problem: Problem, frame: str) -> str:
-    """An unused name for a frame from its move on."""
-    first, _, number = frame.partition("@")
-    count = int(number or 1) + 1
-    while f"{first}@{count}" in problem.tree.branches:
-        count += 1
-    return f"{first}@{count}"
-
-
-def find_move(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]) -> Move | None:
-    """The move that explains most outliers; None where none explains enough.
+def find_move(
+    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
+) -> tuple[str, int, FloatArray] | None:
+    """Frame, stop and (6,) change of the move that explains most outliers; None for too few.
 
     A pushed robot base is no move: its observations stay outliers. `agrees` is the (n,) inlier
     mask.
@@ -145,14 +143,10 @@ def find_move(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[s
             rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
         if np.sum(~agrees[rows]) >= FEWEST:
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
-    found.sort(key=lambda step: -step[0])
-    if not found or found[0][3] in bases:
+    if not found:
         return None
-    gain, stop, change, frame = found[0]
-    rivals = dict.fromkeys(
-        rival for also, at, _, rival in found if also >= _RIVAL_SHARE * gain and rival != frame
-    )
-    return Move(frame, twin_name(problem, frame), stop, change, tuple(rivals))
+    _, stop, change, frame = max(found, key=lambda step: step[0])
+    return None if frame in bases else (frame, stop, log(change))
 
 
 def _best_move(

@@ -15,17 +15,17 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.quantiles import f_limit
-from visioncal.core.transforms import exp, invert, rotation_angle
+from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.moves import (
+    FALSE_ALARM,
     Move,
     explained_by_noise,
     find_move,
     moved,
     needless_move,
-    twin_name,
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
@@ -47,8 +47,6 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, frames_of
 
-# Share of sessions in which an inlier is rejected.
-_FALSE_ALARM = 1e-3
 # Least share, and least number, of the earliest stops with which the search begins.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 _MOST_MOVES = 8
@@ -125,7 +123,7 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     # distribution.
     edges = int(problem.counted[: 6 * len(problem.unknown)].sum())
     freedom = max(0.5 * (float(problem.observations.directions[used].sum()) - edges), 6.0)
-    limit = counted * f_limit(_FALSE_ALARM / len(problem), counted, freedom)
+    limit = counted * f_limit(FALSE_ALARM / len(problem), counted, freedom)
     uneven = np.where(problem.observations.is_uneven, UNEVEN**2, 1.0)
     return Distances(squares, directions, uneven * limit)
 
@@ -139,10 +137,10 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
-        move = find_move(problem, fit, relative_squares < 1.0, movable)
-        if move is None:
+        found = find_move(problem, fit, relative_squares < 1.0, movable)
+        if found is None:
             break
-        problem, fit = moved(problem, fit, move)
+        problem, fit, move = moved(problem, fit, *found)
         movable = (*movable, move.twin)
         moves.append(move)
         involved = problem.observations.involves(move.twin)
@@ -177,9 +175,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         part = problem.subset(used)
         if not (slight := find_steps(part, fit, frames_of(part, movable))):
             break
-        frame = slight[0].of
-        move = Move(frame, twin_name(problem, frame), slight[0].stop, exp(slight[0].value))
-        problem, fit = moved(problem, fit, move)
+        problem, fit, move = moved(problem, fit, slight[0].of, slight[0].stop, slight[0].value)
         movable = (*movable, move.twin)
         moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))

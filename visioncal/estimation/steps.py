@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.quantiles import f_limit
-from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import covariance_from
@@ -21,11 +21,9 @@ from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
     FALSE_MOVE,
     FEWEST,
-    Move,
     explained_by_noise,
     fitted_change,
     moved,
-    twin_name,
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
@@ -245,8 +243,7 @@ def with_step(problem: Problem, fit: Solution, step: Step) -> tuple[Problem, Sol
     """The problem with a step from its stop on, and its fit."""
     effect = step.candidate.effect
     if effect is None:
-        move = Move(step.of, twin_name(problem, step.of), step.stop, exp(step.value))
-        widened, start = moved(problem, fit, move)
+        widened, start, _ = moved(problem, fit, step.of, step.stop, step.value)
     else:
         by_sensor, after = effect.by_sensor, problem.observations.stops >= step.stop
         flanges = {name: array.copy() for name, array in effect.flange_jacobian.items()}

@@ -107,10 +107,9 @@ def moved_table(cell: CellResult) -> Table:
     rows = []
     for move in cell.moved:
         distance = f"{significant(move.shift_mm)} mm, {significant(move.turn_deg)}{DEGREE}"
-        rivals = f" It may have been {', '.join(move.rivals)} instead." if move.rivals else ""
         explanation = (
             f"Between stops {move.last_stop} and {move.first_stop}. {move.frame} is where it stood "
-            f"last, {move.before} where it stood before.{rivals}"
+            f"last, {move.before} where it stood before."
         )
         rows.append(TableRow((move.frame, distance, explanation), "look"))
     rows += [

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Any
 
-from visioncal.core.codec import KEPT
 from visioncal.core.types import Mount
 from visioncal.results.lens import CameraResult
 from visioncal.results.parts import RobotResult
@@ -29,8 +28,6 @@ class Moved:
     first_stop: int  # First stop at the last pose.
     shift_mm: float  # Displacement of its origin [mm].
     turn_deg: float  # Rotation angle [deg].
-    # Frames whose motion would explain the observations as well.
-    rivals: Annotated[tuple[str, ...], KEPT] = ()
 
 
 @dataclass(frozen=True)

@@ -14,24 +14,17 @@ from visioncal.calibration.pipeline.misread_poses import (
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
-from visioncal.calibration.stages.cell import Cell, read_cell
+from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
-from visioncal.calibration.suspects.ranking import LEAST_RUN
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
-from visioncal.core.summaries import html_card
+from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Mask, Mount, Progress
+from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
 from visioncal.session import Session
-
-# Noise of corners beyond which a lens is in doubt [px], and of the flange [mm].
-_MOST_PX, _MOST_MM = CalibrationLimits().pixel_px[0], 1.0
-# Kind of warnings that are no fault of the session.
-_NO_FAULT = "unused"
 
 
 @dataclass(frozen=True)
@@ -46,11 +39,6 @@ class Checkup:
     def is_sound(self) -> bool:
         """Whether nothing is wrong."""
         return not self.findings
-
-    def _repr_html_(self) -> str:
-        reasons = [finding.reason for finding in self.findings] or ["Nothing is wrong."]
-        seen = {"seen": "; ".join(self.seen)}
-        return html_card(self.session, seen, "good" if self.is_sound else "check", reasons)
 
     def __repr__(self) -> str:
         lines = [f"{self.session}: {'; '.join(self.seen)}."]
@@ -84,16 +72,17 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
 
 def to_document(checkup: Checkup) -> dict[str, object]:
     """Converts a checkup to a JSON document."""
-    findings = []
-    for finding in checkup.findings:
-        step = {"do": finding.do.words, "command": finding.do.command} if finding.do else {}
-        entry = {
+    findings = [
+        {
             "kind": finding.kind,
             "sentence": finding.words,
             "views": list(finding.views),
-            **step,
+            "do": finding.do.words if finding.do else "",
+            "command": finding.do.command if finding.do else "",
         }
-        findings.append({name: value for name, value in entry.items() if value})
+        for finding in checkup.findings
+    ]
+    findings = [{name: value for name, value in entry.items() if value} for entry in findings]
     return {"session": checkup.session, "seen": list(checkup.seen), "findings": findings}
 
 
@@ -136,40 +125,19 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     warnings = [
         warning
         for warning in run.warnings
-        if warning.kind != _NO_FAULT
+        if warning.kind != "unused"
         and (cause is None or warning.kind != cause.kind)
         and (hint is None or warning.words not in hint.words)
     ]
-    has_lens = any(warning.kind == "other_lens" for warning in warnings)
-    lens = [] if error is not None or has_lens else list(_lenses(run))
-    yield from sorted([*lens, *warnings], key=lambda value: value.do is None)
+    yield from sorted(warnings, key=lambda value: value.do is None)
     if error is None:
-        if hint is None and run.mount is not None and not lens:
+        if hint is None and run.mount is not None:
             yield from _motion(run, run.mount)
         yield from _lost(run)
 
 
 def _refused(kind: str, error: VisioncalError) -> Finding:
     return Finding(kind, error.message, Remedy(error.next_step) if error.next_step else None)
-
-
-def _lenses(run: RunState) -> Iterator[Finding]:
-    """Findings on stated lenses that do not fit the images."""
-    for frame, look in run.cameras.items():
-        stated, noise_px = look.table.stated, look.pixel_px
-        # Noise that is only stated says nothing of the lens.
-        if stated is None or noise_px in {None, *(px.stated_px for px in look.corners.values())}:
-            continue
-        if noise_px is not None and noise_px > _MOST_PX:
-            yield Finding(
-                "lens",
-                f"Corners deviate by {figure(noise_px)} px from any pose of a flat board (doubt "
-                f"begins at {_MOST_PX:g}): the stated lens is not this camera's, or the board is "
-                "not flat.",
-                Remedy(
-                    "In session.toml, delete matrix and distortion, so that they are estimated."
-                ),
-            ).of(frame if len(run.cameras) > 1 else "")
 
 
 def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
@@ -180,29 +148,20 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
         yield _refused("motion", error)
         return
     views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist())
-    named, one = some_of([*map(str, views)]), len(views) == 1
-    if _is_run(cell, inliers.used):
-        yield Finding(
-            "something_moved",
-            f"Views {named} disagree with the others, and follow each other: from view {views[0]} "
-            f"to view {views[-1]}, something stood elsewhere or was set up otherwise.",
-            Remedy(
-                "Calibrate: the verdict says what it is, where one change explains it.", CALIBRATE
-            ),
-            views,
-        )
-    elif views:
+    if views:
         yield Finding(
             "wrong_views",
-            f"{'View' if one else 'Views'} {named} {'disagrees' if one else 'disagree'} with the "
-            "others: a pose or an image is wrong, or something moved.",
+            f"Views {some_of([*map(str, views)])} disagree with the others: a pose or an image is "
+            "wrong, or something moved.",
             Remedy(
-                "Look at images and poses: repeat these views, or in views.csv, delete the "
-                f"row{'' if one else 's'} of view {', '.join(map(str, views))}."
+                "Look at images and poses: repeat these views, or in views.csv, delete the rows of "
+                f"view {', '.join(map(str, views))}; or calibrate, which names what moved.",
+                CALIBRATE,
             ),
             views,
         )
-    used, (enough, _) = int(inliers.used.sum()), CalibrationLimits().stops
+    used, limits = int(inliers.used.sum()), CalibrationLimits()
+    enough = limits.stops[0]
     if used < enough:
         yield Finding(
             "few_stops",
@@ -214,7 +173,7 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
             ),
         )
     rad, metres = inliers.fit.noise.robots[0].tolist()
-    if 1e3 * metres > _MOST_MM:
+    if 1e3 * metres > limits.sigma_mm[0]:
         yield Finding(
             "scatter",
             f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} "
@@ -224,27 +183,13 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
         )
 
 
-def _is_run(cell: Cell, used: Mask) -> bool:
-    """Whether the outliers are all at one end of the session, and not too few."""
-    order = np.argsort([row.station for row in cell.rows], kind="stable")
-    ends = np.count_nonzero(used[order][1:] != used[order][:-1])
-    return bool(ends == 1 and np.sum(~used) >= LEAST_RUN)
-
-
 def _lost(run: RunState) -> Iterator[Finding]:
     """Findings on views that cannot be used, except those that warnings name already."""
     reported = {view for warning in run.warnings for view in warning.views}
     reasons = {view: why for view, why in run.reasons.items() if view not in reported}
-    is_read = run.mount is not None and run.robots
-    posed = run.base_from_flange.keys() if is_read else reasons.keys()
-    of_rows = {view: why for view, why in reasons.items() if view not in posed}
-    of_images = {view: why for view, why in reasons.items() if view in posed}
-    for lost, do in (
-        (of_rows, "In views.csv, correct the rows that are named, or delete them."),
-        (of_images, "Look at the image, and repeat the view or take it out of views.csv."),
-    ):
-        for words in by_reason(lost):
-            yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Remedy(do))
+    do = Remedy("Look at their images, and correct their rows in views.csv, or repeat them.")
+    for words in by_reason(reasons):
+        yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", do)
 
 
 def _contents(run: RunState) -> Iterator[str]:
@@ -256,11 +201,7 @@ def _contents(run: RunState) -> Iterator[str]:
         there = sum(session.images.exists(image) for image in images)
         yield f"{there} of {counted(len(images), 'image')}"
     for look in run.cameras.values():
-        blur = [corners.blur_px for corners in look.corners.values() if corners.blur_px > 0.0]
-        size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
-        edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
-        seen = counted(len(look.corners), "image" if images else "view")
-        yield f"the board in {seen}{size}{edges}"
+        yield f"the board in {counted(len(look.corners), 'image' if images else 'view')}"
     for robot, reported in run.robots.items():
         # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
@@ -268,8 +209,3 @@ def _contents(run: RunState) -> Iterator[str]:
             yield f"{counted(len(poses), 'pose')} of {whose}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
-
-
-def next_command(checkup: Checkup, session: Path | str) -> str:
-    """The command to calibrate a sound session; empty for another."""
-    return "" if checkup.findings else with_paths(CALIBRATE, session, "out")

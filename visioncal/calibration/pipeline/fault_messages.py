@@ -2,34 +2,32 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.calibration.suspects.ranking import run_evidence
 from visioncal.core.finding_kinds import EXCHANGED
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, look_at, or_alone
-from visioncal.estimation.moves import agreed_change
+from visioncal.estimation.moves import FEWEST, agreed_change
 from visioncal.estimation.steps import agreed_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
-# A base was pushed where at least so many stops agree on its displacement, to such a share of it.
-_FEWEST_STOPS, _ALIKE = 3, 0.5
+# The stops of a base that was pushed agree on its displacement to such a share of it.
+_ALIKE = 0.5
 # Views that a large step explains agree on it to within this share of the step: the uncertainty
 # that the fit leaves grows with it.
 _SURELY_ALIKE = 0.05
 # A robot's pose is wrong where at least so many observations of its stop show it.
 _FEWEST = 2
-# Most views of a fault, and most stops that fit an observation, that are named.
-_LISTED, _NAMED = 8, 3
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
@@ -46,7 +44,6 @@ class PoseFault:
 class Version:
     """A frame during a part of the session, in which it did not move."""
 
-    key: str  # Its name in the problem.
     frame: str  # The name of the frame.
     name: str  # Its name in the result: the frame's own for the last.
     start: int  # The first station of it; -1 for the first version.
@@ -59,18 +56,22 @@ class Version:
 
 def versions(cell_fit: CellFit) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
+    versions_by_key = {}
+    for frame, parts in _parts(cell_fit).items():
+        for start, key in parts:
+            is_last = (start, key) == parts[-1]
+            until = "" if is_last else f"_until_stop_{_stops_of(cell_fit, key)[-1]}"
+            versions_by_key[key] = Version(frame, f"{frame}{until}", start)
+    return versions_by_key
+
+
+def _parts(cell_fit: CellFit) -> dict[str, list[tuple[int, str]]]:
+    """First station and name in the problem of each place of each frame, in the order of time."""
     starts = {move.twin: move.stop for move in cell_fit.inlier_fit.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for key in cell_fit.inlier_fit.problem.unknown:
         parts[key.partition("@")[0]].append((starts.get(key, -1), key))
-    versions_by_key = {}
-    for frame, keys in parts.items():
-        *earlier, (start, last) = sorted(keys)
-        for before, key in earlier:
-            name = f"{frame}_until_stop_{_stops_of(cell_fit, key)[-1]}"
-            versions_by_key[key] = Version(key, frame, name, before)
-        versions_by_key[last] = Version(last, frame, frame, start)
-    return versions_by_key
+    return {frame: sorted(keys) for frame, keys in parts.items()}
 
 
 def _stops_of(cell_fit: CellFit, key: str) -> list[int]:
@@ -84,38 +85,22 @@ def _stops_of(cell_fit: CellFit, key: str) -> list[int]:
 
 def movements(cell_fit: CellFit) -> tuple[Moved, ...]:
     """The frames that moved, in the order of time."""
-    moved, versions_by_key, edges = [], versions(cell_fit), cell_fit.frames
-    for move in sorted(cell_fit.inlier_fit.moves, key=lambda value: value.stop):
-        after = versions_by_key[move.twin]
-        same_frame = (item for item in versions_by_key.values() if item.frame == after.frame)
-        earlier = [item for item in same_frame if item.start < after.start]
-        before = max(earlier, key=lambda value: value.start)
-        mm, deg = pose_difference(edges[before.key], edges[after.key])
-        rivals = tuple(dict.fromkeys(rival.partition("@")[0] for rival in move.rivals))
-        moved.append(
-            Moved(
-                after.frame,
-                before.name,
-                _stops_of(cell_fit, before.key)[-1],
-                _stops_of(cell_fit, move.twin)[0],
-                mm,
-                deg,
-                tuple(rival for rival in rivals if rival != after.frame),
-            )
-        )
-    return tuple(moved)
+    named, edges, moved = versions(cell_fit), cell_fit.frames, list[tuple[int, Moved]]()
+    for frame, parts in _parts(cell_fit).items():
+        for (_, before), (start, after) in pairwise(parts):
+            last, first = _stops_of(cell_fit, before)[-1], _stops_of(cell_fit, after)[0]
+            away = pose_difference(edges[before], edges[after])
+            moved.append((start, Moved(frame, named[before].name, last, first, *away)))
+    return tuple(move for _, move in sorted(moved, key=lambda item: item[0]))
 
 
 def moved_finding(moved: Moved) -> Finding:
     """Finding that a frame moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
-    rivals = (
-        f" (or {' or '.join(moved.rivals)} did: the session leaves it open)" if moved.rivals else ""
-    )
     return Finding(
         "moved_frame",
         f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
-        f"{mm_and_deg(moved.shift_mm, moved.turn_deg)}{rivals}. The result has "
+        f"{mm_and_deg(moved.shift_mm, moved.turn_deg)}. The result has "
         f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
         Remedy(f"Fasten {moved.frame}, and record again."),
     )
@@ -139,7 +124,7 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
         faults += _exchanged_views(cell_fit, mutual, set())
         faults = faults or [*_moved_run(cell_fit)]
     else:
-        faults += [*_pushed_bases(cell_fit), *_exchanged_poses(cell_fit, mutual)]
+        faults += _exchanged_poses(cell_fit, mutual)
         faults += _exchanged_views(
             cell_fit, mutual, {row for fault in faults for row in fault.rows}
         )
@@ -154,7 +139,7 @@ def _fault(
 ) -> PoseFault:
     """A fault of some observations, in words in which {views} are theirs."""
     views = tuple(cell_fit.cell.rows[row].view for row in rows)
-    words = words.format(views=f"views {some_of([*map(str, views)], _LISTED)}")
+    words = words.format(views=f"views {some_of([*map(str, views)])}")
     found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
     return PoseFault(found, tuple(rows), short)
 
@@ -169,7 +154,7 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
-    if len(run) < _FEWEST_STOPS or not problem.observations.has_rotation[run].all():
+    if len(run) < FEWEST or not problem.observations.has_rotation[run].all():
         return
     some, steps = np.isin(np.arange(len(problem)), run), []
     for frame in problem.unknown:
@@ -196,9 +181,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     views = tuple(rows[row].view for row in outliers)
     do = or_alone(f"{advice}; or calibrate the views before and after it apart.", views)
     words = f"{{views}} were left out: {when}, as they agree, {what}."
-    fault = _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
-    evidence = run_evidence(len(run), len(rows))
-    yield replace(fault, found=replace(fault.found, mahalanobis_sq=evidence))
+    short = f"{when}, something had moved"
+    yield _fault(cell_fit, "something_moved", outliers, words, do, short)
 
 
 def _moved_words(
@@ -241,31 +225,6 @@ def _exchanged_views(
             yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
 
 
-def _pushed_bases(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Robots whose observations are all outliers from some stop on, as if the base had moved."""
-    # Such observations are left out, and the base stays where it was: unlike other frames, a base
-    # is not split in two when it moves, as all that its robot carries hangs on it.
-    problem, used = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    stops = problem.observations.stops
-    for robot, base in problem.tree.bases.items():
-        flange = problem.tree.flanges[robot]
-        by_robot = problem.observations_through(flange)
-        first = int(stops[by_robot & used].max(initial=-1)) + 1
-        after = np.flatnonzero(by_robot & ~used & (stops >= first))
-        if len(np.unique(stops[after])) < _FEWEST_STOPS:
-            continue
-        moved = _base_displacement(cell_fit, base, after)
-        as_if = f", as if {base} had been pushed by {moved}" if moved else ""
-        words = (
-            f"All {len(after)} views by way of {flange} from stop "
-            f"{cell_fit.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
-            f"{base} is where it stood before."
-        )
-        look = look_at(cell_fit.cell.rows[after[0]].view)
-        step = Remedy("Fasten it, and calibrate the stops from there on alone.", look)
-        yield _fault(cell_fit, "something_moved", after.tolist(), words, step)
-
-
 def _base_displacement(
     cell_fit: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
 ) -> str:
@@ -300,28 +259,42 @@ def _exchanged_poses(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[P
 
 
 def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:
-    """Stops at which all observations through a robot agree that its pose is wrong."""
+    """Robots that stood elsewhere: of one stop by its flange, of all stops at the end by its base.
+
+    A base that was pushed stays where it was: all that its robot carries hangs on it.
+    """
     problem, used = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    stops = problem.observations.stops
+    stops, named = problem.observations.stops, cell_fit.cell.stops
     for robot, base in problem.tree.bases.items():
         by_robot = problem.observations_through(problem.tree.flanges[robot])
-        for station in np.unique(stops[by_robot & ~used]).tolist():
-            rows = np.flatnonzero(by_robot & (stops == station))
+        last = int(stops[by_robot & used].max(initial=-1))
+        wrong = np.unique(stops[by_robot & ~used]).tolist()
+        parts = [[station] for station in wrong if station <= last]
+        if after := [station for station in wrong if station > last]:
+            is_pushed = len(after) >= FEWEST
+            parts += [after] if is_pushed else [[station] for station in after]
+        for part in parts:
+            rows = np.flatnonzero(by_robot & np.isin(stops, part))
             if len(rows) < _FEWEST or used[rows].any() or {*explained} & {*rows.tolist()}:
                 continue
-            if moved := _base_displacement(cell_fit, base, rows, problem.poses[robot][station]):
-                stop = cell_fit.cell.stops[station]
-                words = (
-                    f"Robot {robot} did not stand at stop {stop} where its pose says: all "
-                    f"{len(rows)} views by way of it disagree with the others, as if the flange "
-                    f"had been moved by {moved}, and were left out ({{views}})."
-                )
-                do = Remedy(
-                    "Correct its pose there in views.csv, or leave the stop out.",
-                    look_at(cell_fit.cell.rows[rows[0]].view),
-                )
-                short = f"the pose of robot {robot} at stop {stop} is wrong"
-                yield _fault(cell_fit, "wrong_pose", rows.tolist(), words, do, short)
+            at_flange = None if len(part) > 1 else problem.poses[robot][part[0]]
+            moved = _base_displacement(cell_fit, base, rows, at_flange)
+            if not moved and len(part) == 1:
+                continue
+            what = f"{base} had been pushed" if len(part) > 1 else "the flange had been moved"
+            as_if = f", as if {what} by {moved}" if moved else ""
+            when = f"at stop {named[part[0]]}" + " and after" * (len(part) > 1)
+            words = (
+                f"Robot {robot} did not stand {when} where its pose says: all {len(rows)} views by "
+                f"way of it disagree with the others{as_if}, and were left out ({{views}})."
+            )
+            do = Remedy(
+                "Correct its poses there in views.csv; or fasten its base, and record again.",
+                look_at(cell_fit.cell.rows[rows[0]].view),
+            )
+            kind = "something_moved" if len(part) > 1 else "wrong_pose"
+            short = f"the pose of robot {robot} {when} is wrong"
+            yield _fault(cell_fit, kind, rows.tolist(), words, do, short)
 
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
@@ -331,7 +304,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
-    rest, reasons = "the other views" if alone else "the rest of the cell", dict[int, str]()
+    reasons = dict[int, str]()
     for at, cause in causes.items():
         row, mm = cell_fit.cell.rows[at], 1e3 * float(off_m[at])
         turned = ""
@@ -342,11 +315,9 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
         if distance[at] > limit[at]:
             beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
         target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
-        if alone and row.seen.startswith("point") and row.seen not in inliers.problem.points:
-            target = "the probe"
         reasons[row.view] = (
-            f"disagrees with {rest}: it places {target} {figure(mm)} mm{turned} away, {beyond}; "
-            f"{cause}"
+            f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
+            f"{beyond}; {cause}"
         )
     return reasons
 
@@ -355,29 +326,20 @@ def _cause(
     cell_fit: CellFit, at: int, fitting: Mapping[int, Sequence[int]], mutual: Mapping[int, int]
 ) -> str:
     """Likely cause of an outlier, by stops that it fits and by inliers of its stop and target."""
-    rows, used, stops = cell_fit.cell.rows, cell_fit.inlier_fit.used, cell_fit.cell.stops
-    seen = np.array(cell_fit.inlier_fit.problem.observations.observed)
+    rows, stops = cell_fit.cell.rows, cell_fit.cell.stops
     if at in mutual:
         own, other = rows[at], rows[mutual[at]]
         return (
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
             f"{stops[own.station]}: these two rows are exchanged"
         )
-    reading = "reading" if rows[at].seer.startswith("instrument") else "image"
-    cause = f"its pose or its {reading} is wrong, or something had moved"
-    of_its_target = np.flatnonzero((seen == seen[at]) & used)
+    cause = "its pose or its reading is wrong, or something had moved"
     of_stop = cell_fit.inlier_fit.problem.observations.stops
-    mates = np.flatnonzero((of_stop == of_stop[at]) & used)
-    if len(of_its_target) == 1 and len(set(seen.tolist())) > 1:
-        other = rows[of_its_target[0]]
-        cause = f"it and view {other.view} alone show this target, and either may be wrong"
-    elif len(mates):
-        cause = (
-            f"view {rows[mates[0]].view} of the same stop agrees: the {reading} is wrong, or "
-            "something moved in between"
-        )
+    mates = np.flatnonzero((of_stop == of_stop[at]) & cell_fit.inlier_fit.used)
+    if len(mates):
+        cause = f"view {rows[mates[0]].view} of the same stop agrees: its reading is wrong"
     if at in fitting:
-        fits = [str(stops[index]) for index in fitting[at][:_NAMED]]
+        fits = [str(stops[index]) for index in fitting[at]]
         one = "stop" if len(fits) == 1 else "another stop, as"
-        cause = f"its image is of {one} {', '.join(fits)}; {cause}"
+        cause = f"its image is of {one} {some_of(fits, 3)}; {cause}"
     return cause

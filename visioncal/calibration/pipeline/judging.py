@@ -1,6 +1,5 @@
 """Collects the verdict's input: results by camera, robot and target; checks observability."""
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -32,9 +31,9 @@ from visioncal.calibration.suspects.judged import (
 )
 from visioncal.calibration.suspects.ranking import is_of_chain
 from visioncal.core.conventions import controller_form
-from visioncal.core.finding_kinds import MOVED_FRAME, NOTE
+from visioncal.core.finding_kinds import NOTE
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
+from visioncal.core.number_format import mm_and_deg, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy
@@ -65,7 +64,7 @@ def findings_of(run: RunState) -> Findings:
     of_arms = doubts_of_arms(
         cell_fit.arms, answer.steps, answer.arms, cell_fit.level, cell_fit.cell
     )
-    found = [*(_with_alternative(doubt, run) for doubt in of_arms), *lens_findings(answer.lenses)]
+    found = [*of_arms, *lens_findings(answer.lenses)]
     of_rest = [
         *(
             component.finding
@@ -97,7 +96,6 @@ def findings_of(run: RunState) -> Findings:
         ),
         (
             *run.notes,
-            *_clock_words(run),
             *notes_on_arms(cell_fit.arms, answer.arms),
             *(finding.reason for finding in of_rest if finding.kind == NOTE),
         ),
@@ -121,17 +119,6 @@ def _use(run: RunState) -> Remedy:
         words, command = "Take the transform to another program", "export OUT --to text"
     again = "visioncal verify compares later stops with it."
     return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")
-
-
-def _with_alternative(finding: Finding, run: RunState) -> Finding:
-    """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
-    steps = run.assessment.steps
-    if finding.kind != MOVED_FRAME or run.mount is None or not steps:
-        return finding
-    tree = run.cell_fit.cell.tree
-    on_flange = tree.body(steps[0].of) != tree.root
-    same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
-    return replace(finding, words=f"{finding.words} {same} would look the same.")
 
 
 def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
@@ -245,17 +232,6 @@ def _absorbing(run: RunState) -> Iterator[str]:
         bodies |= {cell.tree.root} if base == cell.reference else set()
         yield base
         yield from (frame for frame in cell.tree.branches if cell.tree.body(frame) in bodies)
-
-
-def _clock_words(run: RunState) -> Iterator[str]:
-    """Notes on clock offsets of a whole cell that the fit estimates."""
-    for pair, clock in run.assessment.clocks(run).items():
-        if run.mount is None and clock is not run.clocks[pair].clock:
-            yield (
-                f"{pair.words}: the fit of the whole cell has the camera's clock "
-                f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
-                f"{figure(1e3 * (clock.sigma_s or 0.0))} ms)."
-            )
 
 
 def _pairs(
@@ -386,29 +362,17 @@ def check_answer(run: RunState) -> None:
 
 def _words_of(run: RunState) -> CellWords:
     """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
-    inliers, cell, part = run.cell_fit.inlier_fit, run.cell_fit.cell, run.cell_fit.inlier_problem
-    outliers = inliers.problem.subset(~inliers.used)
+    cell, part = run.cell_fit.cell, run.cell_fit.inlier_problem
 
-    def words(frame: str, culprit: str = "") -> tuple[str, str]:
-        seen = part.observations_through(frame)
-        if not seen.any() and (count := int(outliers.observations_through(frame).sum())):
-            return (
-                f"all {count} observations of it disagree with the rest of the cell",
-                "Look whether the board that ties it has the stated size, and whether images and "
-                "poses belong together.",
-            )
-        advice, flanges = _frame_advice(cell, frame), part.tree.flanges.values()
+    def advice(frame: str, culprit: str) -> str:
+        seen, flanges = part.observations_through(frame), part.tree.flanges.values()
         between = [name for name in flanges if part.observations_through(name)[seen].any()]
-        if between and "offset along" in culprit:
-            advice = f"{advice} {measuring_advice(cell, between[0])}".rstrip()
-        return _motion(cell, part, frame), advice
+        measured = between and "offset along" in culprit
+        more = measuring_advice(cell, between[0]) if measured else ""
+        return f"{_frame_advice(cell, frame)} {more}".rstrip()
 
-    return CellWords(
-        "cell",
-        {name: _names(part.tree, name) for name in part.unknown},
-        lambda frame: words(frame)[0],
-        lambda frame, culprit: words(frame, culprit)[1],
-    )
+    names = {name: _names(part.tree, name) for name in part.unknown}
+    return CellWords("cell", names, lambda frame: _motion(cell, part, frame), advice)
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:
@@ -452,16 +416,12 @@ def _frame_advice(cell: Cell, frame: str) -> str:
 
 
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
-    """Names the most uncertain frame of the cell, and the observations that determine it."""
+    """Names the most uncertain frame of the cell, and its worst direction."""
     if not edges:
         return ""
     name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
     worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
-    above = [(row, cell.tree.above(end)) for row in cell.rows for end in (row.seer, row.seen)]
-    counts = Counter(f"{row.seer} of {row.seen}" for row, frames in above if name in frames)
-    fewest = sorted(counts.items(), key=lambda pair: pair[1])
-    words = [f"{counted(count, 'view')} by {pair}" for pair, count in fewest]
     return (
         f"The weakest link is {name}: sigma {mm_and_deg(edge.sigma_mm, edge.sigma_deg)}, most of "
-        f"it in {worst.words}. It rests on {some_of(words, 4)}."
+        f"it in {worst.words}."
     )

@@ -10,7 +10,7 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.appearance import MOST_LOOSE, Compressed
+from visioncal.estimation.appearance import Compressed
 from visioncal.estimation.joint import (
     CONTRADICTION,
     ConvergedFit,
@@ -34,8 +34,8 @@ from visioncal.vision.camera import normalise, project
 _SAME_SIZE = 5e-4
 # Changes of intrinsics or corners below this show in no image [px].
 _LEAST_MOVE_PX = 0.1
-# Accuracy of printed boards [mm].
-_LEAST_BEND_MM = 1e-2
+# Accuracy of printed boards [m].
+_LEAST_BEND_M = 1e-5
 _NEW_LENS = Remedy(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
@@ -56,12 +56,9 @@ def lens_and_board_findings(
     """
     optics = fitted.camera_parameters
     for camera, compressed in zip(optics.problems, fitted.linearised.compressed, strict=True):
-        of = "" if camera == ONLY_CAMERA else camera
-        for finding in (
-            *_noise_findings(optics.problems[camera], compressed),
-            *_lens_findings(fitted, camera),
-        ):
-            yield finding.of(of)
+        noise = _noise_findings(optics.problems[camera], compressed)
+        for finding in (*noise, *_lens_findings(fitted, camera)):
+            yield finding.of("" if camera == ONLY_CAMERA else camera)
     scene = next(iter(optics.problems.values())).scene
     for board, target in enumerate(scene.targets):
         called = f"board {scene.names[board]}".strip()
@@ -72,7 +69,7 @@ def lens_and_board_findings(
                 measured = scale_by_stated_arms(fitted, stated, frame) or measured
             yield from _point_findings(target, optics.values[optics.shape_of(board)])
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
-                yield _rig_size_finding(target, measured)
+                yield scale_finding(f"target {target.name}", target, measured, measured)
             continue
         place = optics.shape_of(board)[0]
         if measured.is_another and place in fitted.linearised.moving:
@@ -80,93 +77,73 @@ def lens_and_board_findings(
             sigma = float(covariance[at, at] ** 0.5)
             written = replace(measured, scale=float(optics.values[place]), sigma=sigma)
             yield scale_finding(called, target, measured, written)
-        if _has_changed(fitted, optics.shape_of(board)[1:]):
-            yield _shape_finding(fitted, board, called)
+        yield from _shape_findings(fitted, board, called)
 
 
 def _noise_findings(problem: CornerProblem, compressed: Compressed) -> Iterator[Finding]:
-    """Finding where the scatter of corners contradicts corners.csv; a note where it is less."""
+    """Finding where corners scatter by more than corners.csv states."""
     stack, unknowns = problem.stack, problem.unknowns(compressed)
     stated, shown = stack.stated_px, stack.shown_px(compressed.residuals, unknowns)
-    if stated is None or not stack.contradicts(compressed.residuals, unknowns):
+    if stated is None or shown <= stated or not stack.contradicts(compressed.residuals, unknowns):
         return
-    kind, by = "corner_noise", "the scatter"
-    advice = "Look for errors of the detector, the lens or the target that sigma_px leaves out."
-    if shown <= stated:
-        kind, by = NOTE, "what is stated"
-        advice = "State what the detector errs by, or leave sigma_px out."
     yield Finding(
-        kind,
+        "corner_noise",
         f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
-        f"(sigma_px of a typical corner). The result goes by {by}.",
-        Remedy(advice),
-    )
-
-
-def _by_motion(thing: str, measured: MeasuredScale, than: str = "stated") -> str:
-    """The size of a target relative to the stated one by the robot's motion, in words."""
-    return (
-        f"By the robot's motion {thing} is {figure(100 * abs(measured.scale))} % "
-        f"{'larger' if measured.scale > 0 else 'smaller'} than {than} (sigma "
-        f"{figure(100 * measured.sigma)} %)"
+        "(sigma_px of a typical corner). The result goes by the scatter.",
+        Remedy("Look for errors of the detector, the lens or the target that sigma_px leaves out."),
     )
 
 
 def scale_finding(
-    board: str, target: Target, measured: MeasuredScale, written: MeasuredScale
+    called: str, target: Target, measured: MeasuredScale, written: MeasuredScale
 ) -> Finding:
-    """Finding on a board of another size than stated; a note where its stated sigma allows it.
+    """Finding on a board or rig of another size; a note where its stated sigma allows it.
 
     `measured` is the scale by the robot's motion, `written` that of the result, with its total
     sigma.
     """
-    size, share = _by_motion(f"the {board}", written), f"{figure(100 * measured.stated_sigma)} %"
+    share = f"{figure(100 * measured.stated_sigma)} %"
+    size = (
+        f"By the robot's motion the {called} is {figure(100 * abs(written.scale))} % "
+        f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
+        f"{figure(100 * written.sigma)} %)"
+    )
     if not measured.contradicts:
         allowed = f"{size}. The stated size allows this (to within {share})."
         return Finding(NOTE, f"{allowed} The result goes by both.")
-    what, side = kind_of(target).sides, 1e3 * target.square_m
-    side_found = side * (1 + written.scale)
-    return Finding(
-        "board_size",
-        f"{size}: {what} of {side_found:.4g} mm, not of {side:.4g} mm (stated to within {share}). "
-        "The result takes the robot's scale; if the board is right, the arm's model is off by as "
-        "much.",
-        Remedy(
-            f"Measure the board over {'many squares' if what == 'squares' else 'its whole width'}. "
-            f"If the robot is right, write {kind_of(target).size_key} = {1e-3 * side_found:.4g} in "
-            "the board's .toml; else check the arm.",
-            CALIBRATE,
-        ),
-        mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),
-    )
+    if target.is_rig:
+        words = f"{size}. The result goes by the table of its points."
+        do = (
+            "Measure the distance of two points that are far apart. If the robot is right, "
+            f"multiply the table's x_m, y_m and z_m by {1 + written.scale:.5g}; else check the arm."
+        )
+    else:
+        kind, side = kind_of(target), 1e3 * target.square_m
+        found = side * (1 + written.scale)
+        words = (
+            f"{size}: {kind.sides} of {found:.4g} mm, not of {side:.4g} mm (stated to within "
+            f"{share}). The result takes the robot's scale; if the board is right, the arm's model "
+            "is off by as much."
+        )
+        do = (
+            f"Measure the board over its whole width. If the robot is right, write {kind.size_key} "
+            f"= {1e-3 * found:.4g} in the board's .toml; else check the arm."
+        )
+    total = measured.sigma**2 + measured.stated_sigma**2
+    square = measured.scale**2 / total
+    return Finding("board_size", words, Remedy(do, CALIBRATE), mahalanobis_sq=square)
 
 
-def _rig_size_finding(target: Target, measured: MeasuredScale) -> Finding:
-    """Finding on a rig of another size than its table states, by the robot's motion."""
-    return Finding(
-        "board_size",
-        f"{_by_motion(f'target {target.name}', measured, 'the table of its points')}. The result "
-        "goes by the table.",
-        Remedy(
-            "Measure the distance of two points that are far apart. Where they are as the robot "
-            f"says, multiply the table's x_m, y_m and z_m by {1 + measured.scale:.5g}; otherwise "
-            "see to the arm.",
-            CALIBRATE,
-        ),
-        mahalanobis_sq=(measured.scale / measured.sigma) ** 2,
-    )
-
-
-def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
-    """Finding on a bent, stretched or sheared board; a note within the accuracy of printing."""
+def _shape_findings(fitted: ConvergedFit, board: int, called: str) -> Iterator[Finding]:
+    """Finding on a bent, stretched or sheared board, beyond the accuracy of printing."""
     optics = fitted.camera_parameters
     shape = optics.shape_of(board)[1:]
     aspect, *bends, shear = shape
     drawn = optics.with_values(shape, np.zeros(len(shape))).corners[board]
-    largest_mm = 1e3 * float(np.linalg.norm(optics.corners[board] - drawn, axis=1).max())
-    if largest_mm < _LEAST_BEND_MM:
-        return Finding(NOTE, f"The {called} is within {figure(largest_mm)} mm of its drawing.")
-    parts, step = [], "Print it anew on another printer."
+    off_m = np.linalg.norm(optics.corners[board] - drawn, axis=1).max()
+    if not _has_changed(fitted, shape) or off_m < _LEAST_BEND_M:
+        return
+    parts = []
     if _has_changed(fitted, np.array([aspect])):
         longer = float(optics.values[aspect])
         far, near = ("y", "x") if longer > 0 else ("x", "y")
@@ -178,24 +155,15 @@ def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
         parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
     if _has_changed(fitted, np.array(bends)) or not parts:
         depth = figure(1e3 * float(np.ptp(optics.corners[board][:, 2])))
-        flat = "Put the board on a stiff, flat plate, and record again."
-        step = f"{flat} {step}" if parts else flat
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
     words = f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest."
-    return Finding("board_shape", words, Remedy(step))
+    flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
+    yield Finding("board_shape", words, Remedy(flat))
 
 
 def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
-    """Finding where a point of a rig contradicts the rig's table."""
-    if not target.point_sigmas_m:
-        return
+    """Finding where a point of a rig contradicts the rig's table; `moved_m` is empty if exact."""
     if not len(moved_m):
-        yield Finding(
-            "remark",
-            f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
-            f"their sigma_m counts for up to {MOST_LOOSE}.",
-            Remedy(f"Leave points out, down to {MOST_LOOSE}, so that their sigma_m counts."),
-        )
         return
     sigmas = np.array(target.point_sigmas_m)
     distances = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)

@@ -7,16 +7,14 @@ import numpy as np
 
 from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
 from visioncal.calibration.suspects.ranking import (
-    LEAST_RUN,
     MEASURE_BOARD,
     NO_JOINTS,
     add_views_remedy,
-    run_evidence,
 )
 from visioncal.core.finding_kinds import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
-from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at, or_alone
+from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at
 from visioncal.results import Rms, ViewResult
 
 _LIMITS = CalibrationLimits()
@@ -46,7 +44,7 @@ def collect_findings(judged: Findings) -> list[Finding]:
     return [
         *scatter,
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
-        *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair, judged)),
+        *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair)),
         *([] if is_wild else [*_sigmas(judged), *_place(judged), *_workspace(judged)]),
         *_few_stops(judged),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _lost_views(sensor)),
@@ -100,20 +98,14 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
     if words:
         worst = sorted(views, key=lambda view: -(view.residual_mm or 0.0))[:_LISTED]
         named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
-        causes = (
-            "an instrument or a tool that moved, readings paired with other poses, units or "
-            "conventions of the poses"
-            if judged.mount == "instrument"
-            else "a board that moved, images paired with other poses, units or conventions of the "
-            "poses, intrinsics, a warped board"
-        )
         yield Finding(
             UNEXPLAINED,
             f"Left out of the fit, views disagree with the others by {', '.join(words)}, rms; the "
             f"worst are {named}.",
             Remedy(
-                f"Look at the worst views for possible causes: {causes}, or an arm with large "
-                "model errors.",
+                "Look at the worst views for possible causes: a board, tool or instrument that "
+                "moved, rows paired with other poses, units or conventions of the poses, "
+                "intrinsics, a warped board, or an arm with large model errors.",
                 REVIEW,
             ),
             tuple(view.view for view in worst),
@@ -138,52 +130,30 @@ def _residual(view: ViewResult) -> str:
 
 
 def _left_out(pair: JudgedPair) -> Iterator[Finding]:
-    """Finding on outlier views of a pair, single or consecutive."""
+    """Finding on outlier views of a pair."""
     if not pair.outliers:
         return
     views, reason = tuple(rejection.view for rejection in pair.outliers), pair.outliers[0].reason
-    compared = [view.view for view in pair.views if view.used or view.view in views]
-    kind, evidence, run = "wrong_views", 0.0, _run(views, compared)
     listed = ", ".join(map(str, views))
-    more, them = ("s", "them") if len(views) > 1 else ("", "it")
-    words = f"View {views[0]} was left out. It {reason}."
-    if more:
+    words = f"View {listed} was left out. It {reason}."
+    if len(views) > 1:
         words = f"Views {listed} were left out. View {views[0]} {reason}."
     step = Remedy(
-        f"Compare image and pose of view{more} {listed}: record {them} again, or in views.csv, "
-        f"delete the row{more} of view{more} {listed}.",
+        f"Compare images and poses: repeat, or in views.csv, delete the rows of view {listed}.",
         look_at(views[0]),
     )
-    if run:
-        kind, evidence = "something_moved", run_evidence(len(views), len(compared))
-        words = f"{words} They follow each other: {run}, something had moved."
-        advice = "Fasten what moved, and calibrate the views before and after it apart."
-        step = or_alone(advice, views)
-    others = _without(views, pair.held_out)
-    yield Finding(kind, words, step, views, without_it=others, mahalanobis_sq=evidence)
+    yield Finding("wrong_views", words, step, views, without_it=_without(views, pair.held_out))
 
 
-def _run(views: Sequence[int], compared: Sequence[int]) -> str:
-    """When consecutive ones of the compared views were taken; empty where they are scattered."""
-    first, count = compared.index(views[0]), len(views)
-    end = first + count
-    if not LEAST_RUN <= count < len(compared) or [*compared[first:end]] != [*views]:
-        return ""
-    if end == len(compared):
-        return f"from view {views[0]} on"
-    return f"from view {views[0]} to view {views[-1]}" if first else f"before view {compared[end]}"
-
-
-def _holdout(pair: JudgedPair, judged: Findings) -> Iterator[Finding]:
+def _holdout(pair: JudgedPair) -> Iterator[Finding]:
     """Finding on views that the session holds back, and the result does not predict."""
     holdout = pair.holdout
     if holdout is not None and (ratio := _ratio(holdout, pair.held_out)) > _LIMITS.holdout:
-        observed = "readings" if judged.mount == "instrument" else "images"
         yield Finding(
             "holdout",
             f"The views that the session holds back are missed by {holdout.words}, {ratio:.0f} "
             "times worse than views left out in turn. They lie where the result does not hold, or "
-            f"their poses or {observed} are wrong.",
+            "their poses or readings are wrong.",
             Remedy("Record views where the result is to hold, with role = fit."),
         )
 
@@ -273,16 +243,13 @@ def _place(judged: Findings) -> Iterator[Finding]:
     if not beyond:
         return
     beyond.sort(key=lambda place: -place.budget_mm["total"])
-    worst, *others = beyond
+    worst = beyond[0]
     total, *parts = sorted(worst.budget_mm.items(), key=lambda at: (at[0] != "total", -at[1]))
     listed = ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED])
     words = (
         f"{worst.words} is placed to {figure(total[1])} mm (sigma; 95 % within "
         f"{figure(worst.radius95_mm)} mm): {listed}."
     )
-    if others:
-        named = (f"{place.words} ({figure(place.budget_mm['total'])} mm)" for place in others)
-        words += f" Over {check:g} mm are also {', '.join(named)}."
     step = MEASURE_BOARD if _is_of_board(judged) else None
     yield Finding("place", words, step, is_fatal=total[1] > bad, until_mm=0.0)
 
@@ -293,16 +260,11 @@ def _workspace(judged: Findings) -> Iterator[Finding]:
     for arm in judged.arms:
         if arm.workspace_mm is None or arm.workspace_mm <= check:
             continue
-        board = (
-            " The board's size counts in it, as no view shows when an arm and a board are both too "
-            "large: measure its squares, and state square_sigma_m."
-        )
-        seen = any(sensor.pixel_px is not None for sensor in judged.sensors)
         yield Finding(
             "workspace",
             f"All over the workspace the calibrated arm places its tool to "
-            f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at {check:g})."
-            f"{board * seen}",
+            f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at {check:g}). A "
+            "board's size counts in it: measure its squares, and state square_sigma_m.",
             _more_views(
                 judged,
                 "Add views with other postures of the arm, all over the workspace.",
@@ -335,18 +297,13 @@ def _lost_views(sensor: Sensor) -> Iterator[Finding]:
     if share <= check:
         return
     others = [rejection for rejection in sensor.lost if rejection.view not in sensor.outliers]
+    words, step = f"{count} of {total} views {'is' if count == 1 else 'are'} not used.", None
     # Outliers have a finding of their own.
-    kind, step, details = "left_out", None, ""
-    if disagree := len({*sensor.outliers}):
-        verb = "disagrees" if disagree == 1 and others else "disagree"
-        details = f"; {disagree if others else 'all'} of them {verb} with the others"
     if others:
-        kind, first = "lost_views", others[0]
-        details += f"; the first{' but for these' if disagree else ''}: view {first.view}, "
-        details += first.reason
+        words += f" The first but for outliers: view {others[0].view}, {others[0].reason}."
         advice = "Correct the first of them and those like it, or repeat what is missing."
-        step = Remedy(advice, look_at(first.view))
-    words = f"{count} of {total} views {'is' if count == 1 else 'are'} not used{details}."
+        step = Remedy(advice, look_at(others[0].view))
+    kind = "lost_views" if others else "left_out"
     views = tuple(rejection.view for rejection in sensor.lost)
     yield Finding(kind, words, step, views, is_fatal=share > bad)
 
@@ -383,14 +340,10 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
         if max(least_mm / _LIMITS.robot_mm, least_deg / _LIMITS.robot_deg) <= 1.0:
             continue
         likelier = (
-            "Read a few stops twice, with the times in stamp_s, to see how well readings repeat; "
-            "more likely than the arm's noise are an instrument that reads worse than stated or "
-            "was moved, or a model of the arm that is off by as much."
-            if judged.mount == "instrument"
-            else "Look for what is likelier than noise of the arm: a board of another size than "
-            "stated (measure it over many squares) or warped, intrinsics that are not this "
-            "camera's, a model of the arm that is off by as much, or poses that were read before "
-            "the arm stood still (read one twice to see how well it repeats)."
+            "Look for what is likelier than noise of the arm: a board of another size than stated "
+            "(measure it over many squares) or warped, intrinsics that are not this camera's, an "
+            "instrument that was moved or reads worse than stated, a model of the arm that is off "
+            "by as much, or poses that were read before the arm stood still."
         )
         ratio = max(arm.noise_mm / _LIMITS.robot_mm, arm.noise_deg / _LIMITS.robot_deg)
         yield Finding(

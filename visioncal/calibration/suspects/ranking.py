@@ -17,7 +17,6 @@ which the limit alone is known (`Finding.by_limit`), are only ranked by it: the 
 stand before each.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -37,7 +36,6 @@ from visioncal.core.finding_kinds import (
 )
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
-from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Need
 from visioncal.core.verdict import CALIBRATE, PLAN, REVIEW, Finding, Remedy, Verdict
 from visioncal.estimation.effects import RANDOM_EFFECTS
@@ -49,8 +47,6 @@ _KINDS: Mapping[str, Kind] = {
 }
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
-# Fewest consecutive left-out views that count as a run, and not as chance.
-LEAST_RUN = 3
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
 _LEAST_SHARE = 0.1
 
@@ -255,13 +251,6 @@ def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
 def is_of_chain(found: Finding) -> bool:
     """Whether a finding explains that views disagree, or that the flange is off."""
     return _KINDS[found.kind].misfit == CHAIN
-
-
-def run_evidence(count: int, of: int) -> float:
-    """Chi-square (one degree of freedom) of `count` consecutive left-out views among `of` views."""
-    # Views that are wrong independently are equally likely to be any of them.
-    chance = KINDS["something_moved"].chance * (of - count + 1) / math.comb(of, count)
-    return float(chi2_limit(max(chance, FACT), 1))
 
 
 def _odds(chance: float) -> float:
