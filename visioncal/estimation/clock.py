@@ -1,8 +1,7 @@
 """Clock offset between camera and robot, from a motion that both recorded.
 
 Starting where both rotate alike, the offset is one more unknown of the chain of frames: it moves
-the flange along its trajectory. Where frames have corners, so is the readout time of the images. A
-change of the offset is found by what each frame alone would have.
+the flange along its trajectory. Where frames have corners, so is the readout time of the images.
 """
 
 from collections.abc import Sequence
@@ -13,9 +12,10 @@ import numpy as np
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import (
+    FEWEST_FRAMES,
     NEAR_S,
     WIDEST_OFFSET_S,
     WINDOW_S,
@@ -39,9 +39,9 @@ from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 
-# Frames for a start; most and fewest frames of a fit; most with dozens of corners each.
-_START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES, _MOST_STACKED = 60, 1200, 4, 400
-# False alarms, per sweep, of a readout time and of changes of the offset.
+# Frames for a start; most frames of a fit; most with dozens of corners each.
+_START_FRAMES, _MOST_FRAMES, _MOST_STACKED = 60, 1200, 400
+# False alarms, per sweep, of a readout time.
 _FALSE_ALARM = 1e-4
 _ROUNDS, _CONVERGED_S = 12, 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
@@ -49,14 +49,8 @@ _OUTLYING = 4.0
 # Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
 # test.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# Most frames whose own offset is estimated.
-_MOST_OWN = 600
-# Ratio of residual noise, rotations times positions, up to which fits are equally good; share to
-# which a change of the offset must reduce it.
-_ALIKE, _CLEARLY_LESS = 1.2, 0.9
-# A change is refined for this number of rounds at most, or until its step is below this share of
-# its sigma.
-_REFINING, _SETTLED = 6, 0.3
+# Ratio of residual noise, rotations times positions, up to which fits are equally good.
+_ALIKE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,25 +67,6 @@ class ClockFit:
     def residual(self) -> float:
         """Residual noise of rotations times positions, as the likelihood has it."""
         return float(self.fit.noise.robots.prod())
-
-
-@dataclass(frozen=True)
-class ClockChange:
-    """Step or drift of a clock offset."""
-
-    from_s: float  # Camera time of the step, or of the start of the drift [s].
-    step_s: float  # Increase of the offset [s]; of a drift, per second.
-    sigma_s: float  # Its standard deviation.
-    is_drift: bool  # Whether the offset grows steadily.
-
-    def shares(self, stamps_s: FloatArray) -> FloatArray:
-        """(m,) change of the offset at some times [s], in units of `step_s`."""
-        later_s = stamps_s - self.from_s
-        return later_s if self.is_drift else (later_s >= 0.0).astype(float)
-
-    def corrected(self, stamps_s: FloatArray) -> FloatArray:
-        """(m,) times by a clock without the change [s]."""
-        return np.asarray(stamps_s - self.step_s * self.shares(stamps_s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,110 +169,10 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
     Then it is the one near the stated offset; None where none is, or there are no fits.
     """
     rivals = [fit for fit in fits if fit.residual <= _ALIKE * fits[0].residual]
-    if all(abs(fit.offset_s - fits[0].offset_s) <= NEAR_S for fit in rivals):
-        return next(iter(fits), None)
-    near = (
-        fit for fit in rivals if stated_s is not None and abs(fit.offset_s - stated_s) <= NEAR_S
-    )
-    return next(near, None)
-
-
-def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
-    """Finds a step of the offset at any frame, or a steady drift; None where noise explains it.
-
-    Means of the frames' own offsets over stretches of time are taken as independent; their residual
-    scatter is the noise of the test (of a change point; Page 1955). A fit to both sides of a step
-    is biased, so that the step is refined in a few rounds.
-    """
-    chosen, own_s, weights = _own_offsets(robot, frames, fit)
-    change = _tested_change(frames.stamps_s[chosen], own_s, weights)
-    if change is None:
-        return None
-    for _ in range(_REFINING):
-        corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
-        fits = fit_offset(robot, corrected, [fit.offset_s])
-        if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
-            return None
-        if frames.stack is not None:
-            # A rolling shutter follows the motion, and would be taken for the clock's change.
-            break
-        chosen, own_s, weights = _own_offsets(robot, corrected, fits[0])
-        more_s, sigma_s, _ = _fit_slope(change.shares(frames.stamps_s[chosen]), own_s, weights)
-        change = replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
-        if abs(more_s) < _SETTLED * sigma_s:
-            break
-    return change
-
-
-def _tested_change(
-    times_s: FloatArray, own_s: FloatArray, weights: FloatArray
-) -> ClockChange | None:
-    """The most significant step or drift of frames' own offsets (m,) [s]."""
-    stretch_of = _stretches(times_s)
-    information = np.bincount(stretch_of, weights).astype(float)
-    valid = information > 0.0
-    if np.sum(valid) < _FEWEST_STRETCHES:
-        return None
-    information = information[valid]
-    means, times = (
-        np.bincount(stretch_of, weights * values)[valid] / information
-        for values in (own_s, times_s)
-    )
-    columns = [times - times[0], *((times >= middle).astype(float) for middle in times[2:-1])]
-    scored = [_fit_slope(column, means, information) for column in columns]
-    best = int(np.argmax([square for _, _, square in scored]))
-    step_s, sigma_s, square = scored[best]
-    if square < f_limit(_FALSE_ALARM / len(scored), 1, len(means) - 2):
-        return None
-    if best == 0:
-        return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
-    # The most significant frame within the neighbouring stretches.
-    nearby = times_s[(times_s >= times[best]) & (times_s <= times[best + 2])]
-    scores = [_fit_slope((times_s >= at).astype(float), own_s, weights)[2] for at in nearby]
-    return ClockChange(float(nearby[int(np.argmax(scores))]), step_s, sigma_s, is_drift=False)
-
-
-def _own_offsets(
-    robot: Trajectory, frames: ImageTimes, fit: ClockFit
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Some frames (m,), the change of the offset that each alone would have [s], its information.
-
-    Frames that no offset explains have no information.
-    """
-    chosen = evenly(len(frames), _MOST_OWN)
-    margin_s = 0.5 * robot.speed_window_s
-    chosen = chosen[robot.covers(frames.stamps_s[chosen] - fit.offset_s, margin_s)]
-    problem = clock_problem(robot, frames.only(chosen), fit.offset_s)
-    linear = problem.linear(State(fit.fit.state.edges, problem.start_values))
-    columns = np.concatenate([linear.jacobian[:, :, -1:], linear.residuals[:, :, None]], axis=2)
-    blocks = problem.total_covariance(linear, fit.fit.noise)
-    products = np.swapaxes(columns, 1, 2) @ np.linalg.solve(blocks, columns)
-    information, gradient = np.maximum(products[:, 0, 0], 1e-12), products[:, 0, 1]
-    remaining = products[:, 1, 1] - gradient**2 / information
-    outlier = remaining > _OUTLYING**2 * float(np.median(remaining))
-    return chosen, -gradient / information, np.where(outlier, 0.0, information)
-
-
-def _stretches(times_s: FloatArray) -> IntArray:
-    """(m,) number of the stretch of time that each belongs to, from 0."""
-    first_s = times_s.min(initial=np.inf)
-    return np.unique((times_s - first_s) // _STRETCH_S, return_inverse=True)[1]
-
-
-def _fit_slope(
-    column: FloatArray, values: FloatArray, weights: FloatArray
-) -> tuple[float, float, float]:
-    """A slope beside a constant by weighted least squares, its sigma, and its F statistic."""
-    total = weights.sum()
-    centred = column - weights @ column / total
-    centred_values = values - weights @ values / total
-    square = float(weights @ centred**2)
-    if square <= 0.0:
-        return 0.0, np.inf, 0.0
-    slope = float(weights @ (centred * centred_values)) / square
-    variance = float(weights @ (centred_values - slope * centred) ** 2) / (len(values) - 2)
-    sigma = float(np.sqrt(variance / square))
-    return slope, sigma, (slope / sigma) ** 2 if sigma > 0.0 else 0.0
+    if any(abs(fit.offset_s - fits[0].offset_s) > NEAR_S for fit in rivals):
+        about_s = np.inf if stated_s is None else stated_s
+        rivals = [fit for fit in rivals if abs(fit.offset_s - about_s) <= NEAR_S]
+    return next(iter(rivals), None)
 
 
 def _fitted(recorded: _Recorded, offset_s: float, start: State | None = None) -> ClockFit | None:
@@ -326,7 +201,7 @@ def _iterated(
     for _ in range(_ROUNDS):
         covered = recorded.covered(offset_s)
         count = len(covered.frames)
-        if count < _FEWEST_FRAMES:
+        if count < FEWEST_FRAMES:
             return None
         if start is None:
             problem = clock_problem(covered.robot, covered.frames, offset_s)
@@ -364,7 +239,8 @@ def _sigmas_s(
     # A direction without information has a very large variance here.
     covariance = covariance_from(fisher_information(problem, fit.state, fit.noise))
     independent = np.diag(covariance)[12:]
-    stretches = _stretches(stamps_s)
+    whole = (stamps_s - stamps_s.min()) // _STRETCH_S
+    stretches = np.unique(whole, return_inverse=True)[1]
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
         return np.sqrt(independent), 6.0 * len(stamps_s)

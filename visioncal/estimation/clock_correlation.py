@@ -15,13 +15,12 @@ from visioncal.estimation.trajectory import Trajectory
 
 # Widest offset searched; clocks farther apart are not on one network [s].
 WIDEST_OFFSET_S = 5.0
-# Least time over which angles are compared, and the search's step [s]; least sigma of an
-# interpolated offset [s].
-WINDOW_S, _STEP_S, _LEAST_SIGMA_S = 0.2, 0.01, 1e-3
+# Least time over which angles are compared, and the search's step [s].
+WINDOW_S, _STEP_S = 0.2, 0.01
 # Peaks within this share of the best are rivals; least distance of distinct peaks [s].
 _RIVAL_SHARE, NEAR_S = 0.9, 0.1
-# Most rivals, and fewest and most pairs of frames.
-_MOST_RIVALS, _FEWEST_PAIRS, _MOST_PAIRS = 12, 4, 500
+# Most rivals; fewest frames, or pairs of them, and most pairs.
+_MOST_RIVALS, FEWEST_FRAMES, _MOST_PAIRS = 12, 4, 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +61,6 @@ class Match:
     """An offset at which camera and robot rotate alike."""
 
     offset_s: float  # Camera clock minus robot clock [s].
-    # Its standard deviation by the angles [s]; infinite where they do not depend on it.
-    sigma_s: float
     correlation: float  # Correlation of the angles there.
     at_end: bool = False  # Whether it lies at an end of the search range.
 
@@ -92,10 +89,8 @@ def turning_matches(
     stamps_s = frames.stamps_s - about_s
     later = np.searchsorted(stamps_s, stamps_s + WINDOW_S)
     first = np.flatnonzero(later < len(frames))
-    if len(first) < _FEWEST_PAIRS:
+    if len(first) < FEWEST_FRAMES:
         return ()
-    # Number of pairs that share a stretch of time.
-    overlapping = float(np.median(later[first] - first)) * min(1.0, _MOST_PAIRS / len(first))
     first = first[evenly(len(first), _MOST_PAIRS)]
     later = later[first]
     poses = frames.cam_from_target
@@ -112,17 +107,13 @@ def turning_matches(
     scores[inside.sum(axis=1) <= max(0.5 * len(first), 2)] = 0.0
     matches = []
     for peak in _peaks(scores):
-        offset_s, sigma_s, at_end = lags_s[peak], np.inf, peak in (0, len(lags_s) - 1)
+        offset_s, at_end = lags_s[peak], peak in (0, len(lags_s) - 1)
         if not at_end:
             left, middle, right = scores[peak - 1 : peak + 2]
             curvature = left - 2.0 * middle + right
             # The vertex of the parabola through the maximum and its neighbours.
             offset_s += _STEP_S * (0.5 * (left - right) / curvature if curvature < 0.0 else 0.0)
-            both = inside[peak - 1 : peak + 2].all(axis=0)
-            rates = (by_robot[peak + 1, both] - by_robot[peak - 1, both]) / (2.0 * _STEP_S)
-            errors = by_camera[both] - by_robot[peak, both]
-            sigma_s = _sigma_s(rates, errors, max(overlapping, 1.0))
-        matches.append(Match(float(offset_s) + about_s, sigma_s, float(scores[peak]), at_end))
+        matches.append(Match(float(offset_s) + about_s, float(scores[peak]), at_end))
     return tuple(matches)
 
 
@@ -150,13 +141,3 @@ def _peaks(scores: FloatArray) -> list[int]:
     peaks = find_peaks(padded, height=_RIVAL_SHARE * best, distance=apart)[0] - 1
     order: list[int] = peaks[np.argsort(-scores[peaks])].tolist()
     return order[:_MOST_RIVALS]
-
-
-def _sigma_s(rates: FloatArray, errors: FloatArray, overlapping: float) -> float:
-    """Standard deviation of an offset [s], by the scatter of the angles and their rates."""
-    information = float(np.sum((rates - rates.mean()) ** 2)) if len(rates) else 0.0
-    if not information > 0.0:
-        return np.inf
-    # Errors of pairs that share a stretch of time are correlated.
-    variance = float(np.var(errors)) * overlapping / information
-    return float(np.hypot(np.sqrt(variance), _LEAST_SIGMA_S))

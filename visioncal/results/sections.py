@@ -24,9 +24,9 @@ class ClockResult(Section):
     """Clock offset between camera and robot: `clock` in calibration.json."""
 
     camera_minus_robot_s: float  # The offset [s].
-    # `motion`: estimated; `turning`: estimated from rotations alone; `stated` by the session;
-    # `rest`: without effect, since the robot stood still.
-    method: Literal["motion", "turning", "stated", "rest"]
+    # `motion`: estimated; `stated` by the session; `rest`: without effect, since the robot stood
+    # still.
+    method: Literal["motion", "stated", "rest"]
     sigma_s: float | None = None  # Its standard deviation [s]; None for views at rest.
     stated_s: float | None = None  # The stated offset [s]; None where there is none.
     # Number of frames in motion that it was estimated from; None for none.

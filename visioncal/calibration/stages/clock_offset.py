@@ -10,8 +10,8 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Mask, Rejection
-from visioncal.core.verdict import GUESS, Finding, Remedy
-from visioncal.estimation.clock import ClockChange, ClockFit
+from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.clock import ClockFit
 from visioncal.estimation.clock_correlation import Match
 from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.results.sections import ClockResult
@@ -117,68 +117,37 @@ def speed_words(clock: ClockResult, speeds: FloatArray, inside: int) -> str:
 
 
 def offset_doubts(clock: ClockResult, views: Sequence[View]) -> Iterator[Finding]:
-    """Findings on an offset by the rotation alone, and on a stated one that the motion refutes."""
-    sigma_s = clock.sigma_s or 0.0
-    ahead_ms, sigma_ms = 1e3 * clock.camera_minus_robot_s, figure(1e3 * sigma_s)
-    if clock.method == "turning":
-        yield Finding(
-            "clock",
-            f"The camera's clock is {ahead_ms:+.1f} ms ahead of the robot's (sigma {sigma_ms} ms), "
-            f"by the turning of both (correlation {clock.correlation:.2f}). It is known no better, "
-            "because the chain of frames does not close over the motion.",
-            Remedy("Try other conventions of the poses.", GUESS),
-        )
+    """Finding on a stated offset that the motion refutes."""
     if clock.stated_s is None:
         return
+    sigma_s = clock.sigma_s or 0.0
     difference_s = abs(clock.stated_s - clock.camera_minus_robot_s)
     frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
     if difference_s > max(_STATED_SIGMAS * sigma_s, _STATED_SHARE * frame_s):
         yield Finding(
             "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
-            f"motion gives {ahead_ms:+.2f} ms (sigma {sigma_ms} ms), which was taken.",
+            f"motion gives {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
+            f"{figure(1e3 * sigma_s)} ms), which was taken.",
             Remedy("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
 
 
-def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
-    """Finding about a change of the offset between the clocks, with the views' original stamps."""
-    if change.is_drift:
-        how = (
-            f"drifts against the robot's, by {1e6 * change.step_s:+.0f} ppm (sigma "
-            f"{figure(1e6 * change.sigma_s)})"
-        )
-    else:
-        later = [view.number for view in views if (view.stamp_s or 0.0) >= change.from_s]
-        how = (
-            f"jumps against the robot's: from view {(*later, 0)[0]} on it is "
-            f"{1e3 * change.step_s:+.1f} ms (sigma {figure(1e3 * change.sigma_s)} ms) farther "
-            "ahead than before"
-        )
-    return Finding(
-        "clock_changed",
-        f"The camera's clock {how}. The times were taken as they would be without that.",
-        Remedy(
-            "Stamp images and robot by one clock, which no time server sets while it records; then "
-            "record again."
-        ),
-        mahalanobis_sq=(change.step_s / change.sigma_s) ** 2,
-    )
-
-
 def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
     """Why the motion does not determine the offset, in words."""
-    best = max(matches, key=lambda match: match.correlation, default=None)
-    if best is None:
+    if not matches:
         return "camera and robot are not seen to turn together for long enough"
-    if best.correlation < LEAST_CORRELATION:
+    if matches[0].correlation < LEAST_CORRELATION:
         return (
-            f"the turning of robot and camera goes along with a correlation of "
-            f"{best.correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are not of "
-            "the same motion, or it was too slow"
+            "the turning of robot and camera goes along with a correlation of "
+            f"{matches[0].correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are "
+            "not of the same motion, or it was too slow"
         )
     if not fits:
-        return "camera and robot move alike at no offset: are these the times of the images?"
+        return (
+            "camera and robot turn alike, but move alike at no offset: are these the times of the "
+            "images, and are the poses read as they are meant (visioncal convert --guess)?"
+        )
     if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
             "the motion is too even: it determines the offset to "

@@ -17,7 +17,6 @@ from visioncal.calibration.stages.clock_offset import (
     LEAST_CORRELATION,
     ClockedViews,
     ClockPair,
-    change_doubt,
     motion_notes,
     offset_doubts,
     speed_words,
@@ -39,7 +38,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
+from visioncal.estimation.clock import ClockFit, clear_fit, fit_offset, fit_readout
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects.clock import clock_effect
@@ -65,11 +64,6 @@ _STATED_SIGMA_S = 1e-3
 _SHOW_OFFSET = Remedy(
     "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
 )
-_SPARED = "not needed: slower views stand for it, at the same places"
-_NO_TIME = "no pose of the robot: neither a pose nor a time is there"
-_BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
-_IN_A_GAP = "no pose of the robot: samples of its stream are missing around that time"
-_IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
 # Up to this number all views are used; of more, slow ones.
 _MANY_VIEWS = 60
 
@@ -192,8 +186,8 @@ class _Sweep:
         return self.frames(clear if 2 * len(clear) > len(free) else free)
 
 
-def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
-    """Gives views their poses at the best available offset; `change` is what was corrected."""
+def _clocked(sweep: _Sweep) -> ClockedViews:
+    """Gives views their poses at the best available offset."""
     flange, stated_s, views = sweep.motion.flange, sweep.stated_s, sweep.waiting
     frames = sweep.fitted_frames(views)
     matches = turning_matches(flange, frames, stated_s or 0.0)
@@ -203,58 +197,28 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
     starts = [match.offset_s for match in sound] + ([] if stated_s is None else [stated_s])
     fits = fit_offset(flange, frames, starts) if sound else ()
     fit = clear_fit(fits, stated_s)
-    changed = None if fit is None or change else clock_change(flange, frames, fit)
-    if changed is not None:
-        stamped = tuple(
-            view
-            if view.stamp_s is None
-            else replace(
-                view,
-                numbers={
-                    **view.numbers, "stamp_s": changed.corrected(np.array([view.stamp_s])).item()
-                },
-            )
-            for view in sweep.views
-        )  # fmt: skip
-        return _clocked(replace(sweep, views=stamped), change_doubt(changed, views))
-    correlation = max((match.correlation for match in matches), default=None)
     clock = ClockResult(
         camera_minus_robot_s=stated_s or 0.0,
         method="rest",
         stated_s=stated_s,
-        correlation=correlation,
+        correlation=matches[0].correlation if matches else None,
     )
-    warnings = () if change is None else (change,)
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
         delayed = fit_readout(flange, frames, sweep.camera, fit)
         shutter = None if delayed is None else delayed.shutter
         is_rolling = shutter is not None and shutter.is_rolling
         fit = delayed if delayed is not None and is_rolling else fit
-        offset_s = fit.offset_s
-        nearby = min(sound, key=lambda match: abs(match.offset_s - offset_s))
         clock = replace(
             clock,
-            camera_minus_robot_s=offset_s,
+            camera_minus_robot_s=fit.offset_s,
             sigma_s=fit.sigma_s,
             method="motion",
             frames=fit.frames,
-            correlation=nearby.correlation,
             shutter=shutter,
         )
         notes = tuple(motion_notes(clock, sweep.motion.name))
-        clocked = _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings), notes)
+        clocked = _at_offset(sweep, clock, tuple(offset_doubts(clock, views)), notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
-    if len(sound) == 1 and frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
-        # By rotation alone, where the chain of frames does not close.
-        (match,) = sound
-        clock = replace(
-            clock,
-            camera_minus_robot_s=match.offset_s,
-            sigma_s=match.sigma_s,
-            method="turning",
-            correlation=match.correlation,
-        )
-        return _at_offset(sweep, clock, (*offset_doubts(clock, views), *warnings))
     return _undetermined(sweep, clock, why_undetermined(fits, matches))
 
 
@@ -288,7 +252,8 @@ def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
     kept = tuple(view for view in sweep.views if view.number not in moving)
     warnings = (Finding("clock", words, _SHOW_OFFSET),)
     clocked = _at_offset(replace(sweep, views=kept), clock, warnings)
-    rejected = (Rejection(view, _IN_MOTION) for view in sorted(moving))
+    reason = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
+    rejected = (Rejection(view, reason) for view in sorted(moving))
     return replace(clocked, rejections=(*clocked.rejections, *rejected))
 
 
@@ -314,32 +279,21 @@ def _at_offset(
     rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][selected]), strict=True))
     if clock.method != "rest":
         notes = (*notes, speed_words(clock, speeds[selected], len(inside)))
-    first_s, last_s = flange.stamps_s[[0, -1]]
-    outside = zip(views, at_s, covered, strict=True)
-    lost = {
-        view.number: _IN_A_GAP if first_s <= view_s <= last_s else _BEYOND
-        for view, view_s, is_covered in outside
-        if not is_covered
-    }
-    # Of a sweep that is longer than the stream, the rest is no loss.
-    beyond = {key for key, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
-    spared = {view.number: _SPARED for view in inside if view.number not in rows}
-    untimed = {
-        view.number
-        for view in sweep.views
-        if view.stamp_s is None and view.base_from_flange() is None and view.joints_rad is None
-    }
-    lost |= dict.fromkeys(untimed, _NO_TIME)
+    reason = "no pose of the robot: its stream has no samples around that time"
+    lost = [view.number for view, ok in zip(views, covered, strict=True) if not ok]
+    redundant = "not needed: slower views stand for it, at the same places"
+    spared = {view.number: redundant for view in inside if view.number not in rows}
     return ClockedViews(
         clock,
         tuple(
             replace(view, numbers={**view.numbers, **rows.get(view.number, {})})
             for view in sweep.views
-            if view.number in rows or not (lacks_robot_state(view) or view.number in untimed)
+            if view.number in rows or not lacks_robot_state(view)
         ),
         {} if clock.method == "rest" else dict(zip(taken, speeds[selected], strict=True)),
-        tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
-        spared | dict.fromkeys(beyond, _BEYOND),
+        # Of a long sweep they are no loss.
+        () if len(views) > _MANY_VIEWS else tuple(Rejection(view, reason) for view in lost),
+        spared | (dict.fromkeys(lost, reason) if len(views) > _MANY_VIEWS else {}),
         warnings,
         notes,
     )
@@ -395,10 +349,7 @@ def clock_effects(
 ) -> tuple[Effect, ...]:
     """Errors of clock offsets and readout times [s], as effects on the cell's rows.
 
-    Args:
-        cell: The cell.
-        clocks: The clocks of pairs.
-        erring: Names in the problem of robots whose arm errors are unknowns of the fit.
+    `erring` are names in the problem of robots whose arm errors are unknowns of the fit.
     """
     effects: list[Effect] = []
     for pair, clocked in clocks.items():
