@@ -154,6 +154,17 @@ def test_pictures_that_were_stored_anew_are_copies():
     assert finding.words.startswith("Views 6 to 11 repeat 0 to 5: ")
 
 
+def test_a_film_of_a_few_stops_is_so_many_views():
+    _, session = of_one_camera(8, stops=True)
+    shown = session.corner_table
+    # The arm was still moving when the fourth image was taken.
+    px = shown.px + 3.0 * (shown.views == 3)[:, None]
+    found = calibrate(replace(session, corner_table=replace(shown, px=px)))
+    kept = {view.view for view in found.views if view.used or "mean" not in view.reason}
+    assert kept == {8 * stop for stop in range(12)} | {3}
+    assert found.views[1].reason == "counts in the mean of view 0, of its stop"
+
+
 @pytest.mark.slow
 def test_still_boards_seen_often_outvote_no_robot():
     """Most rows are of still cameras and a still board, and agree best of all."""

@@ -11,7 +11,7 @@ from visioncal.calibration.stages.detect import Detections, detect, image_of
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
-from visioncal.calibration.stages.repeats import listed, without_repeats
+from visioncal.calibration.stages.repeats import listed, with_stop_means, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import figure
@@ -87,7 +87,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             if (at := corners.get(view.number)) is not None
         }
         seen = seen.with_camera(frame, CameraObservations(table, numbered, resolution))
-    return without_repeats(seen)
+    return with_stop_means(without_repeats(seen))
 
 
 def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple[T, Detections]:

@@ -25,6 +25,11 @@ T = TypeVar("T", bound=Observed)
 # Corners of two exposures of one scene differ by the camera's noise in some corner, by more than
 # this [px]; a picture that was stored anew in another file does not.
 _APART_PX = 0.01
+# Images of one stop that are enough for a mean, and the greatest distance of half of the corners of
+# one of them from that of most [px]: beyond, the arm did not stand still.
+_MANY, _STANDING_PX = 4, 0.5
+# Fewest stops of a camera whose images are averaged: those of fewer are too few views then.
+_FEWEST_STOPS = 3
 
 
 def without_repeats(seen: T) -> T:
@@ -58,6 +63,70 @@ def without_repeats(seen: T) -> T:
     )
     repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
     return replace(seen, repeats=repeats).noting((), (finding,))
+
+
+def with_stop_means(seen: T) -> T:
+    """Takes the mean of the corners of many images of a board at one stop of a camera.
+
+    They share the errors of arm, lens and print, and differ by noise alone. The first view stands
+    for all: a film of twelve stops is calibrated as twelve views.
+    """
+    groups = defaultdict(list)
+    try:
+        for row in seen.timed.observations:
+            if not row.view.is_of_lens:
+                at = row.seer, row.seen, row.station, row.view.holdout
+                groups[at].append(row.view.number)
+    except DataError:
+        return seen
+    joined = dict[int, int]()
+    for frame, look in seen.cameras.items():
+        corners = dict(look.corners)
+        shown = [
+            [look.corners[view] for view in views if view in look.corners]
+            for (seer, *_), views in groups.items()
+            if seer == frame
+        ]
+        for own in shown if sum(map(bool, shown)) >= _FEWEST_STOPS else ():
+            if len(own) >= _MANY:
+                mean, others = _mean_of(own)
+                corners[mean.view] = mean
+                joined |= dict.fromkeys(others, mean.view)
+        left = {view: found for view, found in corners.items() if view not in joined}
+        seen = seen.with_camera(frame, replace(look, corners=left))
+    means = {
+        view: f"counts in the mean of view {first}, of its stop" for view, first in joined.items()
+    }
+    return replace(seen, repeats={**seen.repeats, **means})
+
+
+def _mean_of(images: Sequence[Corners]) -> tuple[Corners, list[int]]:
+    """Mean of the images of one stop, as the first of them, and the other views that are in it."""
+    ids = np.unique(np.concatenate([image.ids for image in images]))
+    px, weights = np.full((len(images), len(ids), 2), np.nan), np.zeros((len(images), len(ids)))
+    for at, image in enumerate(images):
+        places = np.searchsorted(ids, image.ids)
+        px[at, places], weights[at, places] = image.px, 1.0
+        if image.weights is not None:
+            weights[at, places] = image.weights
+    middle = np.nanmedian(px, axis=0)
+    away = np.nanmedian(np.linalg.norm(px - middle, axis=2), axis=1)
+    standing = np.flatnonzero(away < _STANDING_PX)
+    count = np.isfinite(px[standing, :, 0]).sum(axis=0)
+    seen = 2 * count > len(standing)
+    if len(standing) < _MANY or not seen.any():
+        return images[0], []
+    first = images[standing[0]]
+    # Stated noise is that of one image.
+    is_stated = first.stated_px is not None or first.weights is not None
+    total = np.sqrt(np.sum(weights[standing][:, seen] ** 2, axis=0))
+    mean = replace(
+        first,
+        ids=ids[seen],
+        px=np.nanmean(px[standing][:, seen], axis=0),
+        weights=total if is_stated else None,
+    )
+    return mean, [images[at].view for at in standing[1:].tolist()]
 
 
 def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int, int]:
