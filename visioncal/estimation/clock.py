@@ -1,7 +1,8 @@
 """Clock offset between camera and robot, from a motion that both recorded.
 
 Starting where both rotate alike, the offset is one more unknown of the chain of frames: it moves
-the flange along its trajectory. Where frames have corners, so is the readout time of the images.
+the flange along its trajectory. Where frames have corners, so is the readout time of the images. A
+change of the offset is found by what each frame alone would have.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ import numpy as np
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, FloatArray, Mask
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import (
     FEWEST_FRAMES,
@@ -41,7 +42,7 @@ from visioncal.estimation.trajectory import Trajectory
 
 # Frames for a start; most frames of a fit; most with dozens of corners each.
 _START_FRAMES, _MOST_FRAMES, _MOST_STACKED = 60, 1200, 400
-# False alarms, per sweep, of a readout time.
+# False alarms, per sweep, of a readout time and of changes of the offset.
 _FALSE_ALARM = 1e-4
 _ROUNDS, _CONVERGED_S = 12, 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
@@ -49,8 +50,14 @@ _OUTLYING = 4.0
 # Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
 # test.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# Ratio of residual noise, rotations times positions, up to which fits are equally good.
-_ALIKE = 1.2
+# Most frames whose own offset is estimated.
+_MOST_OWN = 600
+# Ratio of residual noise, rotations times positions, up to which fits are equally good; share to
+# which a change of the offset must reduce it.
+_ALIKE, _CLEARLY_LESS = 1.2, 0.9
+# A change is refined for this number of rounds at most, or until its step is below this share of
+# its sigma.
+_REFINING, _SETTLED = 6, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +74,25 @@ class ClockFit:
     def residual(self) -> float:
         """Residual noise of rotations times positions, as the likelihood has it."""
         return float(self.fit.noise.robots.prod())
+
+
+@dataclass(frozen=True)
+class ClockChange:
+    """Step or drift of a clock offset."""
+
+    from_s: float  # Camera time of the step, or of the start of the drift [s].
+    step_s: float  # Increase of the offset [s]; of a drift, per second.
+    sigma_s: float  # Its standard deviation.
+    is_drift: bool  # Whether the offset grows steadily.
+
+    def shares(self, stamps_s: FloatArray) -> FloatArray:
+        """(m,) change of the offset at some times [s], in units of `step_s`."""
+        later_s = stamps_s - self.from_s
+        return later_s if self.is_drift else (later_s >= 0.0).astype(float)
+
+    def corrected(self, stamps_s: FloatArray) -> FloatArray:
+        """(m,) times by a clock without the change [s]."""
+        return np.asarray(stamps_s - self.step_s * self.shares(stamps_s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +201,104 @@ def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | No
     return next(iter(rivals), None)
 
 
+def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
+    """Finds a step of the offset at any frame, or a steady drift; None where noise explains it.
+
+    Means of the frames' own offsets over stretches of time are taken as independent; their residual
+    scatter is the noise of the test (of a change point; Page 1955). A fit to both sides of a step
+    is biased, so that the step is refined in a few rounds.
+    """
+    chosen, own_s, weights = _own_offsets(robot, frames, fit)
+    change = _tested_change(frames.stamps_s[chosen], own_s, weights)
+    if change is None:
+        return None
+    for _ in range(_REFINING):
+        corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
+        fits = fit_offset(robot, corrected, [fit.offset_s])
+        if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
+            return None
+        if frames.stack is not None:
+            # A rolling shutter follows the motion, and would be taken for the clock's change.
+            break
+        chosen, own_s, weights = _own_offsets(robot, corrected, fits[0])
+        more_s, sigma_s, _ = _fit_slope(change.shares(frames.stamps_s[chosen]), own_s, weights)
+        change = replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
+        if abs(more_s) < _SETTLED * sigma_s:
+            break
+    return change
+
+
+def _tested_change(
+    times_s: FloatArray, own_s: FloatArray, weights: FloatArray
+) -> ClockChange | None:
+    """The most significant step or drift of frames' own offsets (m,) [s]."""
+    stretch_of = _stretches(times_s)
+    information = np.bincount(stretch_of, weights).astype(float)
+    valid = information > 0.0
+    if np.sum(valid) < _FEWEST_STRETCHES:
+        return None
+    information = information[valid]
+    means, times = (
+        np.bincount(stretch_of, weights * values)[valid] / information
+        for values in (own_s, times_s)
+    )
+    columns = [times - times[0], *((times >= middle).astype(float) for middle in times[2:-1])]
+    scored = [_fit_slope(column, means, information) for column in columns]
+    best = int(np.argmax([square for _, _, square in scored]))
+    step_s, sigma_s, square = scored[best]
+    if square < f_limit(_FALSE_ALARM / len(scored), 1, len(means) - 2):
+        return None
+    if best == 0:
+        return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
+    # The most significant frame within the neighbouring stretches.
+    nearby = times_s[(times_s >= times[best]) & (times_s <= times[best + 2])]
+    scores = [_fit_slope((times_s >= at).astype(float), own_s, weights)[2] for at in nearby]
+    return ClockChange(float(nearby[int(np.argmax(scores))]), step_s, sigma_s, is_drift=False)
+
+
+def _own_offsets(
+    robot: Trajectory, frames: ImageTimes, fit: ClockFit
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Some frames (m,), the change of the offset that each alone would have [s], its information.
+
+    Frames that no offset explains have no information.
+    """
+    chosen = evenly(len(frames), _MOST_OWN)
+    margin_s = 0.5 * robot.speed_window_s
+    chosen = chosen[robot.covers(frames.stamps_s[chosen] - fit.offset_s, margin_s)]
+    problem = clock_problem(robot, frames.only(chosen), fit.offset_s)
+    linear = problem.linear(State(fit.fit.state.edges, problem.start_values))
+    columns = np.concatenate([linear.jacobian[:, :, -1:], linear.residuals[:, :, None]], axis=2)
+    blocks = problem.total_covariance(linear, fit.fit.noise)
+    products = np.swapaxes(columns, 1, 2) @ np.linalg.solve(blocks, columns)
+    information, gradient = np.maximum(products[:, 0, 0], 1e-12), products[:, 0, 1]
+    remaining = products[:, 1, 1] - gradient**2 / information
+    outlier = remaining > _OUTLYING**2 * float(np.median(remaining))
+    return chosen, -gradient / information, np.where(outlier, 0.0, information)
+
+
+def _stretches(times_s: FloatArray) -> IntArray:
+    """(m,) number of the stretch of time that each belongs to, from 0."""
+    first_s = times_s.min(initial=np.inf)
+    return np.unique((times_s - first_s) // _STRETCH_S, return_inverse=True)[1]
+
+
+def _fit_slope(
+    column: FloatArray, values: FloatArray, weights: FloatArray
+) -> tuple[float, float, float]:
+    """A slope beside a constant by weighted least squares, its sigma, and its F statistic."""
+    total = weights.sum()
+    centred = column - weights @ column / total
+    centred_values = values - weights @ values / total
+    square = float(weights @ centred**2)
+    if square <= 0.0:
+        return 0.0, np.inf, 0.0
+    slope = float(weights @ (centred * centred_values)) / square
+    variance = float(weights @ (centred_values - slope * centred) ** 2) / (len(values) - 2)
+    sigma = float(np.sqrt(variance / square))
+    return slope, sigma, (slope / sigma) ** 2 if sigma > 0.0 else 0.0
+
+
 def _fitted(recorded: _Recorded, offset_s: float, start: State | None = None) -> ClockFit | None:
     """Fits from one start, and once more without outlier frames."""
     clock = _iterated(recorded, offset_s, 0.0, start)
@@ -239,8 +363,7 @@ def _sigmas_s(
     # A direction without information has a very large variance here.
     covariance = covariance_from(fisher_information(problem, fit.state, fit.noise))
     independent = np.diag(covariance)[12:]
-    whole = (stamps_s - stamps_s.min()) // _STRETCH_S
-    stretches = np.unique(whole, return_inverse=True)[1]
+    stretches = _stretches(stamps_s)
     count = int(stretches.max()) + 1
     if count < _FEWEST_STRETCHES:
         return np.sqrt(independent), 6.0 * len(stamps_s)

@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Mask, Rejection
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.clock import ClockFit
+from visioncal.estimation.clock import ClockChange, ClockFit
 from visioncal.estimation.clock_correlation import Match
 from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.results.sections import ClockResult
@@ -131,6 +131,31 @@ def offset_doubts(clock: ClockResult, views: Sequence[View]) -> Iterator[Finding
             f"{figure(1e3 * sigma_s)} ms), which was taken.",
             Remedy("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
+
+
+def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
+    """Finding about a change of the offset between the clocks, with the views' original stamps."""
+    if change.is_drift:
+        how = (
+            f"drifts against the robot's, by {1e6 * change.step_s:+.0f} ppm (sigma "
+            f"{figure(1e6 * change.sigma_s)})"
+        )
+    else:
+        later = [view.number for view in views if (view.stamp_s or 0.0) >= change.from_s]
+        how = (
+            f"jumps against the robot's: from view {(*later, 0)[0]} on it is "
+            f"{1e3 * change.step_s:+.1f} ms (sigma {figure(1e3 * change.sigma_s)} ms) farther "
+            "ahead than before"
+        )
+    return Finding(
+        "clock_changed",
+        f"The camera's clock {how}. The times were taken as they would be without that.",
+        Remedy(
+            "Stamp images and robot by one clock, which no time server sets while it records; then "
+            "record again."
+        ),
+        mahalanobis_sq=(change.step_s / change.sigma_s) ** 2,
+    )
 
 
 def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:

@@ -17,6 +17,7 @@ from visioncal.calibration.stages.clock_offset import (
     LEAST_CORRELATION,
     ClockedViews,
     ClockPair,
+    change_doubt,
     motion_notes,
     offset_doubts,
     speed_words,
@@ -38,7 +39,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.clock import ClockFit, clear_fit, fit_offset, fit_readout
+from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects.clock import clock_effect
@@ -186,8 +187,8 @@ class _Sweep:
         return self.frames(clear if 2 * len(clear) > len(free) else free)
 
 
-def _clocked(sweep: _Sweep) -> ClockedViews:
-    """Gives views their poses at the best available offset."""
+def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
+    """Gives views their poses at the best available offset; `change` is what was corrected."""
     flange, stated_s, views = sweep.motion.flange, sweep.stated_s, sweep.waiting
     frames = sweep.fitted_frames(views)
     matches = turning_matches(flange, frames, stated_s or 0.0)
@@ -197,6 +198,19 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
     starts = [match.offset_s for match in sound] + ([] if stated_s is None else [stated_s])
     fits = fit_offset(flange, frames, starts) if sound else ()
     fit = clear_fit(fits, stated_s)
+    changed = None if fit is None or change else clock_change(flange, frames, fit)
+    if changed is not None:
+        stamped = (view for view in sweep.views if view.stamp_s is not None)
+        stamps_s = {
+            view.number: changed.corrected(np.array([view.stamp_s])).item() for view in stamped
+        }
+        corrected = tuple(
+            replace(view, numbers={**view.numbers, "stamp_s": stamps_s[view.number]})
+            if view.number in stamps_s
+            else view
+            for view in sweep.views
+        )
+        return _clocked(replace(sweep, views=corrected), change_doubt(changed, views))
     clock = ClockResult(
         camera_minus_robot_s=stated_s or 0.0,
         method="rest",
@@ -217,7 +231,8 @@ def _clocked(sweep: _Sweep) -> ClockedViews:
             shutter=shutter,
         )
         notes = tuple(motion_notes(clock, sweep.motion.name))
-        clocked = _at_offset(sweep, clock, tuple(offset_doubts(clock, views)), notes)
+        doubts = (*offset_doubts(clock, views), *([] if change is None else [change]))
+        clocked = _at_offset(sweep, clock, doubts, notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
     return _undetermined(sweep, clock, why_undetermined(fits, matches))
 
