@@ -133,7 +133,7 @@ def test_too_few_views_of_any_board_are_refused():
         *np.flatnonzero(board_numbers(cell) == 0)[:2],
         *np.flatnonzero(board_numbers(cell) == 1)[:2],
     }
-    with pytest.raises(DegenerateError, match="first in 2, second in 2"):
+    with pytest.raises(DegenerateError, match="it takes 3 stops or more"):
         calibrated(without(cell, set(range(len(cell.corners))) - kept))
 
 

@@ -31,13 +31,13 @@ from visioncal.simulation import CellOptions, simulate
 
 
 @lru_cache(maxsize=2)
-def cell_poses(mount):
+def cell_poses(mount, views=14):
     """The poses of a cell with the noise of a fair robot, its lens estimated."""
     return seen_in(
         simulate(
             CellOptions(
                 mount=mount,
-                views=14,
+                views=views,
                 state_intrinsics=False,
                 pixel_sigma_px=0.1,
                 robot_sigma_m=3e-4,
@@ -247,6 +247,15 @@ def test_two_mistakes_at_once_are_named():
     assert is_named(guess, poses), guess.sentence
     assert len(guess.best.hypothesis.changes) == 2
     assert guess.best.hypothesis.robot.reading == Reading("euler-ZYX-deg", "mm")
+
+
+@pytest.mark.parametrize("unit", ["mm", "inch"])
+def test_two_mistakes_are_named_in_few_views(unit):
+    """Fewer than eleven rows are alike in several orders, which are no readings of their own."""
+    poses = cell_poses("eye-in-hand", 8)
+    told = numbers(poses.true_robot, "quaternion-wxyz", unit).read_as(Reading("quaternion-xyzw"))
+    poses = replace(poses, robot=told)
+    assert is_named(guessed(poses), poses)
 
 
 def test_both_sides_in_millimetres_show_by_where_cameras_can_be():

@@ -163,12 +163,14 @@ def search(recording: Recording) -> list[Candidate]:
         that residuals cannot distinguish.
     """
     rows, declared = thinned(recording.common_rows), recording.declared
-    mismatch, plain = _mismatch(recording, rows), [*changes(declared, recording.is_measured)]
+    mismatch = _mismatch(recording, rows)
+    plain = [*changes(declared, recording.is_measured, len(recording.robot))]
     tried = _undone(declared, [*product((None,), plain), *combinations(plain, 2)])
     # Rewritten rotations are tried where no other reading is sure.
     for strange in ([], [*rewritten(recording.robot.rows(rows))]):
         tried += _undone(declared, product((None, *plain), strange))
-        likely = filter(recording.is_likely, _near(tried, [*map(mismatch, tried)], _TURNED))
+        likely = [*filter(recording.is_likely, tried)]
+        likely = _near(likely, [*map(mismatch, likely)], _TURNED) if likely else []
         classes: dict[Hashable, list[Hypothesis]] = {}
         for reading in sorted([declared, *likely], key=lambda item: item.cost):
             of_class = classes.setdefault((reading.chain_class, recording.is_likely(reading)), [])

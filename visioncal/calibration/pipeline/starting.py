@@ -56,6 +56,9 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
     cell = _without_frames(cell, apart)
+    # Without their rows, the robots that saw nothing else are not linked either.
+    while lone := [name for name in cell.tree.branches if name not in cell.connected_frames()]:
+        cell, apart = _without_frames(cell, lone), [*apart, *lone]
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
     untied = tuple(name for name in apart if not branches[name].robot)

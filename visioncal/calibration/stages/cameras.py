@@ -35,11 +35,6 @@ _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
 # [share], by more sigmas than a bent board causes, and the residual falls below this share.
 _DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
 _OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
-# Advice for corners without images.
-COUNTED_BACKWARDS = (
-    "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
-    "are exchanged, or count from the other side where one runs backwards."
-)
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:

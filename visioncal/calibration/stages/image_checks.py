@@ -63,7 +63,10 @@ def empty_rows(session: Session) -> Finding | None:
         "lost_views",
         f"{len(views)} of {count} rows of views.csv have neither an image nor rows in corners.csv: "
         f"view {some_of([*map(str, views)], _LISTED)}.",
-        Remedy("In views.csv, fill in column image of these rows, or delete them."),
+        Remedy(
+            "Write corners.csv again, as a whole; or in views.csv, fill in column image of these "
+            "rows, or delete them."
+        ),
         views,
         until_mm=0.0,
     )
@@ -110,7 +113,7 @@ def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         return None
     counts = f"columns = {board.columns} and rows = {board.rows}"
     step = Remedy(f"In the target's .toml, write {counts}, or name another target.")
-    if board.dictionary:
+    if board.dictionary and board.kind == declared.kind:
         side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
         step = Remedy(
             f"Measure the {side}, and where it is not {mm} mm as declared, change the figure in "

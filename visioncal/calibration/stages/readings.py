@@ -61,18 +61,21 @@ def read_instrument(session: Session) -> Readings:
     """
     rows = [view for view in session.views if view.reading_m is not None]
     _check_unit(rows)
-    instrument, of_point = _instrument(session, rows), Counter(view.point for view in rows)
+    instrument = _instrument(session, rows)
     are_poses = any(view.instrument_from_probe() is not None for view in rows)
-    if are_poses and len(of_point) > 1:
+    of_point = Counter(
+        view.point for view in rows if not are_poses or view.instrument_from_probe() is not None
+    )
+    read_again = [name for name, count in of_point.items() if name and count > 1]
+    names, rejections, used = tuple(read_again or of_point), [], []
+    if are_poses and len(names) > 1:
         raise DataError(
-            f"views.csv: poses of {len(of_point)} probes ({some_of([*of_point])}) were read; one "
-            "is read in a session.",
+            f"views.csv: poses of {len(names)} probes ({some_of(names)}) were read; one is read in "
+            "a session.",
             culprits=["views.csv: point"],
             next_step="Split the session, or leave the columns meas_qx ... out: places of several "
             "points are read.",
         )
-    read_again = [name for name, count in of_point.items() if name and count > 1]
-    names, rejections, used = tuple(read_again or of_point), [], []
     for view in session.views:
         if view.reading_m is None:
             reason = "no reading of the instrument: meas_x_m ... are empty"

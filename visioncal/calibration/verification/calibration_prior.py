@@ -162,7 +162,7 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     values = np.zeros(0) if fit.arm is None else fit.arm.values
     size, count = 6 * len(edges), 6 * len(edges) + len(fit.looks) + len(values)
     if fit.covariance.shape != (count, count) or not np.allclose(
-        fit.covariance[:size, :size], calibration.joint_covariance
+        fit.covariance[:size, :size], calibration.joint_covariance, rtol=1e-6, atol=0.0
     ):
         raise ValueError("covariance is not that of the transforms")
     if stops is not None and not (

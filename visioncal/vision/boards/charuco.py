@@ -81,7 +81,7 @@ class Charuco(Board):
 
     name: ClassVar[TargetKind] = "charuco"
     keys = "columns rows square_m square_sigma_m marker_m dictionary legacy"
-    marks_squares = is_seen_in_part = is_dense = has_quick_search = True
+    is_seen_in_part = is_dense = has_quick_search = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary and legacy."""

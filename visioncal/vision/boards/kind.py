@@ -102,8 +102,6 @@ class BoardKind(ABC):
     unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
     # Whether some of its corners can be detected without the others.
     is_seen_in_part: ClassVar[bool] = False
-    # Whether its markers are in the light squares of a checkerboard.
-    marks_squares: ClassVar[bool] = False
     # Whether tags stand alone, and need white around them that is as wide as one module.
     has_lone_tags: ClassVar[bool] = False
     fewest: ClassVar[int] = 6  # Corners that a view needs, or all of fewer.
