@@ -17,6 +17,7 @@ from support.marks import slow
 
 import visioncal
 from visioncal.calibration.guess import guess_reading
+from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.pipeline.guess_inputs import chain_poses
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
@@ -255,7 +256,10 @@ def test_two_mistakes_are_named_in_few_views(unit):
     poses = cell_poses("eye-in-hand", 8)
     told = numbers(poses.true_robot, "quaternion-wxyz", unit).read_as(Reading("quaternion-xyzw"))
     poses = replace(poses, robot=told)
-    assert is_named(guessed(poses), poses)
+    guess = guessed(poses)
+    assert is_named(guess, poses)
+    tried = changes(guess.declared.hypothesis, is_measured=True, count=8)
+    assert not any("sorted as text" in change.words for change in tried)
 
 
 def test_both_sides_in_millimetres_show_by_where_cameras_can_be():
