@@ -195,7 +195,6 @@ def bending(result):
         weight="model",
         payload_kg=(0.0, 0.0),
         sag_mm=Sag(1.0, 2.0),
-        stops=(),
     )
     return replace(result, elastic=shown)
 

@@ -55,7 +55,7 @@ def test_what_can_be_no_load_is_refused(cells, words):
 
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
     options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
-    with pytest.raises(DegenerateError, match=r"changes \(0 to 5.09858 kg\), and all 12 views"):
+    with pytest.raises(DegenerateError, match="views are all from one pose of the robot"):
         known_of(hung(options, np.repeat(postures(1)[:1], 12, axis=0)))
 
 
