@@ -144,6 +144,20 @@ def test_an_interval_is_about_the_level_that_was_found():
     assert len(looks) <= 9
 
 
+def test_an_interval_ends_where_the_likelihood_rises_steeply():
+    """A small noise beside a known one, ten times as large: flat below, steep above."""
+
+    def profile(logarithm):
+        variance = 1.0 + np.exp(2.0 * logarithm)
+        return 50.0 * (np.log(variance) + 1.01 / variance)
+
+    low, high = profile_interval(profile, 0.1, profile(np.log(0.1)))
+    assert low == 0.0
+    rise = 2.0 * (profile(np.log(high)) - profile(np.log(0.1)))
+    # Sought to 0.02 in its logarithm, over which the rise changes by a tenth.
+    assert rise == pytest.approx(1.96**2, rel=0.15)
+
+
 def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
     rng = np.random.default_rng(0)
     problem = observed(world(rng, stops=8), rng)

@@ -131,6 +131,14 @@ def test_a_mirrored_drawing_is_refused(flip, count):
         fit_points(replace(pairs, nominal=pairs.nominal * flip))
 
 
+def test_a_mirrored_part_that_other_names_nearly_explain_is_mirrored():
+    """A box but for one corner: its corners renamed nearly fit the mirrored one."""
+    drawn = np.array([[x, y, z] for x in (0.0, 0.3) for y in (0.0, 0.2) for z in (0.0, 0.1)])
+    drawn[0] = 0.025, 0.02, 0.0
+    with pytest.raises(DataError, match="mirror image of the drawing"):
+        fit_points(pairs_of(drawn, drawn * [-1.0, 1.0, 1.0]))
+
+
 def test_points_in_one_place_are_refused():
     points = np.tile([0.1, 0.2, 0.3], (4, 1))
     with pytest.raises(DataError, match="do not fit the drawing"):

@@ -380,16 +380,23 @@ def profile_interval(
         lowest = local
 
     def crossing(side: float, limit: float) -> float:
-        width = _FIRST_WIDTH
-        for _ in range(_ITERATIONS):
-            # The root is about linear in the width.
+        inner, outer, width = (0.0, 0.0), None, _FIRST_WIDTH
+        while True:
+            # The root is about linear in the width; between two widths that enclose it.
             root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
-            if width == _WIDEST and root < _SURPRISE_95:
+            if root < _SURPRISE_95:
+                inner = width, root
+            else:
+                outer = width, root
+            if outer is not None:
+                share = (_SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
+                following = inner[0] + share * (outer[0] - inner[0])
+            elif width == _WIDEST:
                 return limit
-            before = width
-            width = min(width * min(_SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
-            if not abs(width - before) >= _EXACT:
-                break
-        return float(np.exp(middle + side * width))
+            else:
+                following = min(width * min(1.1 * _SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
+            if not abs(following - width) >= _EXACT:
+                return float(np.exp(middle + side * following))
+            width = following
 
     return crossing(-1.0, 0.0), crossing(1.0, float(np.exp(middle + _WIDEST)))

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
@@ -279,5 +280,9 @@ def _cause(touches: Touches, fit: GroupFit, culprit: Direction) -> tuple[str, st
         )
     tips = touches.subset(fit.used & touches.are("point"))
     poses = tips.base_from_flange
-    words = Turning.of(poses).words(poses, f"{len(tips)} used touches", "the flange")
+    # Only touches of one point tell the tip.
+    first, second = np.nonzero(np.triu(tips.points[:, None] == tips.points, 1))
+    turns = (invert(poses[second]) @ poses[first])[:, :3, :3]
+    turning = Turning.by(Rotation.from_matrix(turns).as_rotvec()) if len(turns) else None
+    words = (turning or Turning.of(poses)).words(poses, f"{len(tips)} used touches", "the flange")
     return f"{words}, at a scatter of {figure(1e3 * fit.sigma)} mm", _ADVICE

@@ -123,17 +123,20 @@ class PointPairs:
         return float(np.sqrt(np.trace(self.known, axis1=1, axis2=2).mean() / 3.0))
 
 
-def _hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -> int:
+def _hand(
+    measured: FloatArray, nominal: FloatArray, noise_m: float, misfit_m2: float | None = None
+) -> int:
     """1 for points as drawn, -1 for their mirror image, 0 where both fit alike.
 
+    `misfit_m2` is the squared misfit of the points as drawn, where it is known.
     Coplanar points have no handedness: mirrored they are the same points seen from behind, with the
     frame's z axis reversed.
     """
     freedom, floor = 3.0 * len(measured) - 6.0, misfit_by_noise(len(measured), noise_m)
-    as_drawn, flipped = (
-        float(procrustes_residual(measured, points)) + floor
-        for points in (nominal, nominal * [-1.0, 1.0, 1.0])
-    )
+    if misfit_m2 is None:
+        misfit_m2 = float(procrustes_residual(measured, nominal))
+    as_drawn = misfit_m2 + floor
+    flipped = float(procrustes_residual(measured, nominal * [-1.0, 1.0, 1.0])) + floor
     limit = float(f_limit(FALSE_ALARM, freedom, freedom))
     return int(flipped > limit * as_drawn) - int(as_drawn > limit * flipped)
 
@@ -276,7 +279,9 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         )
     noise = float(np.hypot(pairs.known_noise_m, expected_noise_m or 0.0))
     numbering = find_numbering(points.measured, points.drawn, noise)
-    if not numbering.is_wrong and _hand(points.measured, points.nominal, noise) < 0:
+    # Names that are exchanged may explain more than a mirror.
+    in_order = len(points) * numbering.rms_m**2
+    if _hand(points.measured, points.nominal, noise, in_order) < 0:
         raise DataError(
             f"fixture: the measured points are the mirror image of the drawing: as they are they "
             f"fit to {figure(1e3 * numbering.stated_rms_m)} mm only (root mean square).",

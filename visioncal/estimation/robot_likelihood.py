@@ -97,15 +97,11 @@ class RobotLikelihood:
         found = self.model.maximised(logs, low, high, settled, enough)
         return np.exp(found.logs).reshape(start.shape), found.value
 
-    def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
-        """Estimates the robots' levels (r, 2); see `estimate_noise`.
-
-        Returns:
-            The levels, and the negative restricted log-likelihood there.
-        """
+    def levels(self, *, from_above: bool) -> FloatArray:
+        """Estimates the robots' levels (r, 2); see `estimate_noise`."""
         if from_above:
-            return self.white
-        return self._levels(np.maximum(self.before, _ABOVE_NOTHING))
+            return self.white[0]
+        return self._levels(np.maximum(self.before, _ABOVE_NOTHING))[0]
 
     @cached_property
     def white(self) -> tuple[FloatArray, float]:

@@ -178,7 +178,7 @@ def estimate_noise(
     The search for robots' levels starts at the given ones, or above the residuals: from too low a
     start, it may stay there.
     """
-    robots = robot_likelihood(problem, state, noise).levels(from_above=from_above)[0]
+    robots = robot_likelihood(problem, state, noise).levels(from_above=from_above)
     noise = replace(noise, robots=robots)
     if not len(noise.sensors):
         return noise

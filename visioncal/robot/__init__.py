@@ -12,7 +12,6 @@ from visioncal.robot.conversion import (
     parallel_axes,
     table_of,
     with_base,
-    with_joint_offsets,
 )
 from visioncal.robot.files import (
     ROBOT_SUFFIXES,
@@ -79,5 +78,4 @@ __all__ = [
     "table_of",
     "torque_regressor",
     "with_base",
-    "with_joint_offsets",
 ]

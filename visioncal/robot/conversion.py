@@ -158,15 +158,6 @@ def with_base(robot: Robot, parent_from_base: FloatArray) -> Robot:
     return Robot.from_document(document | gravity)
 
 
-def with_joint_offsets(robot: Robot, zeros_rad: FloatArray) -> Robot:
-    """Builds the arm with (n,) offsets added to its reported joint angles [rad]."""
-    added = robot.chain.functions[:, 1] * zeros_rad
-    table = _described(robot)
-    if table is not None and not added[table.prismatic].any():
-        return _of_table(robot, replace(table, theta_rad=table.theta_rad + added))
-    return robot.corrected(functions=np.pad(added[:, None], ((0, 0), (0, 3))))
-
-
 def _described(robot: Robot) -> DHTable | None:
     """The table that describes a robot; None where it has another description."""
     return table_from_document(robot.document) if "convention" in robot.document else None

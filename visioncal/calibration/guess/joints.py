@@ -114,8 +114,7 @@ def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
         declared_reading(robot),
         zeros=np.where(np.arange(robot.joint_count) == joint, zero_rad, 0.0),
         words=f"the zero of {name} (q{joint + 1}_rad) moved by {degrees:.2f} deg",
-        fix=f"Home {name} anew, or add {degrees:.2f} deg to q{joint + 1}_rad; --level offsets "
-        "finds it to the precision of the views.",
+        fix=f"Home {name} anew, or add {degrees:.2f} deg to q{joint + 1}_rad.",
         columns=(joint,),
         # A fitted number explains more by chance.
         cost=1.5,

@@ -150,7 +150,11 @@ def check_joints(observed: T, *, drops: bool) -> T:
             f"The joint angles do not belong to {zero.robot.name} as they are declared. "
             f"{guess.sentence('what the camera sees')}"
         )
-        finding = Finding("misread_joints", words, Remedy(zero.fix))
+        finding = Finding(
+            "misread_joints",
+            words,
+            Remedy(f"{zero.fix} --level offsets finds it to the precision of the views."),
+        )
         observed = observed.noting((), (finding.of(label),))
     return observed
 
