@@ -29,7 +29,6 @@ class Kind:
     hides: tuple[str, ...] = ()
     inflates: tuple[str, ...] = ()  # Sources of errors that it inflates.
     is_doubt: bool = True  # Whether it is a doubt about the result.
-    is_unusable: bool = False  # Whether it is of rows that cannot be used, and reported first.
     leaves_out: bool = False  # Whether it is of views that were left out.
     is_step: bool = False  # Whether it is a sudden step, which inflates all sigmas.
     is_source: bool = False  # Whether it is a source of errors, whose probability is its share.
@@ -66,7 +65,7 @@ _BY_CHAIN = (
 
 _KINDS = (
     # What was seen and read.
-    Kind(MISSING, is_doubt=False, is_unusable=True),
+    Kind(MISSING, is_doubt=False),
     Kind(REPEATED_READINGS, is_doubt=False),
     Kind("repeated_views", FACT),
     Kind("corner_numbers", FACT),

@@ -11,6 +11,8 @@ from visioncal.core.types import FloatArray
 
 # False-alarm probability of findings: one sound session of ten thousand has one by chance.
 FALSE_ALARM = 1e-4
+# Probability that noise alone rejects a row, of all that are compared, or an order of points.
+FALSE_REJECTION = 1e-3
 
 
 def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
-from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, Kind
+from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, MISSING, Kind
 from visioncal.core.number_format import percent, ranges
 from visioncal.core.summaries import html_card
 
@@ -195,7 +195,7 @@ class Verdict:
         causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
         sized = (finding for finding in self.findings if finding.of_kind.size)
         costs = sorted(sized, key=lambda finding: finding.of_kind.size)
-        missing = [finding for finding in self.findings if finding.of_kind.is_unusable]
+        missing = [finding for finding in self.findings if finding.kind == MISSING]
         # Behind a likely cause, and not where the result is of no use.
         of_use = [] if self.status == "bad" else self.findings
         to_correct = [finding for finding in of_use if finding.kind == CALIBRATED_ARM]

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
@@ -42,8 +42,6 @@ from visioncal.estimation.trajectory import Trajectory
 
 # Frames for a start; most frames of a fit; most with dozens of corners each.
 _START_FRAMES, _MOST_FRAMES, _MOST_STACKED = 60, 1200, 400
-# False alarms, per sweep, of a readout time and of changes of the offset.
-_FALSE_ALARM = 1e-4
 _ROUNDS, _CONVERGED_S = 12, 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
@@ -246,7 +244,7 @@ def _tested_change(
     scored = [_fit_slope(column, means, information) for column in columns]
     best = int(np.argmax([square for _, _, square in scored]))
     step_s, sigma_s, square = scored[best]
-    if square < f_limit(_FALSE_ALARM / len(scored), 1, len(means) - 2):
+    if square < f_limit(FALSE_ALARM / len(scored), 1, len(means) - 2):
         return None
     if best == 0:
         return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
@@ -344,7 +342,7 @@ def _iterated(
     sigmas_s, freedom = _sigmas_s(problem, fit, covered.frames.stamps_s, pulls)
     shutter = None
     if covered.camera is not None and len(sigmas_s) > 1:
-        is_clear = (readout_s / sigmas_s[1]) ** 2 > f_limit(_FALSE_ALARM, 1, freedom)
+        is_clear = (readout_s / sigmas_s[1]) ** 2 > f_limit(FALSE_ALARM, 1, freedom)
         line_s = readout_s / (covered.camera.resolution[1] - 1)
         kind: Literal["rolling", "global"] = "rolling" if is_clear else "global"
         shutter = Shutter(kind, readout_s, float(sigmas_s[1]), line_s)

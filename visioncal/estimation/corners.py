@@ -12,15 +12,14 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.vision.camera import project_with_jacobian
 
-# Chi-square test of the stated noise: false alarm in one session of ten thousand, and least ratio,
-# which is the rounding of a noise that is stated with one digit.
-_FALSE_ALARM, _ROUNDED = 1e-4, 1.3
+# Least ratio of noise to what is stated that counts: the rounding of a statement of one digit.
+_ROUNDED = 1.3
 # Exact corners have no noise; a millionth of a pixel keeps their covariance positive definite.
 _LEAST_SIGMA_PX = 1e-6
 
@@ -167,7 +166,7 @@ class CornerStack:
         if self.stated_px is None or freedom < 1:
             return False
         ratio = self.shown_px(residuals, unknowns) / self.stated_px
-        low, high = chi2_limit(np.array([1.0 - _FALSE_ALARM, _FALSE_ALARM]), freedom) / freedom
+        low, high = chi2_limit(np.array([1.0 - FALSE_ALARM, FALSE_ALARM]), freedom) / freedom
         above, below = ratio > max(np.sqrt(high), _ROUNDED), ratio < min(np.sqrt(low), 1 / _ROUNDED)
         return bool(above or below)
 

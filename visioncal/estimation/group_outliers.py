@@ -5,11 +5,10 @@ from math import comb
 
 import numpy as np
 
-from visioncal.core.quantiles import chi2_limit, f_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.linalg import squared_lengths
 from visioncal.estimation.points import (
-    FALSE_ALARM,
     GroupFit,
     Groups,
     Placement,
@@ -113,7 +112,7 @@ def distances(fit: GroupFit) -> Distances:
     # and the inliers were selected for their small level among all sets of their size. Half of the
     # false alarms go to the first excluded group, a quarter to the next.
     excluded = int(np.sum(~fit.used))
-    share = FALSE_ALARM / 2.0**excluded / comb(len(fit.used), excluded)
+    share = FALSE_REJECTION / 2.0**excluded / comb(len(fit.used), excluded)
     positive = np.maximum(directions, 1)
     limit = positive * f_limit(share, positive, max(fit.freedom, 1))
     return Distances(squares, directions, np.where(directions > 0, limit, np.inf))
@@ -168,4 +167,4 @@ def _is_explained(fit: GroupFit, expected_sigma: float) -> bool:
     if fit.freedom < 1:
         return True
     misfit = _misfit(fit.groups.subset(fit.used), expected_sigma)
-    return misfit <= float(chi2_limit(FALSE_ALARM, fit.freedom))
+    return misfit <= float(chi2_limit(FALSE_REJECTION, fit.freedom))

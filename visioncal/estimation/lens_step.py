@@ -6,14 +6,13 @@ tested at each view (Rao's score test), beside the lens common to all.
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.linalg import covariance_from
 
 # Least number of views on either side.
 _FEWEST = 3
-_FALSE_ALARM = 1e-4
 # With an autofocus, or residual errors of the lens model, which are alike in successive views, some
 # cyclic part of the session with another start differs as much. Starts within this many views of
 # the step are the same; most starts tried.
@@ -60,7 +59,7 @@ def lens_step(
     index = int(gains[0].argmax())
     gain = float(gains[0, index])
     noise = (squares - gain) / max(freedom - 3, 1)
-    limit = 3.0 * float(f_limit(_FALSE_ALARM / tried, 3, max(freedom - 3, 1)))
+    limit = 3.0 * float(f_limit(FALSE_ALARM / tried, 3, max(freedom - 3, 1)))
     if freedom <= 3 or gain < limit * noise:
         return None
     first = index + _FEWEST

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.quantiles import chi2_limit, f_limit
+from visioncal.core.quantiles import FALSE_ALARM, FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.problem import Problem
@@ -23,8 +23,6 @@ FEWEST = 3
 _LEAST_SHARE = 0.25
 # Number of observations whose implied change is tried as a candidate.
 _CANDIDATES = 24
-# Shares of sessions in which an inlier is rejected, and in which a frame seems to have moved.
-FALSE_ALARM, FALSE_MOVE = 1e-3, 1e-4
 # Factor on the noise, which a share of the stops underestimates.
 _MARGIN = 2.0
 
@@ -67,7 +65,7 @@ def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
 
 def _noise_limit(among: int) -> float:
     """Limit of the squared distance of noise, for `among` observations."""
-    return _MARGIN**2 * float(chi2_limit(FALSE_ALARM / among, 6))
+    return _MARGIN**2 * float(chi2_limit(FALSE_REJECTION / among, 6))
 
 
 def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
@@ -88,7 +86,7 @@ def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Mov
     least = int(np.argmin(squares))
     tried = len(problem.unknown) * len(np.unique(problem.observations.stops))
     freedom = max(0.5 * (6.0 * len(problem) - problem.size), 6.0)
-    limit = 6.0 * float(f_limit(FALSE_MOVE / tried, 6, freedom))
+    limit = 6.0 * float(f_limit(FALSE_ALARM / tried, 6, freedom))
     return moves[least] if squares[least] < limit else None
 
 

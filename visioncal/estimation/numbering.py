@@ -12,11 +12,10 @@ from math import perm
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.estimation.points import FALSE_ALARM
 from visioncal.estimation.procrustes import align, procrustes_residual
 
 # Most pairs and triples of drawn points that are compared with a measured triangle.
@@ -97,7 +96,7 @@ def find_numbering(
     stated_row = int(np.flatnonzero(moves == 0)[0])
     # Corrected for the number of orders among which the best one was chosen.
     tried = min(perm(len(nominal), count), _MOST_TRIED)
-    limit = f_limit(FALSE_ALARM / tried, freedom, freedom)
+    limit = f_limit(FALSE_REJECTION / tried, freedom, freedom)
     # Exchanging two measurements of one drawn point gives no other order.
     distinct = np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
     return Numbering(

@@ -14,13 +14,12 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.moves import (
-    FALSE_ALARM,
     Move,
     explained_by_noise,
     find_move,
@@ -123,7 +122,7 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     # distribution.
     edges = int(problem.counted[: 6 * len(problem.unknown)].sum())
     freedom = max(0.5 * (float(problem.observations.directions[used].sum()) - edges), 6.0)
-    limit = counted * f_limit(FALSE_ALARM / len(problem), counted, freedom)
+    limit = counted * f_limit(FALSE_REJECTION / len(problem), counted, freedom)
     uneven = np.where(problem.observations.is_uneven, UNEVEN**2, 1.0)
     return Distances(squares, directions, uneven * limit)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.quantiles import f_limit, t_chance
+from visioncal.core.quantiles import FALSE_REJECTION, f_limit, t_chance
 from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
@@ -26,7 +26,6 @@ from visioncal.estimation.numbering import Numbering, find_numbering, misfit_by_
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
 from visioncal.estimation.points import (
-    FALSE_ALARM,
     FEWEST_POINTS,
     GroupFit,
     Placement,
@@ -137,7 +136,7 @@ def _hand(
         misfit_m2 = float(procrustes_residual(measured, nominal))
     as_drawn = misfit_m2 + floor
     flipped = float(procrustes_residual(measured, nominal * [-1.0, 1.0, 1.0])) + floor
-    limit = float(f_limit(FALSE_ALARM, freedom, freedom))
+    limit = float(f_limit(FALSE_REJECTION, freedom, freedom))
     return int(flipped > limit * as_drawn) - int(as_drawn > limit * flipped)
 
 
@@ -330,7 +329,7 @@ def _scale_of(fit: GroupFit) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
     chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
     # A negative scale is no drawing of another size: exchanged names fit like that.
-    return Scale(value, sigma, value > 0.0 and chance < FALSE_ALARM)
+    return Scale(value, sigma, value > 0.0 and chance < FALSE_REJECTION)
 
 
 def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:

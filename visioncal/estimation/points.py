@@ -31,8 +31,6 @@ _ROUNDS = 10
 _CONVERGED = 1e-10
 # Scaled eigenvalue ratio below which a direction is undetermined.
 NULL_RATIO = 1e-8
-# Chance that noise rejects a row, a mirror image, a scale or an order of points.
-FALSE_ALARM = 1e-3
 # Least start of the noise level [m]: it is searched from above.
 _START_SIGMA = 5e-4
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of, stops_of
@@ -19,7 +19,6 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
-    FALSE_MOVE,
     FEWEST,
     explained_by_noise,
     fitted_change,
@@ -207,7 +206,7 @@ def find_steps(
             square, count = float(-gradient[mine] @ value), len(value)
             many = freedom / (kinds if count > 1 else 1)
             limit = count * float(
-                f_limit(FALSE_MOVE / tried[candidate.kind], count, max(0.5 * many, 6.0))
+                f_limit(FALSE_ALARM / tried[candidate.kind], count, max(0.5 * many, 6.0))
             )
             if _as_f_test(square, many, count) < limit or square <= squares.get(at, 0.0):
                 continue

@@ -9,7 +9,7 @@ from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.number_format import figure
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
 from visioncal.estimation.appearance import SCALE, Appearance, Compressed, compress, shape_basis
@@ -23,8 +23,6 @@ from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import GREY, poor_image_reason
 from visioncal.vision.targets import corner_positions, rotations
 
-# Significance of corners that scatter more than the noise.
-_FALSE_ALARM = 1e-4
 # Ratio of scatter to expected noise that warrants a warning; light and distance explain less.
 _MENTIONED = 2.0
 # Largest number of refits without outlier corners.
@@ -86,7 +84,7 @@ def target_pose_candidates(
     freedom = 2 * len(kept.ids) - 6
     warnings: tuple[str, ...] = ()
     scatter_px = float(np.sqrt(squared_sum / freedom))
-    is_larger = squared_sum > noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
+    is_larger = squared_sum > noise_px**2 * float(chi2_limit(FALSE_ALARM, freedom))
     # Rounding of exact corners is no scatter.
     if is_larger and scatter_px >= 1e-6:
         if scatter_px >= _MENTIONED * noise_px:

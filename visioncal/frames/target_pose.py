@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 from visioncal.core.arguments import check_fields, typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.quantiles import chi2_limit, f_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, compose, exp, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Image, IntArray, Mask, Target
 from visioncal.estimation.linalg import covariance_from, squared_lengths
@@ -33,8 +33,6 @@ from visioncal.results import Calibration, Edge
 from visioncal.vision.targets import load_target
 
 Parent: TypeAlias = Literal["base", "flange"]
-# Probability that a set of images loses an inlier.
-_FALSE_ALARM = 1e-3
 # Squared distance beyond which two poses differ significantly.
 _DIFFERENT = float(chi2_limit(0.05, 6))
 # Relative difference below which scores are equal.
@@ -190,7 +188,7 @@ class CandidateViews:
 
         F distributed, since the noise levels are estimated.
         """
-        tail = _FALSE_ALARM / len(self.views)
+        tail = FALSE_REJECTION / len(self.views)
         return 6.0 * float(f_limit(tail, 6, min(self.freedom, 1e6)))
 
 

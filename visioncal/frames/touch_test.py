@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, listed
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import Finding, Remedy
@@ -28,8 +28,6 @@ from visioncal.vision.targets import corner_positions
 READING_MM = 0.1
 # Number of five gaps that may exceed their 95 % prediction by chance.
 _BY_CHANCE = 1
-# Probability that any gap of a sound cell is taken for far beyond its prediction.
-_FALSE_ALARM = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +164,7 @@ def evaluate_gaps(
     )
     beyond = sum(point.gap_mm > point.radius95_mm for point in touched)
     # Errors along one direction have the longest tail for their 95 % radius.
-    limits = chi2_limit(np.array([_FALSE_ALARM / len(points), 0.05]), 1)
+    limits = chi2_limit(np.array([FALSE_REJECTION / len(points), 0.05]), 1)
     by_chance = np.sqrt(limits[0] / limits[1])
     far = any(point.gap_mm > by_chance * point.radius95_mm for point in touched)
     passed = beyond <= _BY_CHANCE and not far
