@@ -42,8 +42,8 @@ class Guess:
     """The reading of the poses that is right, and its rivals."""
 
     declared: Candidate  # The declared reading.
-    # The best readings, best first, with the declared one; each represents all readings that
-    # residuals cannot distinguish from it.
+    # The best reading, the declared one, then others, the likeliest first; each represents all
+    # readings that residuals cannot distinguish from it.
     candidates: tuple[Candidate, ...]
     best: Candidate  # The reading that stands out; the declared one where none does.
     sentence: str  # The finding, with its figures.

@@ -106,18 +106,6 @@ class CellFit:
         values = self.inlier_fit.problem.values_of(LENSES, state)[: len(free)]
         return self.linearised_corners.camera_parameters.with_values(free, values)
 
-    def reprojection_px(self, rows: IntArray, state: State) -> FloatArray:
-        """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
-
-        Args:
-            rows: (m,) indices of the observations.
-            state: The unknowns of this fit, or of one to a subset of the observations.
-        """
-        chosen = np.isin(np.arange(len(self.cell.rows)), rows)
-        poses = self.inlier_fit.problem.subset(chosen).predicted(state)
-        cell_rows = [self.cell.rows[index] for index in rows]
-        return self.pixels(cell_rows, [self.poses[index] for index in rows], poses, state)
-
     def pixels(
         self,
         rows: Sequence[ObservationRow],

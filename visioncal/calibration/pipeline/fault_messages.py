@@ -46,7 +46,6 @@ class Version:
 
     frame: str  # The name of the frame.
     name: str  # Its name in the result: the frame's own for the last.
-    start: int  # The first station of it; -1 for the first version.
 
     @property
     def is_last(self) -> bool:
@@ -58,10 +57,10 @@ def versions(cell_fit: CellFit) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
     versions_by_key = {}
     for frame, parts in _parts(cell_fit).items():
-        for start, key in parts:
-            is_last = (start, key) == parts[-1]
+        for _, key in parts:
+            is_last = key == parts[-1][1]
             until = "" if is_last else f"_until_stop_{_stops_of(cell_fit, key)[-1]}"
-            versions_by_key[key] = Version(frame, f"{frame}{until}", start)
+            versions_by_key[key] = Version(frame, f"{frame}{until}")
     return versions_by_key
 
 
@@ -119,16 +118,13 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
         for name, target in cell_fit.cell.session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
-    mutual, faults = exchanged(agreed.problem, fitting), list[PoseFault]()
-    if cell_fit.cell.mount is not None:
-        faults += _exchanged_views(cell_fit, mutual, set())
-        faults = faults or [*_moved_run(cell_fit)]
-    else:
-        faults += _exchanged_poses(cell_fit, mutual)
-        faults += _exchanged_views(
-            cell_fit, mutual, {row for fault in faults for row in fault.rows}
-        )
+    is_pair, mutual = cell_fit.cell.mount is not None, exchanged(agreed.problem, fitting)
+    faults = [] if is_pair else [*_exchanged_poses(cell_fit, mutual)]
+    faults += _exchanged_views(cell_fit, mutual, {row for fault in faults for row in fault.rows})
+    if not is_pair:
         faults += _wrong_poses(cell_fit, {row for fault in faults for row in fault.rows})
+    elif not faults:
+        faults += _moved_run(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, mutual) for at in outliers.tolist()} | clauses
     return tuple(faults), _reasons(cell_fit, causes)
@@ -269,10 +265,9 @@ def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[Pose
         by_robot = problem.observations_through(problem.tree.flanges[robot])
         last = int(stops[by_robot & used].max(initial=-1))
         wrong = np.unique(stops[by_robot & ~used]).tolist()
-        parts = [[station] for station in wrong if station <= last]
-        if after := [station for station in wrong if station > last]:
-            is_pushed = len(after) >= FEWEST
-            parts += [after] if is_pushed else [[station] for station in after]
+        after = [station for station in wrong if station > last]
+        pushed = [after] if len(after) >= FEWEST else []
+        parts = [[station] for station in wrong if not pushed or station <= last] + pushed
         for part in parts:
             rows = np.flatnonzero(by_robot & np.isin(stops, part))
             if len(rows) < _FEWEST or used[rows].any() or {*explained} & {*rows.tolist()}:

@@ -135,7 +135,6 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
         cell_fit.arms,
         columns_of_boards(cell_fit),
         middle_jacobians(cell_fit),
-        answer.problem,
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
         _strays(answer, explained),
     )

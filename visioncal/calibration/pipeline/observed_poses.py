@@ -1,7 +1,7 @@
 """Observations of one camera and one robot with given lens, boards and arm."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Self
 
@@ -25,8 +25,6 @@ class ObservedPoses(Observed):
 
     # Which of the session's boards the problem contains, the reference board first.
     boards: tuple[int, ...] = (0,)
-    # (4, 4) edges of the camera and the boards, by frame.
-    frames: Mapping[str, FloatArray] = field(default_factory=dict)
     used: tuple[int, ...] = ()  # The views in the problem, in the session's order.
     # Lens and boards with their free values; None without corners.
     free: LensBoardParameters | None = None

@@ -180,8 +180,6 @@ class PickInputs:
     board_columns: IntArray  # The problem's columns of boards' shapes.
     # (3, b) Jacobian of each target's middle for these columns, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
-    # The observations of all pairs, merged or not, that the fit was made from.
-    full_problem: Problem
     # Relative change of the focal length of each camera from image to image.
     jitters: Mapping[str, float]
     # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.
@@ -213,7 +211,7 @@ def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
     if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
         return None
     state, noise = fitted.fit.state, fitted.fit.noise
-    return arm.errors.sigma * misfit_jacobian(fitted.full_problem, state, noise, robot, arm.errors)
+    return arm.errors.sigma * misfit_jacobian(fitted.problem, state, noise, robot, arm.errors)
 
 
 def _subset(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:

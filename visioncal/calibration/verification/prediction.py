@@ -166,25 +166,24 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
     mount, targets = observed.session.mount, tuple(prior.targets.values())
     x, *boards = prior.state.edges
     order = {board: at for at, board in enumerate(prior.boards)}
-    views, chosen = [], []
-    for view in (view.number for view in observed.session.views):
-        poses = observed.poses.get(view)
-        if poses is None or poses.board not in order:
-            continue
-        if view not in observed.base_from_flange or view in observed.reasons:
-            continue
-        robot = robot_part(observed.arm_at([view]).poses, mount)[0]
-        predicted = invert(robot @ x) @ boards[order[poses.board]]
-        views.append(view)
-        chosen.append(poses.nearest(predicted, targets[poses.board] if targets else None))
+    poses, posed = observed.poses, observed.base_from_flange.keys() - observed.reasons.keys()
+    numbers = (view.number for view in observed.session.views)
+    views = [view for view in numbers if view in poses and poses[view].board in order]
+    views = [view for view in views if view in posed]
     if not views:
         raise DataError(
             f"session {observed.session.name!r}: no view shows the target from a known pose of the "
             "robot.",
             culprits=observed.lost_views,
         )
+    chosen = []
+    robots = robot_part(observed.arm_at(views).poses, mount)
+    for view, robot in zip(views, robots, strict=True):
+        board = poses[view].board
+        predicted = invert(robot @ x) @ boards[order[board]]
+        chosen.append(poses[view].nearest(predicted, targets[board] if targets else None))
     observed = replace(observed, used=tuple(views), boards=prior.boards, free=prior.free)
-    observed = replace(observed, frames=observed.framed(prior.state.edges)).posed(chosen)
+    observed = observed.posed(chosen)
     if observed.free is not None and all(view.corners is not None for view in chosen):
         observed = observed.with_noise(_noise_px(observed)).posed(chosen)
     return observed

@@ -266,7 +266,6 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     board = max(dict.fromkeys(shown), key=shown.count)
     chosen = [view for view in sorted(views) if run.poses[view].board == board]
     observed = replace(observed, boards=(board,), used=tuple(chosen))
-    observed = replace(observed, frames=observed.framed(np.stack([guess.x, guess.z])))
     robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
     target = tuple(run.session.boards.values())[board]
     poses = [
@@ -283,7 +282,7 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     problem = observed.problem(chosen)
     return _RecordedStart(
         problem,
-        problem.start(observed.frames),
+        problem.start(observed.framed(np.stack([guess.x, guess.z]))),
         _TYPICAL,
         observed.free or free,
         observed.arm_at_stops,
