@@ -74,7 +74,7 @@ def test_they_are_found_and_make_the_arm_better_where_it_never_was(shop, known):
     kinematics = known.robot_arm.kinematics
     assert kinematics.level == FUNCTIONS
     # One size from some hundred values, a length from a grid of factors of two.
-    assert kinematics.functions.sigma_rad == pytest.approx(3e-4, rel=0.4)
+    assert kinematics.errors["harmonics"].sigma == pytest.approx(3e-4, rel=0.4)
     assert 0.12 <= kinematics.functions.length_rad <= 0.5
     without = known_of(session_of(shop), level="offsets")
     ours, theirs = (float(np.sqrt(np.mean(away_m(shop, value) ** 2))) for value in (known, without))

@@ -46,7 +46,7 @@ from visioncal.simulation.layout import (
 DATA = Path(__file__).parents[1] / "data"
 REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 
-IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
+TO_HAND = "eye-to-hand"
 _PLAIN = CellOptions()
 _FINE = replace(_PLAIN, camera=fine_camera(), pixel_sigma_px=0.1)
 _OPEN = replace(_PLAIN, state_intrinsics=False, pixel_sigma_px=0.1)

@@ -49,9 +49,9 @@ FLANGE_FROM_TOOL = RigidTransform.from_components(
 )
 # A fixture of which one point alone was touched: its axes are the base's by declaration.
 BASE_FROM_FIXTURE = RigidTransform.from_translation([-0.62, -0.05, 0.02])
-# The touch of the tool that is not used, with its reason, and one that is used in doubt.
+# The touch of the tool that is not used, with its reason, and that of one that is used in doubt.
 WRONG_TOUCH, WRONG_REASON = "17", "it is 6.4 mm off: the tip slipped, or <i>another</i> point"
-DOUBTFUL_TOUCH, DOUBT = "14", "it is 0.9 mm off, three times the others"
+DOUBT = "it is 0.9 mm off, three times the others"
 
 
 @dataclass(frozen=True)

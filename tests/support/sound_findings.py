@@ -9,7 +9,6 @@ from visioncal.calibration.suspects.judged import (
     PointAccuracy,
     Sensor,
 )
-from visioncal.core.types import Rejection
 from visioncal.estimation.observability import Direction
 from visioncal.results import HELD_BACK, ViewResult
 
@@ -68,12 +67,3 @@ def changed(findings, **changes):
             (now,) = getattr(findings, name)
             changes[name] = (replace(now, **mine),)
     return replace(findings, **changes)
-
-
-def left_out(numbers, count=20):
-    """Findings of views of which some disagree with the others."""
-    seen = [replace(view, used=view.view not in numbers) for view in views(count)]
-    out = [Rejection(at, f"disagrees with the other views: view {at}'s figures") for at in numbers]
-    pair = replace(PAIR, views=seen, outliers=out)
-    sensor = replace(SENSOR, used=count - len(out), lost=out, outliers=[*numbers])
-    return replace(SOUND, pairs=(pair,), sensors=(sensor,))

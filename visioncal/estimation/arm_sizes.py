@@ -310,7 +310,6 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     functions = JointFunctions(
         np.tile(np.repeat([share, *waves.sizes[1:]], 2), joints),
         expanded.reshape(2 * joints * orders, -1) @ determined,
-        block.sigma,
         waves.length_rad,
         2.0 * (rest.most_likely(logs).value - best.value),
     )

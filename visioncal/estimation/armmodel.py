@@ -33,7 +33,6 @@ class JointFunctions:
     # (2 n k, r) Jacobian of these by the block's values: combinations that the observations
     # determine. What it does not span keeps its prior.
     directions: FloatArray
-    sigma_rad: float  # Their size [rad].
     length_rad: float  # Their correlation length over the joint angle [rad].
     gain: float  # Twice the gain in log-likelihood over the same arm without them.
 

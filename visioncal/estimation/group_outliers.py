@@ -147,9 +147,9 @@ def _doubtful(problem: PointProblem, fit: GroupFit) -> Mask:
         used[excluded] = True
         refit = fit_groups(problem, used, fit.state)
         inside = refit.groups.subset(used)
-        left = np.full(len(used), np.inf)
-        left[used] = _misfit(inside, refit.sigma) - distances(refit).squares[used]
-        least = max(left[excluded], np.finfo(float).eps * _misfit(inside, refit.sigma))
+        left, total = np.full(len(used), np.inf), _misfit(inside, refit.sigma)
+        left[used] = total - distances(refit).squares[used]
+        least = max(left[excluded], np.finfo(float).eps * total)
         rivals = fit.used & (left < least * _ODDS ** (2.0 / max(fit.freedom, 1)))
         if rivals.any():
             doubtful |= rivals

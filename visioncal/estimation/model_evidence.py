@@ -180,8 +180,9 @@ def _whitened(
     """Whitens for factors on the noise and shares of it that do not repeat, at (p,) values."""
     without, count, again = undone(problem, cause, values), len(problem), belief.repeated
     linear = without.linear(with_change(belief.state, cause))
-    by_cause = linear.jacobian[:, :, len(belief.covariance) :].reshape(6 * count, len(values))
-    by_unknowns = linear.jacobian[:, :, : len(belief.covariance)]
+    jacobian, known = linear.jacobian, len(belief.covariance)
+    by_cause = jacobian[:, :, known:].reshape(6 * count, len(values))
+    by_unknowns = jacobian[:, :, :known]
     repeats = np.zeros(0, dtype=np.int64) if again is None else again.repeats
     rows = np.append(np.arange(count), repeats)
     stops = problem.observations.stops if again is None else again.stops

@@ -293,8 +293,9 @@ def _refuse_open(
     """Refuses frames that are not determined, by the first of them."""
     covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     found = directions(problem, state, covariance, words.names)
-    least = _OPEN if only_open else 0.0
-    beyond = [(frame, item) for frame, item in found if item.sigma > max(item.limit, least)]
+    beyond = [
+        pair for pair in found if (pair[1].is_open if only_open else pair[1].sigma > pair[1].limit)
+    ]
     if beyond:
         frame, worst = beyond[0]
         raise DegenerateError(

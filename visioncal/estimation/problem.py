@@ -241,7 +241,7 @@ class Problem:
         """(n,) mask of measured poses with one flange error, shared by no other observation."""
         of, members = self.units
         count = np.bincount(of[of >= 0], minlength=len(members))
-        single = (count == 1) & (members >= 0).any(axis=1) & (members[:, 1:] < 0).all(axis=1)
+        single = (count == 1) & (members[:, 1:] < 0).all(axis=1)
         alone = (of >= 0) & self.observations.has_rotation
         alone[alone] = single[of[alone]]
         return alone

@@ -84,23 +84,23 @@ def trimmed_start(
     away: Callable[[State], FloatArray],
     solve: Callable[[Mask, State], State],
     count: int,
-    followed: int = 5,
 ) -> tuple[Mask, State]:
     """Least-trimmed-squares start: the units nearest to the state that they determine.
+
+    The five best starts are refined by concentration steps.
 
     Args:
         starts: States to try, of all units and of small sets.
         away: Distances (m,) of all units under a state, in any unit.
         solve: Solves from the units of an (m,) mask, near a state.
         count: Number of units taken for inliers.
-        followed: Number of starts refined by concentration steps, best first.
 
     Returns:
         (m,) mask of these units, and their state.
     """
     candidates = [(start, away(start)) for start in starts]
     candidates.sort(key=lambda pair: trimmed_sum(pair[1], count))
-    refined = [_concentrated(*pair, away, solve, count) for pair in candidates[:followed]]
+    refined = [_concentrated(*pair, away, solve, count) for pair in candidates[:5]]
     return min(refined, key=lambda pair: pair[0])[1:]
 
 

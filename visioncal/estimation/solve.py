@@ -206,8 +206,9 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     whitening = Whitening.of(problem, noise, linear.by_errors)
     information, gradient, _ = whitening.equations(problem, state, linear)
     fitted = covariance_among(information, problem.moving)
-    left = linear.residuals[:, :, None] - linear.jacobian @ (fitted @ gradient)[:, None]
-    pulled, weighted = whitening.inverse(left), whitening.inverse(linear.jacobian)
+    jacobian = linear.jacobian
+    left = linear.residuals[:, :, None] - jacobian @ (fitted @ gradient)[:, None]
+    pulled, weighted = whitening.inverse(left), whitening.inverse(jacobian)
     remaining = whitening.weights - np.swapaxes(whitening.taken, 1, 2) @ whitening.taken
     remaining -= weighted @ fitted @ np.swapaxes(weighted, 1, 2)
     squares = np.sum(pulled * (own @ pulled), axis=(1, 2))

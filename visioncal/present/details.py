@@ -75,7 +75,7 @@ def details(document: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str
             yield from details(value, path)
             continue
         digits = 6 if path in _RATIOS else 2 if "sigma" in path else 4
-        text = _text(value, digits, ", ")
+        text = _text(value, digits)
         if text:
             # The keys of points are their names; the unit is that of their parent.
             suffix = _suffix(parent if parent in _LABELS else name)
@@ -88,7 +88,7 @@ def _suffix(key: str) -> str:
     return next((unit for unit in _UNITS if key.endswith(unit)), "")
 
 
-def _text(value: object, digits: int, separator: str) -> str:
+def _text(value: object, digits: int) -> str:
     """A detail as text; empty if it is not for display."""
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -99,5 +99,5 @@ def _text(value: object, digits: int, separator: str) -> str:
     if isinstance(value, Sequence) and all(
         isinstance(number, int | float | str) for number in value
     ):
-        return separator.join(_text(number, digits, separator) for number in value)
+        return ", ".join(_text(number, digits) for number in value)
     return ""

@@ -274,8 +274,8 @@ class ElasticResult(Section):
     weight: str  # Whether the links' weight is from the model's masses, or unknown.
     payload_kg: tuple[float, float]  # Smallest and largest payload [kg].
     sag_mm: Sag  # Flange deflection under the loads of the stops.
-    # (n, 4 n) compliance times unknown masses and first moments of links (see `robot.bent_joints`);
-    # None where the masses are known, or have little effect.
+    # (n, 4 n) compliance times unknown masses and first moments of links (see
+    # `robot.deflected_joints`); None where the masses are known, or have little effect.
     weight_moments: Matrix | None = None
     # Ratio of the effective payload and force to the stated ones; None where there was no payload.
     payload_factor: Factor | None = None

@@ -35,8 +35,6 @@ class Mistake:
     names: str
     options: CellOptions = _CELL  # What the cell is otherwise like.
     joints: bool = False  # Whether its table has joint angles, and its session.toml a robot.
-    # Whether the fix can be typed here; what takes a new recording is only advised.
-    is_mended: bool = True
 
 
 @cache
@@ -353,8 +351,8 @@ BROKEN: Mapping[str, Mistake] = {
     ),
     # The images and the board.
     "two images missing": Mistake(_deleted, "images/004.png|missing|two images|2 of 15"),
-    "images named .jpg": Mistake(_as_jpg, "missing", is_mended=False),
-    "images in another folder": Mistake(_elsewhere, "missing", is_mended=False),
+    "images named .jpg": Mistake(_as_jpg, "missing"),
+    "images in another folder": Mistake(_elsewhere, "missing"),
     "another kind of board": Mistake(
         _board(kind="checkerboard", columns=8, rows=5), "ChArUco|charuco"
     ),
@@ -366,24 +364,18 @@ BROKEN: Mapping[str, Mistake] = {
     "one image upside down": Mistake(
         _images(lambda array: cv2.rotate(array, cv2.ROTATE_180), lambda at: at == 7), "view 7"
     ),
-    "mirrored images": Mistake(_images(lambda array: array[:, ::-1]), "mirror", is_mended=False),
+    "mirrored images": Mistake(_images(lambda array: array[:, ::-1]), "mirror"),
     "blurred images": Mistake(
         _images(lambda array: cv2.GaussianBlur(array, (0, 0), 9.0)),
         "blurred",
-        is_mended=False,
     ),
     # The motion.
-    "two views": Mistake(_few, "2 views|views", is_mended=False),
-    "turns about one axis": Mistake(
-        _nothing, "turn about", options=_poor(motion="one_axis"), is_mended=False
-    ),
-    "no turns": Mistake(
-        _nothing, "turn|rotat", options=_poor(motion="translation"), is_mended=False
-    ),
+    "two views": Mistake(_few, "2 views|views"),
+    "turns about one axis": Mistake(_nothing, "turn about", options=_poor(motion="one_axis")),
+    "no turns": Mistake(_nothing, "turn|rotat", options=_poor(motion="translation")),
     "too little motion": Mistake(
         _nothing,
         "turn|motion|tilt",
         options=_poor(tilt_rad=(0.0, 0.01), roll_rad=0.01),
-        is_mended=False,
     ),
 }

@@ -54,7 +54,7 @@ class CalibratedArm:
     inverse: Inverse  # Inverse kinematics of the calibrated arm without a load.
     compliance: FloatArray  # (n,) compliance of its joints [rad/(N m)].
     # (n, 4 n) compliance times unknown masses and first moments of the links; None where the masses
-    # are known (see `bent_joints`).
+    # are known (see `deflected_joints`).
     weight_moments: FloatArray | None
 
     @classmethod
