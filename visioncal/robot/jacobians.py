@@ -73,7 +73,7 @@ def _twists_about_z(chain: Chain, placements: FloatArray, functions: FloatArray)
 
 
 def _row_jacobian(table: DHTable, row: int) -> FloatArray:
-    """Jacobian (6, 5) of Z_i X_i over theta, d, a, alpha and beta; row -1 is X_0 alone."""
+    """Jacobian (6, 5) of Z_i X_i over theta, d, a, alpha and beta."""
     a, alpha, beta = table.a_m[row + 1], table.alpha_rad[row + 1], table.beta_rad[row + 1]
     zero = np.zeros(())
     behind_z, behind_a = about_x(a, alpha, beta), about_x(zero, alpha, beta)

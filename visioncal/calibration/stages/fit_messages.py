@@ -195,12 +195,12 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             ),
         )
     if not problem.scene.estimated and len(free) and _has_changed(fitted, free):
-        moved = f"fx, fy, cx, cy moved by {_px((optics.values - optics.stated)[lens[:4]])} px."
+        moves, stated_px = (optics.values - optics.stated)[lens[:4]], problem.stated_sigma[:4]
+        moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
         rays = normalise(problem.scene.camera, problem.stack.px)
         rays = np.column_stack([rays, np.ones(len(rays))])
         before, after = (project(at, rays) for at in (problem.scene.camera, optics.camera(camera)))
         moved_px = np.nanmax(np.linalg.norm(after - before, axis=1), initial=0.0)
-        moves, stated_px = (optics.values - optics.stated)[lens[:4]], problem.stated_sigma[:4]
         is_wrong = problem.scene.matrix_sigma_px is None
         is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * stated_px))
         if is_wrong and moved_px > _LEAST_MOVE_PX:

@@ -291,7 +291,7 @@ class _Growth:
         """The relations by a pair with a number of unknown segments."""
         turns = self.symmetries.get(pair.seen, np.eye(4)[None])
         # Where the earliest views do not agree by half, all may.
-        for rows in (pair.early, pair.rows):
+        for rows in (pair.early, pair.rows) if len(pair.early) < len(pair.rows) else (pair.early,):
             unknown, parts = self._parts(joined, pair, rows)
             if len(unknown) != count:
                 return

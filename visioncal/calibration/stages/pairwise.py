@@ -199,11 +199,11 @@ def between_arms(
     Wu, Wang, Qi and Ren 2016 iterate), from starts with v in 24 orientations. `first` and `second`
     are (m, 4, 4). None where no start converges, or with too few views.
     """
+    if len(first) < _FEWEST_BETWEEN or candidates.turns.any():
+        return None
     middle = compose(Rotation.create_group("O").as_matrix(), np.zeros(3))[:, None]
     seen, park = candidates.poses[None, :, 0].repeat(len(middle), axis=0), SOLVERS["park"]
     before, after = (invert(arm)[None].repeat(len(middle), axis=0) for arm in (first, second))
-    if len(first) < _FEWEST_BETWEEN or candidates.turns.any():
-        return None
     for _ in range(_ALTERNATIONS):
         # u and w for given v; then v and w for given u; then u and v for given w.
         u_inverse = park(after @ invert(middle) @ before, seen).x[:, None]

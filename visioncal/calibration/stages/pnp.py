@@ -186,10 +186,11 @@ def _with_rivals(
     rivals = differ & ((worse < _RIVAL_RATIO**2 * best) | (mahalanobis_sq < _RIVAL_CHI2))
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
+    turns_of = [rotation_transforms(target) for target in targets]
+    adjoints = [adjoint(invert(turns)) for turns in turns_of]
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
-        count, turns = 1 + int(rivals[at]), rotation_transforms(targets[board])
-        by_turn = adjoint(invert(turns))
+        count, turns, by_turn = 1 + int(rivals[at]), turns_of[board], adjoints[board]
         covariance = variance * covariance_from(information[:count, at])[:, None]
         views.append(
             ViewPoses(

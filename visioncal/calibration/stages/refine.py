@@ -72,13 +72,12 @@ def refine_jointly(
         The fit, and the model with the errors of its arms.
     """
     with diverging():
-        if is_sized:
-            stated = fit_jointly(optics, model, frames)
-        else:
+        stated = None
+        if not is_sized:
             # Sizes are estimated from above: near a wrong size, lines of sight restrain another.
             wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
             stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
-        if _is_shrunk(stated):
+        if stated is None or _is_shrunk(stated):
             stated = fit_jointly(optics, model, frames)
         fitted, posture = with_sizes(model, stated)
         new_model, sized = model.with_errors(fitted), fitted

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
 from visioncal.vision.boards.aprilgrid import APRILGRID
 from visioncal.vision.boards.charuco import CHARUCO
-from visioncal.vision.boards.checkerboard import CHECKERBOARD
+from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.circles import CircleGrid
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
@@ -18,7 +18,7 @@ __all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "ki
 
 KINDS: Mapping[TargetKind, BoardKind] = {
     kind.name: kind
-    for kind in (CHARUCO, CHECKERBOARD, APRILGRID, CircleGrid(), MarkerKind(), Rig())
+    for kind in (CHARUCO, Checkerboard(), APRILGRID, CircleGrid(), MarkerKind(), Rig())
 }
 
 

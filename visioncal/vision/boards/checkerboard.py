@@ -135,9 +135,6 @@ class Checkerboard(Board):
         return None
 
 
-CHECKERBOARD = Checkerboard()
-
-
 def square_corners(target: Target, inset: int) -> FloatArray:
     """(n, 3) corners [m] of a board's squares, row by row, from `inset` squares inside on."""
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
