@@ -112,5 +112,9 @@ class DynamicsLimits:
     undetermined_share: float = 0.5
 
 
+# Fewest views, or stops, that determine a frame: turns about two axes take three of them.
+FEWEST_VIEWS = 3
+# Sigmas from which on a stated value counts as contradicted.
+CONTRADICTION = 3.0
 # Greatest blur of an image in which a board is detected, as a Gaussian's sigma [px].
 MAX_BLUR_PX = 4.0

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.mixed import profile_interval
+from visioncal.estimation.mixed import SURPRISE_95, profile_interval
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import (
@@ -21,8 +21,6 @@ _SCALES = 0.02 * np.sinh(np.linspace(-6.2, 5.4, 59))
 # Levels under a tenth of a micrometre or microradian count as zero. They are then integrated about
 # this one: arms repeat to some hundredths of a millimetre [m].
 _NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
-# Normal quantile of a 95 % interval.
-_TWO_SIDED_95 = 1.96
 # Steps of the other levels' logarithms after which an interval's end moves by less than 1 %.
 _CONVERGED = 1e-2
 # Degrees of freedom of a level not significantly above zero: those of a handful of stops.
@@ -94,8 +92,6 @@ def freedom_of(intervals: Iterable[Sequence[float]]) -> float:
     little.
     """
     freedoms = [
-        2.0 * (_TWO_SIDED_95 / np.log(high / low)) ** 2
-        for low, high in intervals
-        if 0.0 < low < high
+        2.0 * (SURPRISE_95 / np.log(high / low)) ** 2 for low, high in intervals if 0.0 < low < high
     ]
     return max(float(sum(freedoms)), _LEAST_FREEDOM)

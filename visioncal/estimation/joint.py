@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.corners import floored_sigma_px
@@ -34,8 +35,6 @@ from visioncal.estimation.solve import (
 _SETTLED, _ROUNDS = 0.02, 8
 # A step is halved while it increases the corner residuals by this factor; maximum of halvings.
 FOLLOWS, _HALVINGS = 2.0, 12
-# Standard deviations from which on a stated value counts as contradicted.
-CONTRADICTION = 3.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
 # by this factor.
 UNEVEN_LINKS = 2.0

@@ -6,13 +6,12 @@ tested at each view (Rao's score test), beside the lens common to all.
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.linalg import covariance_from
 
-# Least number of views on either side.
-_FEWEST = 3
 # With an autofocus, or residual errors of the lens model, which are alike in successive views, some
 # cyclic part of the session with another start differs as much. Starts within this many views of
 # the step are the same; most starts tried.
@@ -40,7 +39,7 @@ def lens_step(
         length and displacement of the principal point [px], their (3,) standard deviations, and
         twice the gain in log-likelihood; None if noise or other parts of the session show more.
     """
-    count, tried = len(order), len(order) + 1 - 2 * _FEWEST
+    count, tried = len(order), len(order) + 1 - 2 * FEWEST_VIEWS
     if tried < 1:
         return None
     seen = reproject(stack, camera, cam_from_target)
@@ -62,7 +61,7 @@ def lens_step(
     limit = 3.0 * float(f_limit(FALSE_ALARM / tried, 3, max(freedom - 3, 1)))
     if freedom <= 3 or gain < limit * noise:
         return None
-    first = index + _FEWEST
+    first = index + FEWEST_VIEWS
     starts = np.unique(np.linspace(0, count - 1, min(count, _MOST_STARTS)).round().astype(int))
     distance = np.abs((starts[:, None] - [0, first] + count // 2) % count - count // 2).min(axis=1)
     rotations = (np.arange(count) + starts[distance > _SAME_WITHIN, None]) % count
@@ -85,7 +84,7 @@ def _tested(products: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatA
         and (o, p, 3, 3) their covariance, at a noise of one.
     """
     total = products.sum(axis=1)[:, None]
-    after = np.cumsum(products[:, ::-1], axis=1)[:, ::-1][:, _FEWEST : 1 - _FEWEST]
+    after = np.cumsum(products[:, ::-1], axis=1)[:, ::-1][:, FEWEST_VIEWS : 1 - FEWEST_VIEWS]
     lens_covariance = covariance_from(total[:, :, :-1, :-1])
     across = after[:, :, :-1, :-1] @ steps
     projection = np.swapaxes(across, 2, 3) @ lens_covariance

@@ -17,6 +17,10 @@ _LEAST_PIVOT_SQ = 1e-11
 _VANISHED = 1e-6
 
 
+# Scaled eigenvalue ratio below which a direction is undetermined.
+NULL_RATIO = 1e-8
+
+
 def eigenvalue_shares(information: FloatArray) -> FloatArray:
     """Eigenvalues (n,), ascending, of a matrix scaled to a unit diagonal, over the largest.
 

@@ -36,7 +36,7 @@ HARDLY, _VARIANCES = 0.1, 3.0
 _SURELY, _SHORT_STEP = 3.0, 0.5
 # Square root of the likelihood-ratio limit of a 95 % interval of one unknown (chi-square); first
 # and largest half width and tolerance of its search, in logarithms of the sigma.
-_SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
+SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 
 # Spacing of the grid over the logarithm of a random effect's size.
 _SIZE_STEP = 0.2
@@ -376,7 +376,7 @@ def profile_interval(
     middle = float(np.log(max(sigma, LEAST_SIGMA)))
     # A fit at a local maximum has its interval about that maximum.
     local = profile(middle)
-    if 2.0 * (local - lowest) > _SURPRISE_95**2:
+    if 2.0 * (local - lowest) > SURPRISE_95**2:
         lowest = local
 
     def crossing(side: float, limit: float) -> float:
@@ -384,17 +384,17 @@ def profile_interval(
         while True:
             # The root is about linear in the width; between two widths that enclose it.
             root = float(np.sqrt(max(2.0 * (profile(middle + side * width) - lowest), 0.0)))
-            if root < _SURPRISE_95:
+            if root < SURPRISE_95:
                 inner = width, root
             else:
                 outer = width, root
             if outer is not None:
-                share = (_SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
+                share = (SURPRISE_95 - inner[1]) / (outer[1] - inner[1])
                 following = inner[0] + share * (outer[0] - inner[0])
             elif width == _WIDEST:
                 return limit
             else:
-                following = min(width * min(1.1 * _SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
+                following = min(width * min(1.1 * SURPRISE_95 / max(root, 1e-9), 4.0), _WIDEST)
             if not abs(following - width) >= _EXACT:
                 return float(np.exp(middle + side * following))
             width = following

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
@@ -17,8 +18,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import Solution, by_noise_alone, fitted_covariance
 
-# Least number of further observations, and of stops, that a move must explain.
-FEWEST = 3
 # Least share of the following observations explained; others may have moved, too, or be wrong.
 _LEAST_SHARE = 0.25
 # Number of observations whose implied change is tried as a candidate.
@@ -139,7 +138,7 @@ def find_move(
         rows = problem.observations.involves(frame)
         if frame in bases:
             rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
-        if np.sum(~agrees[rows]) >= FEWEST:
+        if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
     if not found:
         return None
@@ -172,9 +171,9 @@ def _best_move(
     after = agreeing[candidate] & (stops >= stops[begin])
     gain = int(gains[candidate, begin])
     if (
-        gain < FEWEST
-        or len(np.unique(stops[after])) < FEWEST
-        or len(np.unique(stops[explained & (stops < stops[begin])])) < FEWEST
+        gain < FEWEST_VIEWS
+        or len(np.unique(stops[after])) < FEWEST_VIEWS
+        or len(np.unique(stops[explained & (stops < stops[begin])])) < FEWEST_VIEWS
         or after.sum() <= _LEAST_SHARE * (len(stops) - begin)
     ):
         return []

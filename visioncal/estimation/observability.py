@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DegenerateError
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted, figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
@@ -25,7 +26,6 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
 # Least component along an axis for a direction to be called by it.
 _NEARLY_AXIS = 0.95
-FEWEST_VIEWS = 3
 # Least rotation of a robot between any of its stops, and most stops that are paired.
 _STILL_RAD, _PAIRED = float(np.deg2rad(0.5)), 300
 # A direction with a larger predicted sigma is not determined at all [m or rad].

@@ -47,7 +47,7 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.steps import find_steps, frames_of
 
 # Least share, and least number, of the earliest stops with which the search begins.
-_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
+EARLY_SHARE, FEWEST_EARLY = 0.4, 8
 _MOST_MOVES = 8
 # Limit of an observation's distance from its prediction: in metres, and over the median.
 _NEAR_M, _FAR = 0.04, 6.0
@@ -263,7 +263,7 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
 def _early(problem: Problem) -> Mask:
     """(n,) the observations of the earliest stops."""
     stops = problem.observations.stops
-    last = max(_EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:_FEWEST_EARLY][-1]))
+    last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_EARLY][-1]))
     return np.asarray(stops <= last)
 
 

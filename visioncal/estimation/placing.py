@@ -8,9 +8,9 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import covariance_from, eigenvalue_shares
+from visioncal.estimation.linalg import NULL_RATIO, covariance_from, eigenvalue_shares
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
-from visioncal.estimation.points import NULL_RATIO, GroupFit
+from visioncal.estimation.points import GroupFit
 
 # Least noise of any instrument [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6

@@ -37,7 +37,7 @@ from visioncal.estimation.procrustes import (
     procrustes_residual,
     spreads,
 )
-from visioncal.estimation.robust import small_sets
+from visioncal.estimation.robust import SETS, small_sets
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
@@ -48,8 +48,6 @@ _STATED = {
     "x": (False, True, True),
     "xy": (False, False, True),
 }
-# Most starts from one touch of each kind.
-_SETS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +185,8 @@ def _feature_frames(touches: PointPairs) -> Iterator[FloatArray]:
     kinds = [touches.rows(kind) for kind in FEATURE_KINDS]
     yield _frame_from(*(points[rows].mean(axis=0) for rows in kinds))
     sets = np.array(list(product(*kinds)))
-    if len(sets) > _SETS:
-        sets = np.random.default_rng(0).choice(sets, _SETS, replace=False)
+    if len(sets) > SETS:
+        sets = np.random.default_rng(0).choice(sets, SETS, replace=False)
     yield from (_frame_from(*points[rows]) for rows in sets)
 
 

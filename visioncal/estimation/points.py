@@ -22,15 +22,19 @@ import numpy as np
 from visioncal.core.transforms import apply_each, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares, gram
+from visioncal.estimation.linalg import (
+    NULL_RATIO,
+    covariance_from,
+    damped_step,
+    eigenvalue_shares,
+    gram,
+)
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, Units
 
 # Fewest points of a frame, and fewest touches of a point.
 FEWEST_POINTS = 3
 _ROUNDS = 10
 _CONVERGED = 1e-10
-# Scaled eigenvalue ratio below which a direction is undetermined.
-NULL_RATIO = 1e-8
 # Least start of the noise level [m]: it is searched from above.
 _START_SIGMA = 5e-4
 

@@ -22,7 +22,7 @@ State = TypeVar("State")
 
 _ROUNDS = 10
 # Number of small sets: with 40 % outliers, all 60 sets of three contain one with probability 3e-7.
-_SETS = 60
+SETS = 60
 # Chance that an inlier is missed before units are tested one by one.
 _MISSED = 1e-3
 
@@ -55,11 +55,11 @@ class Robust(Protocol[Fit]):
 
 def small_sets(count: int, size: int) -> Iterator[IntArray]:
     """Yields sets of `size` of `count` units: all of them, or sixty at random."""
-    if comb(count, size) <= _SETS:
+    if comb(count, size) <= SETS:
         yield from (np.array(rows) for rows in combinations(range(count), size))
         return
     rng = np.random.default_rng(0)
-    yield from (np.sort(rng.choice(count, size, replace=False)) for _ in range(_SETS))
+    yield from (np.sort(rng.choice(count, size, replace=False)) for _ in range(SETS))
 
 
 def half_of(count: int) -> int:

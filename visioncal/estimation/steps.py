@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -19,7 +20,6 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
-    FEWEST,
     explained_by_noise,
     fitted_change,
     moved,
@@ -145,7 +145,7 @@ def drift_of(problem: Problem, robot: str) -> Candidate:
 
 def _between(problem: Problem, rows: Mask) -> IntArray:
     """Stops with enough stops of (n,) some observations before and after."""
-    return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST : 1 - FEWEST])
+    return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST_VIEWS : 1 - FEWEST_VIEWS])
 
 
 def _size_effect(problem: Problem, fit: Solution, board: str) -> Effect:

@@ -11,11 +11,12 @@ from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.finding_kinds import EXCHANGED
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, look_at, or_alone
-from visioncal.estimation.moves import FEWEST, agreed_change
+from visioncal.estimation.moves import agreed_change
 from visioncal.estimation.steps import agreed_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
@@ -150,7 +151,7 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
-    if len(run) < FEWEST or not problem.observations.has_rotation[run].all():
+    if len(run) < FEWEST_VIEWS or not problem.observations.has_rotation[run].all():
         return
     some, steps = np.isin(np.arange(len(problem)), run), []
     for frame in problem.unknown:
@@ -266,7 +267,7 @@ def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[Pose
         last = int(stops[by_robot & used].max(initial=-1))
         wrong = np.unique(stops[by_robot & ~used]).tolist()
         after = [station for station in wrong if station > last]
-        pushed = [after] if len(after) >= FEWEST else []
+        pushed = [after] if len(after) >= FEWEST_VIEWS else []
         parts = [[station] for station in wrong if not pushed or station <= last] + pushed
         for part in parts:
             rows = np.flatnonzero(by_robot & np.isin(stops, part))

@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.motion import RobotMotion
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import CONTRADICTION, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Mask, Rejection
 from visioncal.core.verdict import Finding, Remedy
@@ -19,10 +20,8 @@ from visioncal.session import View, too_far_apart
 
 # Least correlation of turning angles of the same motion; largest sigma of a usable offset [s].
 LEAST_CORRELATION, LARGEST_SIGMA_S = 0.5, 0.01
-# Fewest views at rest that make a calibration.
-FEWEST_VIEWS = 3
-# A stated offset is reported as wrong beyond this many sigmas and this share of a frame period.
-_STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
+# A stated offset is reported as wrong beyond this share of a frame period.
+_STATED_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def offset_doubts(clock: ClockResult, views: Sequence[View]) -> Iterator[Finding
     sigma_s = clock.sigma_s or 0.0
     difference_s = abs(clock.stated_s - clock.camera_minus_robot_s)
     frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
-    if difference_s > max(_STATED_SIGMAS * sigma_s, _STATED_SHARE * frame_s):
+    if difference_s > max(CONTRADICTION * sigma_s, _STATED_SHARE * frame_s):
         yield Finding(
             "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "

@@ -12,7 +12,6 @@ import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.clock_offset import (
-    FEWEST_VIEWS,
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
     ClockedViews,
@@ -35,6 +34,7 @@ from visioncal.calibration.stages.motion import (
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import VisioncalError
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection

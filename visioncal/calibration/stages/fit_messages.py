@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.finding_kinds import NOTE
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.appearance import Compressed
 from visioncal.estimation.joint import (
-    CONTRADICTION,
     ConvergedFit,
     FrameModel,
     MeasuredScale,

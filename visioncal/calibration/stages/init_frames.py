@@ -20,7 +20,6 @@ import numpy as np
 
 from visioncal.calibration.stages.pairwise import (
     AGREE_M,
-    FEWEST,
     WORST_M,
     Candidates,
     between_arms,
@@ -31,8 +30,10 @@ from visioncal.calibration.stages.pairwise import (
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection, Target
+from visioncal.estimation.outliers import EARLY_SHARE, FEWEST_EARLY
 from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.procrustes import align, spreads
@@ -41,8 +42,6 @@ from visioncal.vision.targets import rotation_transforms
 
 # A rival within this ratio of the chosen candidate's distance is as likely.
 CLEAR_RATIO = 3.0
-# Share of the stops, and fewest views of a pair, that initial poses are estimated from.
-_EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 # Most orientations of boards that are tried.
 _MOST_TRIED = 256
 # Fewest stops at which points are read to determine them and the instrument; assumed sigma of these
@@ -165,7 +164,7 @@ class _Growth:
             rows.setdefault((seen.observers[at], seen.observed[at]), []).append(at)
         pairs: tuple[list[_Pair], list[_Pair]] = [], []
         for (seer, target), numbers in rows.items():
-            every, last_stop = np.array(numbers), _EARLY_SHARE * float(seen.stops.max())
+            every, last_stop = np.array(numbers), EARLY_SHARE * float(seen.stops.max())
             count = int(np.searchsorted(seen.stops[every], last_stop, side="right"))
             robots = tuple(step for step in problem.tree.path(seer, target) if step.robot)
             # Of places alone, the chain is that between the bodies of both.
@@ -176,7 +175,7 @@ class _Growth:
                 frames += ends if step.is_up else ends[::-1]
             frames.append(target if is_oriented else problem.tree.body(target))
             segments = tuple(zip(frames[::2], frames[1::2], strict=True))
-            early = every[: max(count, _FEWEST_EARLY)]
+            early = every[: max(count, FEWEST_EARLY)]
             pair = _Pair(seer, target, every, early, robots, segments)
             pairs[not is_oriented].append(pair)
         return cls(problem, candidates, symmetries, *pairs)
@@ -301,7 +300,7 @@ class _Growth:
                 matrices = np.array([matrix for matrix, _ in fits])
                 yield _Relation(*unknown[0], matrices, fits[0][1])
                 return
-            if len(rows) < FEWEST:
+            if len(rows) < FEWEST_VIEWS:
                 continue
             if count == 2 and (edges := hand_eye(invert(parts[1]), candidates)) is not None:
                 yield _Relation(*unknown[0], invert(edges.x)[None], edges.sigmas_m[0])
@@ -322,7 +321,7 @@ class _Growth:
         for pair in sorted(self.oriented, key=lambda value: -len(value.rows)):
             rows = pair.rows if is_first else pair.early
             unknown, parts = self._parts(joined, pair, rows)
-            if len(unknown) != 2 or len(rows) < FEWEST:
+            if len(unknown) != 2 or len(rows) < FEWEST_VIEWS:
                 continue
             ends = {end for segment in unknown for end in segment}
             has_prior = any(not self.is_placed(joined, end) for end in priors & ends)
@@ -375,7 +374,7 @@ class _Growth:
                 readings.setdefault(pair.seer, []).append((points[:, 0], read))
         for name, parts in readings.items():
             points, read = (np.concatenate(pair) for pair in zip(*parts, strict=True))
-            if len(read) >= FEWEST and spreads(points)[0][1] > AGREE_M:
+            if len(read) >= FEWEST_VIEWS and spreads(points)[0][1] > AGREE_M:
                 of_seer = self.problem.tree.body(name)
                 yield _Relation(of_seer, name, align(points, read)[None], _ROUGH_M)
 
@@ -440,7 +439,7 @@ def _distances(problem: Problem, candidates: Candidates, tied: InitialFrames) ->
     distances = candidates.distances(problem.predicted(problem.start(frames)))
     for group in problem.groups:
         rows, robots = group.rows, [step for step in group.path if step.robot]
-        is_enough = max(FEWEST, len(distances) / 2) <= len(rows)
+        is_enough = max(FEWEST_VIEWS, len(distances) / 2) <= len(rows)
         if is_enough and len(robots) == 1 and candidates.valid[rows, 1:].any():
             # A fit to most views is more precise than one to the earliest.
             picks, robot = distances[rows].argmin(axis=1), _robot_part(problem, robots[0], rows)

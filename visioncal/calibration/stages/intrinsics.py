@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
@@ -17,9 +18,6 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.poses import planar_poses
 from visioncal.vision.targets import numbered_positions
 
-# Two views of a plane determine fx, fy, cx, cy in theory (Zhang 2000, section 3.1); a third gives
-# the distortion and a first check.
-_FEWEST_VIEWS = 3
 _ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
@@ -62,10 +60,12 @@ def estimate_intrinsics(
         DegenerateError: The views do not determine the focal length at all.
         ConvergenceError: No start converges.
     """
-    if len(corners) < _FEWEST_VIEWS:
+    # Two views of a plane determine fx, fy, cx, cy in theory (Zhang 2000, section 3.1); a third
+    # gives the distortion and a first check.
+    if len(corners) < FEWEST_VIEWS:
         raise DataError(
             f"intrinsics: {counted(len(corners), 'view', ('shows', 'show'))} the target, and at "
-            f"least {_FEWEST_VIEWS} are needed.",
+            f"least {FEWEST_VIEWS} are needed.",
             culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )

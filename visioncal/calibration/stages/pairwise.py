@@ -8,12 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.stages.pnp import ViewPoses, distances_m
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import compose, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
-from visioncal.estimation.linalg import covariance_from, eigenvalue_shares
+from visioncal.estimation.linalg import NULL_RATIO, covariance_from, eigenvalue_shares
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
@@ -21,10 +22,8 @@ from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
 _TRIPLES = 40
-FEWEST = 3
-# Below this scaled eigenvalue ratio the motion leaves a direction undetermined; an edge with a
-# larger sigma [m, with rotations on a lever] is no start.
-_NULL_RATIO, WORST_M = 1e-8, 0.1
+# An edge with a larger sigma [m, with rotations on a lever] is no start.
+WORST_M = 0.1
 # Largest mean distance of views that agree, rotations on a lever [m].
 AGREE_M = 0.02
 # Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
@@ -132,7 +131,7 @@ def _trimmed_edges(
         starts,
         lambda item: np.asarray(item.residuals.min(axis=1)),
         solve,
-        max(len(robot) // 2 + 1, FEWEST),
+        max(len(robot) // 2 + 1, FEWEST_VIEWS),
     )
     return half, edges, float(edges.residuals.min(axis=1)[half].mean())
 
@@ -171,7 +170,7 @@ def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     problem = chain("eye-in-hand", robot[half], picked, exact)
     state = State(np.stack([edges.x, edges.z]), np.zeros(0))
     information = fisher_information(problem, state, _NOISE)
-    if eigenvalue_shares(information)[0] < _NULL_RATIO:
+    if eigenvalue_shares(information)[0] < NULL_RATIO:
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     # Views that agree poorly determine less than their motion would.
@@ -224,7 +223,7 @@ def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:
     counts = candidates.valid.sum(axis=1)
     weights = 1.0 / counts**2
     for _ in range(_TRIPLES):
-        triple = rng.choice(len(candidates), FEWEST, replace=False, p=weights / weights.sum())
+        triple = rng.choice(len(candidates), FEWEST_VIEWS, replace=False, p=weights / weights.sum())
         options = [list(range(counts[at])) for at in triple]
         # A turn of the target in all views alike changes its frame and is no other solution.
         options[0] = [at for at in options[0] if candidates.turns[triple[0], at] == 0]

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.finding_kinds import NOTE
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
@@ -18,8 +19,6 @@ from visioncal.estimation.tree import Tree
 from visioncal.session.document import PriorTable
 
 _AXES = ("x_m", "y_m", "z_m")
-# A measured component is contradicted beyond this many combined sigmas.
-_CONTRADICTION = 3.0
 # Prior sigma of a position that is overruled by any estimate that is accepted [m].
 _LOOSE_M = 1.0
 
@@ -139,7 +138,7 @@ def without_most_contradicted(
         for component in components(problem, state, covariance, [prior])
     ]
     contradiction, worst, axis = max(found, default=(0.0, 0, 0))
-    if contradiction <= _CONTRADICTION:
+    if contradiction <= CONTRADICTION:
         return None
     kept = list(problem.priors)
     kept[worst] = kept[worst].without(axis)

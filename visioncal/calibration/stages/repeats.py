@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
 from visioncal.core.finding_kinds import REPEATED_READINGS
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
 from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
@@ -28,8 +29,6 @@ _APART_PX = 0.01
 # Images of one stop that are enough for a mean, and the greatest distance of half of the corners of
 # one of them from that of most [px]: beyond, the arm did not stand still.
 _MANY, _STANDING_PX = 4, 0.5
-# Fewest stops of a camera whose images are averaged: those of fewer are too few views then.
-_FEWEST_STOPS = 3
 
 
 def without_repeats(seen: T) -> T:
@@ -87,7 +86,7 @@ def with_stop_means(seen: T) -> T:
             for (seer, *_), views in groups.items()
             if seer == frame
         ]
-        for own in shown if sum(map(bool, shown)) >= _FEWEST_STOPS else ():
+        for own in shown if sum(map(bool, shown)) >= FEWEST_VIEWS else ():
             if len(own) >= _MANY:
                 mean, others = _mean_of(own)
                 corners[mean.view] = mean

@@ -7,11 +7,11 @@ import numpy as np
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.prediction import PredictedStops
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
-from visioncal.estimation.observability import FEWEST_VIEWS
 
 CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
     "camera",

@@ -19,7 +19,7 @@ from visioncal.calibration.verification.change_hypotheses import (
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.finding_kinds import AGREEMENT
-from visioncal.core.limits import CheckLimits
+from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
@@ -29,7 +29,6 @@ from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
 # Sigmas beyond which a part of a motion is mentioned; nearly every check detects twice as many.
-_MENTIONED = 3.0
 # Thermal expansion of aluminium and steel, in shares a kelvin.
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
@@ -174,7 +173,7 @@ def _moved_words(move: Mapping[str, Any]) -> str:
     if "moved_mm" not in move:
         return ""
     (is_shifted, shift), (is_turned, turn) = (
-        (size > _MENTIONED * sigma, f"by {figure(size)} {unit} (sigma {figure(sigma)}) {way}")
+        (size > CONTRADICTION * sigma, f"by {figure(size)} {unit} (sigma {figure(sigma)}) {way}")
         for size, sigma, unit, way in (
             (move["moved_mm"], move["sigma_mm"], "mm", f"along {move['along']}"),
             (move["turned_deg"], move["sigma_deg"], "deg", f"about {move['about']}"),
@@ -251,7 +250,7 @@ def _signed_axis(vector: FloatArray) -> str:
 
 def _agreement(check: Check) -> str:
     turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
-    sure = 2.0 * _MENTIONED * check.camera_sigma
+    sure = 2.0 * CONTRADICTION * check.camera_sigma
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     again = f" ({check.repeated} of them where the calibration's stood)" if check.repeated else ""
     verb = "agrees" if check.predicted.stops == 1 else "agree"
