@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from visioncal.core.documents import as_numbers, parse_stored, read_json, read_table
-from visioncal.core.documents.jsons import parse_json, read_npy, read_npz
+from visioncal.core.documents.jsons import parse_json, read_arrays
 from visioncal.core.documents.structured import parse_yaml, read_opencv, read_xml, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
@@ -59,15 +59,19 @@ def test_yaml_values(text, value):
         ("a: 1\nb: !!python/object/apply:os.getcwd []", "line 2: the tag 'python/object/apply"),
         ("a: !!python/name:os.system x", "the tag"),
         ("a: !local x", "the tag"),
-        ("a: &x [1]\nb: *x", r"line 2: the alias \*x"),
-        ("a: 1\nb: 2\na: 3", "line 3: the key 'a' a second time"),
-        ("[" * 200, "nested deeper"),
+        ("a: 1\nb: 2\na: 3", "line 3: 'a' is no key, or there twice"),
+        ("a: &a [*a]", "no YAML"),
+        ("[" * 200, "no YAML"),
+        ("[" * 100_000, "no YAML"),
         ("- " * 200 + "1", "nested deeper"),
         ("a: [1, 2", "no YAML"),
         ("a: b: c", "line 1 is no YAML"),
-        ("? [1]\n: 2", "a list or mapping as a key"),
-        ("m: !!opencv-matrix {rows: 2, cols: 2, dt: d, data: [1, 2, 3]}", "3 numbers; 2 x 2"),
-        ("m: !!opencv-matrix {rows: 1, cols: 1, dt: x, data: [1]}", "OpenCV's types"),
+        ("? [1]\n: 2", "line 1: a list of 1 is no key"),
+        (
+            "m: !!opencv-matrix {rows: 2, cols: 2, dt: d, data: [1, 2, 3]}",
+            "3 numbers are no matrix of 2 x 2",
+        ),
+        ("m: !!opencv-matrix {rows: 1, cols: 1, dt: x, data: [1]}", "of the type 'x'"),
         ("a: \x01", "no YAML"),
     ],
 )
@@ -79,7 +83,7 @@ def test_yaml_that_is_refused(text, words):
 def test_aliases_cost_nothing(file):
     lines = ["a: &a [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
     lines += [f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}]" for a, b in pairwise("abcdefghi")]
-    with pytest.raises(DataError, match="alias"):
+    with pytest.raises(DataError, match="more than 1,000,000 values"):
         read_yaml(file("laughs.yaml", "\n".join(lines)))
 
 
@@ -153,8 +157,8 @@ def test_what_numpy_writes_is_read_without_it(tmp_path, dtype, order):
     array = np.asarray(np.arange(6).reshape(2, 3) % 2, dtype=dtype, order=order)
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", array=array, scalar=array[0, 0])
-    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
-    both = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(read_arrays(tmp_path / "a.npy")["matrix"], array)
+    both = read_arrays(tmp_path / "a.npz")
     np.testing.assert_array_equal(both["array"], array)
     assert both["scalar"].shape == ()
 
@@ -168,23 +172,23 @@ class Executed:
 
 def test_pickles_are_not_opened(file, tmp_path):
     np.save(tmp_path / "a.npy", np.array([Executed()], dtype=object), allow_pickle=True)
-    with pytest.raises(DataError, match="Python objects"):
-        read_npy(tmp_path / "a.npy")
+    with pytest.raises(DataError, match="Python objects are not read"):
+        read_arrays(tmp_path / "a.npy")
     np.savez(tmp_path / "a.npz", a=np.array([Executed()], dtype=object))
-    with pytest.raises(DataError, match="Python objects"):
-        read_npz(tmp_path / "a.npz")
-    with pytest.raises(DataError, match=r"no \.npz"):
-        read_npz(file("b.npz", pickle.dumps(Executed())))
+    with pytest.raises(DataError, match="Python objects are not read"):
+        read_arrays(tmp_path / "a.npz")
+    with pytest.raises(DataError, match="no arrays"):
+        read_arrays(file("b.npz", pickle.dumps(Executed())))
 
 
 def test_an_array_that_lies_about_its_size_is_not_allocated(file):
     stored = io.BytesIO()
     np.save(stored, np.zeros(3))
     data = stored.getvalue().replace(b"(3,), }" + b" " * 10, b"(3000000000000,), }"[:17])
-    with pytest.raises(DataError, match="bytes of content"):
-        read_npy(file("a.npy", stored.getvalue()[:-5]))
+    with pytest.raises(DataError, match="no arrays"):
+        read_arrays(file("a.npy", stored.getvalue()[:-5]))
     with pytest.raises(DataError):
-        read_npy(file("b.npy", data))
+        read_arrays(file("b.npy", data))
 
 
 def test_a_zip_bomb_is_not_unpacked(file):
@@ -193,7 +197,7 @@ def test_a_zip_bomb_is_not_unpacked(file):
         archive.writestr("a.npy", b"\0" * 60_000_000)
     assert len(stored.getvalue()) < 100_000
     with pytest.raises(DataError, match="unpacks to more than 50 MB"):
-        read_npz(file("bomb.npz", stored.getvalue()))
+        read_arrays(file("bomb.npz", stored.getvalue()))
 
 
 TABLES = {
@@ -280,51 +284,41 @@ def changed(data, mark, offset, value):
 
 WHOLE = npz(npy("<f8", "(2,)", bytes(16)))
 HOSTILE = {
-    "one-byte float.npy": (npy("<f1", "(3,)", b"abc"), "numbers or text are needed"),
-    "text of no width.npy": (npy("<U0", "(3,)"), "numbers or text are needed"),
-    "bytes of no width.npy": (npy("|S0", "(2,)"), "numbers or text are needed"),
-    "hidden size.npy": (npy("<f8", f"({10**11}, {10**11}, 0)"), "entries are read"),
-    "nine axes.npy": (npy("<f8", "(1,1,1,1,1,1,1,1,1)", bytes(8)), "has the shape"),
-    "open shape.npy": (npy("<i8", "(3"), "no header"),
-    "lzma.npz": (npz(npy("<f8", "(2,)", bytes(16)), zipfile.ZIP_LZMA), "another way"),
-    "bzip2.npz": (npz(npy("<f8", "(2,)", bytes(16)), zipfile.ZIP_BZIP2), "another way"),
+    "one-byte float.npy": (npy("<f1", "(3,)", b"abc"), "no (arrays|numbers)"),
+    "hidden size.npy": (npy("<f8", f"({10**11}, {10**11}, 0)"), "no arrays"),
+    "open shape.npy": (npy("<i8", "(3"), "no arrays"),
     # Fields of the entry in the archive's directory: flags, packing, and where the file begins.
-    "encrypted.npz": (changed(WHOLE, b"PK\x01\x02", 8, 1), "encrypted"),
-    "unknown packing.npz": (changed(WHOLE, b"PK\x01\x02", 10, 77), "another way"),
-    "newer.npz": (changed(WHOLE, b"PK\x01\x02", 6, 99), "no .npz"),
-    "beyond its end.npz": (changed(WHOLE, b"PK\x01\x02", 45, 9), "no .npz"),
-    "before its beginning.npz": (changed(WHOLE, b"PK\x05\x06", 17, 127), "no .npz"),
-    "wrong sum.npz": (changed(WHOLE, b"PK\x01\x02", 16, 1), "no .npz"),
-    "cut.npz": (WHOLE[:-30], "no .npz"),
-    "array inside.npz": (npz(npy("<f1", "(3,)", b"abc")), "numbers or text are needed"),
+    "encrypted.npz": (changed(WHOLE, b"PK\x01\x02", 8, 1), "no arrays"),
+    "unknown packing.npz": (changed(WHOLE, b"PK\x01\x02", 10, 77), "no arrays"),
+    "newer.npz": (changed(WHOLE, b"PK\x01\x02", 6, 99), "no arrays"),
+    "beyond its end.npz": (changed(WHOLE, b"PK\x01\x02", 45, 9), "no arrays"),
+    "before its beginning.npz": (changed(WHOLE, b"PK\x05\x06", 17, 127), "no arrays"),
+    "wrong sum.npz": (changed(WHOLE, b"PK\x01\x02", 16, 1), "no arrays"),
+    "cut.npz": (WHOLE[:-30], "no arrays"),
+    "array inside.npz": (npz(npy("<f1", "(3,)", b"abc")), "no (arrays|numbers)"),
     "endless rows.yml": (
         "a: !!opencv-matrix {rows: 1e300, cols: 0, dt: d, data: []}",
-        "none that is read",
+        "are no matrix",
     ),
     "half a row.yml": (
         "a: !!opencv-matrix {rows: 1.5, cols: 2, dt: d, data: [1, 2, 3]}",
-        "none that is read",
+        "are no matrix",
     ),
     "hundred sizes.yml": (
         f"a: !!opencv-nd-matrix {{sizes: [{'1,' * 99}1], dt: d, data: [1]}}",
-        "none that is read",
+        "are no matrix",
     ),
     "hidden sizes.yml": (
         f"a: !!opencv-nd-matrix {{sizes: [{10**12}, {10**12}, 0], dt: d, data: []}}",
-        "none that is read",
+        "are no matrix",
     ),
     "many hidden sizes.yml": (
         f"a: !!opencv-nd-matrix {{sizes: [{'999999,' * 6}0], dt: d, data: []}}",
-        "none that is read",
+        "are no matrix",
     ),
     "many channels.yml": (
         "a: !!opencv-matrix {rows: 9999, cols: 0, dt: 999d, data: []}",
-        "none that is read",
-    ),
-    "twice.xml": ("<s><a>1</a><a>2</a></s>", "<a> is there twice"),
-    "rows twice.xml": (
-        "<s><a type_id='opencv-matrix'><rows>1</rows><rows>2</rows></a></s>",
-        "<rows> is there twice",
+        "are no matrix",
     ),
     "odd number.xml": (
         "<s><a type_id='opencv-matrix'><rows>1</rows><cols>1</cols><data>1_0</data></a></s>",
@@ -336,7 +330,7 @@ HOSTILE = {
         "more than 1,000,000 values",
     ),
 }
-READERS = {".npy": read_npy, ".npz": read_npz, ".yml": read_opencv, ".xml": read_opencv}
+READERS = {".npy": read_arrays, ".npz": read_arrays, ".yml": read_opencv, ".xml": read_opencv}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -1,7 +1,6 @@
 """Bounded readers of YAML, XML, and OpenCV's FileStorage in any of its forms, without OpenCV.
 
-YAML is of plain values and OpenCV's matrices, without aliases; XML without document types and
-entities.
+YAML is of plain values and OpenCV's matrices; XML without document types and entities.
 """
 
 import math
@@ -17,11 +16,17 @@ from defusedxml.ElementTree import DefusedXMLParser
 
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.tables import is_number
-from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text
+from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text, shown
 from visioncal.core.errors import DataError
-from visioncal.core.files import MAX_DEPTH, MAX_VALUES, read_bytes, too_deep, too_many
+from visioncal.core.files import (
+    MAX_DEPTH,
+    MAX_VALUES,
+    check_values,
+    read_bytes,
+    too_deep,
+    too_many,
+)
 
-_BLANKS = (b" ", b"\n", b"\t", b"\r")
 _STANDARD = "tag:yaml.org,2002:"
 _CONSTANTS: dict[str, object] = {"true": True, "yes": True, "on": True}
 _CONSTANTS |= {"false": False, "no": False, "off": False, "": None, "~": None, "null": None}
@@ -42,8 +47,8 @@ def read_yaml(path: Path) -> object:
     """Reads the first document of a YAML file, OpenCV's FileStorage dialect included.
 
     Raises:
-        DataError: It is missing, no YAML, holds a key twice, an alias or a tag that would construct
-            an object, or is too large or too deep.
+        DataError: It is missing, no YAML, holds a key twice or a tag that would construct an
+            object, or is too large or too deep.
     """
     return parse_yaml(read_plain_text(path), str(path))
 
@@ -51,45 +56,25 @@ def read_yaml(path: Path) -> object:
 def parse_yaml(text: str, where: str) -> object:
     """Parses YAML as `read_yaml` does; `where` names its origin in errors."""
     # OpenCV's `%YAML:1.0` is no valid directive; an empty comment keeps line numbers.
-    plain = re.sub(r"\A%YAML[^\n]*", "#", text)
+    loader = _Loader(re.sub(r"\A%YAML[^\n]*", "#", text))
+    loader.where = where
     try:
-        _check_events(plain, where)
-        loader = _Loader(plain)
-        loader.where = where
-        return loader.get_data() if loader.check_data() else None
+        # The parser bounds the depth, and an alias is a reference.
+        value = loader.get_data() if loader.check_data() else None
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise DataError(f"{where}{line} is no YAML: {error.problem}.", culprits=[where]) from error
     except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{where} is no YAML: {reason}.", culprits=[where]) from error
+    except RecursionError as error:
+        raise too_deep(where) from error
+    check_values(value, where)
+    return value
 
 
-def _check_events(text: str, where: str) -> None:
-    """Checks size, depth and aliases before anything is built; raises DataError."""
-    count = depth = 0
-    for event in yaml.parse(text, Loader=_BASE):
-        if isinstance(event, yaml.DocumentEndEvent):
-            return
-        count += isinstance(event, yaml.NodeEvent)
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if count > MAX_VALUES:
-            raise too_many(where)
-        if depth > MAX_DEPTH:
-            raise too_deep(f"{where}, line {_line(event)}")
-        if isinstance(event, yaml.AliasEvent):
-            seen = f"the alias *{event.anchor}"
-            raise _refusal(where, event, seen, "values written out are needed")
-
-
-def _line(item: yaml.Event | yaml.Node) -> int:
-    return item.start_mark.line + 1 if item.start_mark else 0
-
-
-def _refusal(where: str, item: yaml.Event | yaml.Node, seen: str, needed: str) -> DataError:
-    place = f"{where}, line {_line(item)}"
-    return DataError(f"{place}: {seen}; {needed}.", culprits=[place])
+def _place(where: str, node: yaml.Node) -> str:
+    return f"{where}, line {node.start_mark.line + 1}"
 
 
 _BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -104,21 +89,25 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
         """Reads a mapping, or one of OpenCV's matrices."""
         content: dict[str, object] = {}
         for key, value in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                seen = "a list or mapping as a key"
-                raise _refusal(self.where, key, seen, "a word is needed")
-            if key.value in content:
-                seen = f"the key {key.value[:60]!r} a second time"
-                raise _refusal(self.where, key, seen, "once is needed")
+            if not isinstance(key, yaml.ScalarNode) or key.value in content:
+                place = _place(self.where, key)
+                raise DataError(
+                    f"{place}: {shown(key.value)} is no key, or there twice; words, once each, are "
+                    "needed.",
+                    culprits=[place],
+                )
             content[key.value] = self.construct_object(value, deep=True)
         if node.tag.endswith("matrix"):
-            return matrix_from(content, f"{self.where}, line {_line(node)}")
+            return matrix_from(content, _place(self.where, node))
         return content
 
     def refuse(self, node: yaml.Node) -> object:
         """Refuses any other tag; raises DataError."""
-        seen = f"the tag {node.tag.removeprefix(_STANDARD)[:60]!r}"
-        raise _refusal(self.where, node, seen, "plain values are needed")
+        place = _place(self.where, node)
+        raise DataError(
+            f"{place}: the tag {node.tag.removeprefix(_STANDARD)[:60]!r}; plain values are needed.",
+            culprits=[place],
+        )
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -149,8 +138,8 @@ def parse_xml(data: bytes, where: str) -> Element:
     Raises:
         DataError: It is no XML, declares a document type, or is too large or too deep.
     """
-    # An upper bound: words by blanks, and elements, each as large as five, by half their tags.
-    if 5 * data.count(b"<") // 2 + sum(map(data.count, _BLANKS)) > MAX_VALUES:
+    # An upper bound of its elements and words.
+    if sum(map(data.count, (b"<", b" ", b"\n", b"\t", b"\r"))) > MAX_VALUES:
         raise too_many(where)
     parser = DefusedXMLParser(target=TreeBuilder(insert_comments=True), forbid_dtd=True)
     try:
@@ -211,33 +200,22 @@ def _with_matrices(value: object, where: str) -> object:
 
 def _from_xml(element: Element, where: str) -> object:
     place, children = f"{where}: <{element.tag}>", [*element.iterfind("*")]
-    text = (element.text or "").strip()
     if element.get("type_id") in _MATRICES:
-        content = {
-            tag: words.strip('" \n') if tag == "dt" else _numbers(words, place)
-            for tag, item in _by_tag(element, where).items()
-            for words in [item.text or ""]
-        }
-        return matrix_from(content, place)
-    if children and all(child.tag == "_" for child in children):
-        return [_from_xml(child, where) for child in children]
+        texts = {child.tag: (child.text or "").strip('" \n') for child in children}
+        return matrix_from(
+            {tag: text if tag == "dt" else _numbers(text, place) for tag, text in texts.items()},
+            place,
+        )
     if children:
-        return {tag: _from_xml(item, where) for tag, item in _by_tag(element, where).items()}
+        values = [_from_xml(child, where) for child in children]
+        tags = [child.tag for child in children]
+        return values if {*tags} == {"_"} else dict(zip(tags, values, strict=True))
+    text = (element.text or "").strip()
     try:
         numbers = _numbers(text, place)
     except DataError:
         return text.strip('"')
     return numbers[0] if len(numbers) == 1 else numbers or ""
-
-
-def _by_tag(element: Element, where: str) -> dict[str, Element]:
-    by_tag: dict[str, Element] = {}
-    for child in element.iterfind("*"):
-        if by_tag.setdefault(child.tag, child) is not child:
-            raise DataError(
-                f"{where}: <{child.tag[:60]}> is there twice; once is needed.", culprits=[where]
-            )
-    return by_tag
 
 
 def _numbers(text: str, where: str) -> list[float]:

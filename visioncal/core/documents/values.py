@@ -16,7 +16,6 @@ from visioncal.core.types import FloatArray
 DECIMAL = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
 
 _SHOWN = 60  # characters of a value in a message
-_MOST_AXES = 8
 
 
 def read_plain_text(path: Path) -> str:
@@ -85,11 +84,7 @@ def mapping(value: object, where: str) -> Mapping[str, Any]:
 
 
 def matrix_from(value: object, where: str) -> FloatArray:
-    """Builds a matrix from rows, cols (or sizes), dt and data.
-
-    Args:
-        value: The mapping; `data` is a list of numbers.
-        where: Its location, for messages.
+    """Builds a matrix from OpenCV's rows, cols (or sizes), dt and data.
 
     Returns:
         (rows, cols) numbers, (rows, cols, channels) where dt names several channels, or an array
@@ -100,29 +95,19 @@ def matrix_from(value: object, where: str) -> FloatArray:
     """
     content = mapping(value, where)
     data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)
-    if "sizes" in content:
-        sides = as_numbers(content["sizes"], f"{where}: sizes").reshape(-1).tolist()
-    else:
-        sides = [number(content.get(name), f"{where}: {name}") for name in ("rows", "cols")]
-    kind = re.fullmatch(r"([0-9]*)[ucwsifdh]", str(content.get("dt", "d")))
-    if kind is None:
+    stated = content.get("sizes", [content.get("rows"), content.get("cols")])
+    sides = as_numbers(stated, f"{where}: rows, cols").reshape(-1).tolist()
+    kind = re.fullmatch(r"([0-9]{0,3})[ucwsifdh]", str(content.get("dt", "d")))
+    channels = float(kind[1] or 1) if kind else 1.0
+    sides += [channels] * (channels > 1)
+    valid = kind is not None and all(side % 1 == 0 and side >= 0 for side in sides)
+    # A side of 0 must not hide the others.
+    valid = valid and len(sides) < 9 and math.prod(max(side, 1.0) for side in sides) <= MAX_VALUES
+    if not valid or math.prod(sides) != len(data):
+        words = " x ".join(f"{side:g}" for side in sides[:4])
         raise DataError(
-            f"{where}: dt is {content.get('dt')!r}; one of OpenCV's types is needed, such as d.",
+            f"{where}: {len(data)} numbers are no matrix of {words} of the type "
+            f"{content.get('dt', 'd')!r}.",
             culprits=[where],
         )
-    if kind[1] and int(kind[1][:3]) > 1:
-        sides.append(float(kind[1][:3]))
-    valid = len(sides) <= _MOST_AXES and all(
-        0 <= side <= MAX_VALUES and side % 1 == 0 for side in sides
-    )
-    shape = [int(side) for side in sides] if valid else []
-    # A side of 0 must not hide the others.
-    if not valid or math.prod(max(index, 1) for index in shape) > MAX_VALUES:
-        words = " x ".join(f"{side:g}" for side in sides[:_MOST_AXES])
-        raise DataError(f"{where}: a matrix of {words} is none that is read.", culprits=[where])
-    if math.prod(shape) != len(data):
-        words = " x ".join(map(str, shape))
-        raise DataError(
-            f"{where}: the matrix has {len(data)} numbers; {words} are needed.", culprits=[where]
-        )
-    return data.reshape(shape)
+    return data.reshape([int(side) for side in sides])

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from visioncal.core.documents import as_numbers, is_number, mapping, number
-from visioncal.core.documents.jsons import read_npz
+from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_opencv, read_xml, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
@@ -145,7 +145,7 @@ def read_intrinsics(path: Path, most: int = 8) -> tuple[dict[str, Any], tuple[st
         DataError: It is none of these, or has an unknown lens model.
     """
     if path.suffix.lower() == ".npz":
-        return intrinsics_from(read_npz(path), str(path), most)
+        return intrinsics_from(read_arrays(path), str(path), most)
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
         if root.find("camera") is not None:

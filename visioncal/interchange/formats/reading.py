@@ -17,7 +17,7 @@ import numpy as np
 
 from visioncal.core.conventions import write_pose
 from visioncal.core.documents import TextTable, is_number, read_json, read_table
-from visioncal.core.documents.jsons import Array, read_npy, read_npz
+from visioncal.core.documents.jsons import Array, read_arrays
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.structured import read_opencv, read_yaml
 from visioncal.core.documents.values import read_plain_text
@@ -379,10 +379,8 @@ def read_fields(path: Path) -> Fields:
         DataError: It cannot be read, or holds no rows.
     """
     suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return fields_of_arrays(read_npz(path), path)
-    if suffix == ".npy":
-        return fields_of_arrays({"value": read_npy(path)}, path)
+    if suffix in (".npz", ".npy"):
+        return fields_of_arrays(read_arrays(path), path)
     if suffix in DOCUMENTS:
         return fields_of_document(read_document(path), path)
     if suffix in _PROGRAMS:

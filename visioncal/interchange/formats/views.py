@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.documents import as_numbers, is_number, mapping, read_table
-from visioncal.core.documents.jsons import read_npy, read_npz
+from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
@@ -225,10 +225,8 @@ def _record(path: Path) -> dict[str, object]:
     """Reads one view's file; numbers without a name are its matrix or pose."""
     suffix = path.suffix.lower()
     document: object = _halcon_pose(path) if suffix == ".dat" else None
-    if suffix == ".npz":
-        document = read_npz(path)
-    elif suffix == ".npy":
-        document = read_npy(path)
+    if suffix in (".npz", ".npy"):
+        document = read_arrays(path)
     elif suffix in DOCUMENTS:
         document = read_document(path)
     elif document is None:
