@@ -19,7 +19,7 @@ from visioncal.core.files import (
 from visioncal.core.number_format import did_you_mean
 
 
-def test_text_survives_odd_paths(tmp_path: Path) -> None:
+def test_text_survives_odd_paths(tmp_path):
     path = tmp_path / "Zelle 3, größe.txt"
     write_atomically(path, "µm\r\n")
     assert read_bytes(path) == "µm\r\n".encode()
@@ -28,13 +28,11 @@ def test_text_survives_odd_paths(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-def test_failed_write_leaves_the_old_content_and_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_leaves_the_old_content_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "a.txt"
     write_atomically(path, "old")
 
-    def full_disk(_: int) -> None:
+    def full_disk(_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full_disk)
@@ -43,7 +41,7 @@ def test_failed_write_leaves_the_old_content_and_nothing_else(
     assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [("a.txt", "old")]
 
 
-def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
+def test_missing_file_and_folder_are_named(tmp_path):
     with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
         read_bytes(tmp_path / "nowhere.txt")
     (tmp_path / "images" / "view10").mkdir(parents=True)
@@ -57,7 +55,7 @@ def test_missing_file_and_folder_are_named(tmp_path: Path) -> None:
         write_atomically(tmp_path / "missing" / "a.txt", "")
 
 
-def test_what_might_never_end_is_not_read(tmp_path: Path) -> None:
+def test_what_might_never_end_is_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     for path in (tmp_path / "pipe.csv", Path("/dev/zero")):
         with pytest.raises(DataError, match="is no regular file"):
@@ -72,12 +70,12 @@ def test_what_might_never_end_is_not_read(tmp_path: Path) -> None:
     ("name", "words"),
     [("ä" * 128, "longer than 255 bytes"), ("a\0b", "does not exist"), ("a/" * 3000, "too long")],
 )
-def test_names_that_no_file_has_are_refused(name: str, words: str, tmp_path: Path) -> None:
+def test_names_that_no_file_has_are_refused(name, words, tmp_path):
     with pytest.raises(DataError, match=words):
         read_bytes(tmp_path / name)
 
 
-def test_a_link_out_of_a_folder_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_out_of_a_folder_is_not_followed(tmp_path):
     (tmp_path / "secret.csv").write_text("secret")
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -93,13 +91,13 @@ def test_a_link_out_of_a_folder_is_not_followed(tmp_path: Path) -> None:
         read_text_inside(folder, "loop.csv")
 
 
-def test_text_may_have_a_byte_order_mark_but_must_be_utf8() -> None:
+def test_text_may_have_a_byte_order_mark_but_must_be_utf8():
     assert decode_text(b"\xef\xbb\xbfview", "x.csv") == "view"
     with pytest.raises(DataError, match=r"x\.csv, line 2: byte 0xe4 is not UTF-8"):
         decode_text(b"view\ngr\xe4n", "x.csv")
 
 
-def test_toml_errors_give_the_line() -> None:
+def test_toml_errors_give_the_line():
     with pytest.raises(DataError, match=r"x\.toml is not valid TOML: .*line 2"):
         parse_toml("a = 1\nb = [1,, 2]", "x.toml")
 
@@ -113,12 +111,12 @@ def test_toml_errors_give_the_line() -> None:
         ("a = " + "9" * 5000, "is not valid TOML"),
     ],
 )
-def test_toml_that_no_one_writes_is_refused(text: str, words: str) -> None:
+def test_toml_that_no_one_writes_is_refused(text, words):
     with pytest.raises(DataError, match=words):
         parse_toml(text, "x.toml")
 
 
-def test_near_names_are_suggested() -> None:
+def test_near_names_are_suggested():
     assert "resolution" in did_you_mean("resolutoin", ["resolution", "model"])
     assert did_you_mean("zzz", ["resolution", "model"]) == ""
 
@@ -133,9 +131,7 @@ def test_near_names_are_suggested() -> None:
         ({"a": -1}, "a is -1"),
     ],
 )
-def test_a_number_that_does_not_serve_is_refused_by_name(
-    content: dict[str, object], words: str
-) -> None:
+def test_a_number_that_does_not_serve_is_refused_by_name(content, words):
     with pytest.raises(DataError, match=words) as caught:
         DocumentTable(content, "robot x").number("a", positive=True)
     assert caught.value.culprits == ("robot x: a",)

@@ -62,7 +62,7 @@ def test_writers_at_once_leave_the_files_of_one(tmp_path):
 
 @pytest.mark.parametrize("refused", ["link", "symlink", "flock"])
 def test_without_links_or_locks_the_files_are_renamed(tmp_path, monkeypatch, refused):
-    def unsupported(*_: object, **__: object) -> None:
+    def unsupported(*_, **__):
         raise OSError(95, "Operation not supported")
 
     written(tmp_path, ALL)
@@ -118,7 +118,7 @@ def test_an_error_names_the_file_as_it_would_be_called(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def breaking(*_: object, **__: object) -> None:
+def breaking(*_, **__):
     raise ValueError("18 mm of 25 mm")
 
 

@@ -8,7 +8,7 @@ from visioncal.core.limits import CalibrationLimits, NeedLimits
 PAGE = Path(visioncal.__file__).parent / "calibration" / "README.md"
 
 
-def _row(status: str) -> str:
+def _row(status):
     (row,) = (line for line in PAGE.read_text().splitlines() if line.startswith(f"| `{status}` |"))
     return row
 

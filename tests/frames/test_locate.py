@@ -54,9 +54,7 @@ def in_hand():
     return cell, calibration_of(cell)
 
 
-def agrees_with_differences(
-    part: np.ndarray, ahead: Located, behind: Located, step: float, *, beyond: bool = False
-) -> None:
+def agrees_with_differences(part, ahead, behind, step, *, beyond=False):
     slope = (ahead.p_base - behind.p_base) / (2 * step)
     # Truncation of second order in a step of a thousandth, relative; rounding is less. A lens that
     # breathes by a thousandth moves with its centre and the distance by as much less.

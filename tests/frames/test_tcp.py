@@ -336,7 +336,7 @@ def test_json_is_the_frame_alone(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def calibrated(tmp_path_factory) -> Path:
+def calibrated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     write_session(simulate(CellOptions(views=10, seed=3)), folder / "cell", images=False)
     session = Session.load(folder / "cell")
@@ -345,7 +345,7 @@ def calibrated(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def out(calibrated, tmp_path) -> Path:
+def out(calibrated, tmp_path):
     return Path(shutil.copytree(calibrated, tmp_path / "out"))
 
 

@@ -19,19 +19,19 @@ from visioncal.session import Session
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     path = tmp_path / "cell, größer"
     made_up(5).session.save(path)
     return path
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def content(folder):
     """The bytes of every file, by its path in the folder."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_there_and_back_again(folder: Path, tmp_path: Path) -> None:
+def test_there_and_back_again(folder, tmp_path):
     recording, again = tmp_path / "cell.rrd", tmp_path / "again"
     convert(folder, recording)
     convert(recording, again)
@@ -39,7 +39,7 @@ def test_there_and_back_again(folder: Path, tmp_path: Path) -> None:
     assert content(again) == content(folder)
 
 
-def test_a_recording_without_a_whole_view_leaves_no_folder(folder: Path, tmp_path: Path) -> None:
+def test_a_recording_without_a_whole_view_leaves_no_folder(folder, tmp_path):
     cut, again = tmp_path / "cut.rrd", tmp_path / "again"
     empty = replace(Session.load(folder), views=())
     write_recording(cut, empty, None, (), None)
@@ -48,7 +48,7 @@ def test_a_recording_without_a_whole_view_leaves_no_folder(folder: Path, tmp_pat
     assert not again.exists()
 
 
-def test_what_a_session_cannot_hold_leaves_no_folder(tmp_path: Path) -> None:
+def test_what_a_session_cannot_hold_leaves_no_folder(tmp_path):
     recording = streams(tmp_path / "in")
     rows = recording.source.read_text().splitlines()
     rows[35] = ",".join([*rows[35].split(",")[:2], "-4.4e10", *rows[35].split(",")[3:]])
@@ -58,7 +58,7 @@ def test_what_a_session_cannot_hold_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder: Path, tmp_path: Path) -> None:
+def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder, tmp_path):
     for first, second in (("a.rrd", "b.RRD"), ("a", "b")):
         convert(folder, tmp_path / first)
         convert(tmp_path / first, tmp_path / second)
@@ -66,7 +66,7 @@ def test_a_recording_of_a_recording_and_a_folder_of_a_folder(folder: Path, tmp_p
 
 
 @pytest.mark.parametrize("name", ["taken", "taken.rrd"])
-def test_what_is_there_stays(folder: Path, tmp_path: Path, name: str) -> None:
+def test_what_is_there_stays(folder, tmp_path, name):
     taken = tmp_path / name
     taken.write_bytes(b"kept")
     with pytest.raises(DataError, match="exists, and nothing is overwritten"):
@@ -74,7 +74,7 @@ def test_what_is_there_stays(folder: Path, tmp_path: Path, name: str) -> None:
     assert taken.read_bytes() == b"kept"
 
 
-def test_force_replaces_a_recording_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+def test_force_replaces_a_recording_and_nothing_else(folder, tmp_path):
     (tmp_path / "old.rrd").write_bytes(b"old")
     convert(folder, tmp_path / "old.rrd", force=True)
     assert Session.load(tmp_path / "old.rrd").digest() == Session.load(folder).digest()
@@ -88,7 +88,7 @@ def test_force_replaces_a_recording_and_nothing_else(folder: Path, tmp_path: Pat
     assert (tmp_path / "file").read_bytes() == (tmp_path / "full/file").read_bytes() == b"kept"
 
 
-def test_a_recording_is_not_written_over_itself(folder: Path, tmp_path: Path) -> None:
+def test_a_recording_is_not_written_over_itself(folder, tmp_path):
     path = tmp_path / "cell.rrd"
     convert(folder, path)
     before = path.read_bytes()
@@ -97,7 +97,7 @@ def test_a_recording_is_not_written_over_itself(folder: Path, tmp_path: Path) ->
     assert path.read_bytes() == before
 
 
-def test_the_recording_that_comes_along_calibrates(tmp_path: Path) -> None:
+def test_the_recording_that_comes_along_calibrates(tmp_path):
     path = Path(__file__).parents[2] / "recordings" / "ur10e_charuco.rrd"
     assert path.stat().st_size < 3_000_000
     folder = tmp_path / "ur10e_charuco"
@@ -110,7 +110,7 @@ def test_the_recording_that_comes_along_calibrates(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["absent", "empty", "notes.txt"])
-def test_what_is_no_session_is_named(tmp_path: Path, name: str) -> None:
+def test_what_is_no_session_is_named(tmp_path, name):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("no session")
     with pytest.raises(DataError, match=name):
@@ -118,7 +118,7 @@ def test_what_is_no_session_is_named(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / "new.rrd").exists()
 
 
-def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
+def test_the_command_converts_and_refuses(folder, tmp_path):
     done = visioncal("convert", folder, tmp_path / "new.rrd")
     assert done.status == 0, done.err
     assert Session.load(folder).digest() in done.err
@@ -128,7 +128,7 @@ def test_the_command_converts_and_refuses(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def misread(tmp_path: Path) -> Session:
+def misread(tmp_path):
     """A session whose copy in the folder `mm` has its positions in millimetres."""
     session = made_up(9, images=False).session
     cells = [
@@ -143,7 +143,7 @@ def misread(tmp_path: Path) -> Session:
 
 
 @pytest.mark.usefixtures("misread")
-def test_no_answer_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_answer_writes_nothing(tmp_path, monkeypatch):
     terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr("visioncal.cli.convert.sys", terminal)
     command = ["convert", str(tmp_path / "mm"), str(tmp_path / "no"), "--guess"]
@@ -152,7 +152,7 @@ def test_no_answer_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert not (tmp_path / "no").exists()
 
 
-def test_a_session_whose_poses_are_misread_is_mended(misread: Session, tmp_path: Path) -> None:
+def test_a_session_whose_poses_are_misread_is_mended(misread, tmp_path):
     asked = visioncal("convert", tmp_path / "mm", tmp_path / "no", "--guess")
     assert asked.status == 2
     assert "--yes" in asked.err
@@ -168,9 +168,7 @@ def test_a_session_whose_poses_are_misread_is_mended(misread: Session, tmp_path:
         assert new.text == old.text
 
 
-def test_what_describes_somebody_elses_poses_is_refused_for_a_session(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_what_describes_somebody_elses_poses_is_refused_for_a_session(folder, tmp_path):
     done = visioncal("convert", folder, tmp_path / "new", "--robot-unit", "mm")
     assert done.status == 2
     assert "is a session already" in done.err

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ REQUESTED = ImportOptions(
 )
 
 
-def poses(folder: Path, *, named: bool = True) -> Path:
+def poses(folder, *, named=True):
     lines = ["x,y,z,qx,qy,qz,qw" + ",image" * named]
     for name, row in zip(NAMES, quaternions(CELL.robot.base_from_flange).tolist(), strict=True):
         lines.append(",".join([*map(repr, row), *[name] * named]))
@@ -31,7 +30,7 @@ def poses(folder: Path, *, named: bool = True) -> Path:
     return path
 
 
-def mrcal(folder: Path) -> Path:
+def mrcal(folder):
     lines = ["#!/usr/bin/env mrgingham", "## generated", "# filename x y level"]
     # As a shell sorts them: 1, 10, 11, 12, 2.
     for at in sorted(range(VIEWS), key=lambda index: NAMES[index]):
@@ -41,7 +40,7 @@ def mrcal(folder: Path) -> Path:
     return path
 
 
-def table(folder: Path) -> Path:
+def table(folder):
     lines = ["file,corner_id,x,y"]
     for name, px in zip(NAMES, PX.tolist(), strict=True):
         rows = [f"{name},{at},{x!r},{y!r}" for at, (x, y) in enumerate(px)]

@@ -19,7 +19,7 @@ from support.foreign_samples import (
 from typer.testing import CliRunner
 
 from visioncal.cli.app import app
-from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
+from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import (
     DoubtfulSession,
@@ -35,7 +35,7 @@ CAMERA = "cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"
 ORDER = [4, 0, 7, 2, 8, 1, 6, 3, 5]
 
 
-def written(form: PoseForm):
+def written(form):
     """The robot's poses as a maker writes them."""
     return np.array([write_pose(value, form) for value in BASE_FROM_FLANGE])
 

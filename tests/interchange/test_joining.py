@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.kept import assert_same, assert_same_evidence
-from support.samples import Sample, made_up, tool_frame, with_frames
+from support.samples import made_up, tool_frame, with_frames
 
 from visioncal.calibration.run import Run, run
 from visioncal.cli.calibrate import calibrate_command
@@ -24,12 +24,12 @@ from visioncal.simulation import CellOptions, simulate, write_session
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
 @pytest.fixture(scope="module")
-def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def outputs(sample, tmp_path_factory):
     """What a calibration writes."""
     folder = tmp_path_factory.mktemp("written")
     write_outputs(folder, sample.session, Run(sample.calibration, sample.evidence))
@@ -37,11 +37,11 @@ def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(outputs: Path, tmp_path: Path) -> Path:
+def folder(outputs, tmp_path):
     return Path(shutil.copytree(outputs, tmp_path / "out"))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -117,13 +117,13 @@ def test_results_of_another_session_are_refused(sample, folder):
 
 
 @pytest.fixture
-def pairs(tmp_path: Path) -> Path:
+def pairs(tmp_path):
     """A session of pose pairs, which are calibrated in no time."""
     cell = simulate(CellOptions(views=12, seed=1))
     return write_session(cell, tmp_path / "pairs", images=False)
 
 
-def options(session: Path, out: Path) -> CalibrateOptions:
+def options(session, out):
     return CalibrateOptions(session=session, need=NeedOptions(), work=WorkOptions(), out=out)
 
 

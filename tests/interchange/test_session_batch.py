@@ -45,7 +45,7 @@ def here(monkeypatch):
     monkeypatch.setattr(batch_run, "rows_of", lambda jobs, *_: map(work, jobs))
 
 
-def facts(found: Calibration):
+def facts(found):
     return to_document(replace(found, created=""))
 
 

@@ -10,9 +10,9 @@ from support.planned import cell_of, views, whole
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera
 from visioncal.live.planning.candidates import candidates
-from visioncal.live.planning.cell import Box, Limits, PlanCell
+from visioncal.live.planning.cell import Box, Limits
 from visioncal.live.planning.design import choose_stops
 from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.path import order_stops
@@ -31,14 +31,14 @@ BOXES = (
 )
 
 
-def board_plate(cell: PlanCell) -> tuple[FloatArray, FloatArray]:
+def board_plate(cell):
     """The print as a box (pose in the target's frame, size) of a hair's thickness."""
     print_m = outline_m(Sheet(target=cell.target), 0.0)
     low, high = print_m.min(axis=0), print_m.max(axis=0)
     return compose(np.eye(3), 0.5 * (low + high)), high - low + [0, 0, 1e-6]
 
 
-def least_clearance(cell: PlanCell, q: FloatArray) -> float:
+def least_clearance(cell, q):
     """By plain geometry, of arm, camera or board, floor and boxes [m]."""
     pose, size = board_plate(cell)
     boxes = [(box.base_from_box, box.size_m) for box in cell.boxes]
@@ -336,7 +336,7 @@ def test_points_are_inside_where_they_project_inside(model, distortion, edge_px)
     assert 0.1 < holds.mean() < 0.9
 
 
-def _before_the_fold(camera: Camera, points: np.ndarray) -> np.ndarray:
+def _before_the_fold(camera, points):
     """Whether the projection still moves outwards with the ray."""
     farther = points * [1.0 + 1e-6, 1.0 + 1e-6, 1.0]
     middle = camera.matrix[2:]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.killed import kill_and_resume
-from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from support.live_cell import FakeArm, fake_devices, fake_plan
 from support.marks import slow
 from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of, recorded
 
@@ -23,7 +23,6 @@ from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import (
     Capture,
-    CaptureEvent,
     checked_path,
     follow,
     missed_stops,
@@ -31,12 +30,11 @@ from visioncal.live.capture.recording import (
 )
 from visioncal.live.capture.take import image_motion_px
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
 
 
 @pytest.fixture(scope="module")
-def plan() -> PlanFile:
+def plan():
     return fake_plan(5)
 
 
@@ -381,10 +379,10 @@ def test_the_coach_asks_for_what_is_missing(plan):
 class Hand:
     """Leads an arm to the next place as soon as a view is there; in the end it presses Ctrl-C."""
 
-    def __init__(self, arm: FakeArm, places: list[np.ndarray]) -> None:
+    def __init__(self, arm, places):
         self.arm, self.places = arm, iter(places)
 
-    def stepped(self, _: CaptureEvent) -> None:
+    def stepped(self, _):
         """Leads it on."""
         place = next(self.places, None)
         if place is None:
@@ -427,7 +425,7 @@ def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
     assert len(Session.load(tmp_path / "live").views) == 2
 
 
-def _capture(folder, plan: PlanFile, arm: FakeArm, camera: FakeCamera) -> Capture:
+def _capture(folder, plan, arm, camera):
     journal = Journal.begin(folder, facts_of(plan, arm, camera), arm.clock.unix_offset_s(), 0)
     cell = LiveCell(arm, (camera,), arm.clock)
     planned = plan.cell

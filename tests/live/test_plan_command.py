@@ -4,13 +4,12 @@ import json
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 from scipy.spatial.distance import pdist
-from support.commands import Done, visioncal
+from support.commands import visioncal
 from support.drawn import column
 from support.marks import slow
 
@@ -46,7 +45,7 @@ def strict_rerun():
     rr.set_strict_mode(False)
 
 
-def plan(source: object, out: Path, *more: object, **cell: str) -> Done:
+def plan(source, out, *more, **cell):
     options = CELL | {f"--{name}": value for name, value in cell.items()}
     return visioncal(
         "plan", source, "-o", out, *more, *(name for two in options.items() for name in two)
@@ -54,7 +53,7 @@ def plan(source: object, out: Path, *more: object, **cell: str) -> Done:
 
 
 @pytest.fixture(scope="module")
-def planned(tmp_path_factory) -> Path:
+def planned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("planned") / "größer"
     done = plan("ur5e", folder, "--stops", 6, "--box", "post:400,600,300:100,100,600")
     assert done.status == 0, done.err
@@ -62,12 +61,12 @@ def planned(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def document(planned) -> dict:
+def document(planned):
     return json.loads((planned / "plan.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
-def one_axis(tmp_path_factory) -> Path:
+def one_axis(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sessions") / "one axis"
     return write_session(simulate(ONE_AXIS), folder)
 
@@ -250,7 +249,7 @@ def test_what_is_written_wrongly_is_told_before_what_is_missing(option, said, tm
     assert f"error: {option} is " in done.err
 
 
-def folding_arm(folder: Path) -> Path:
+def folding_arm(folder):
     """An arm of six axes whose joints turn so far that it can fold back onto its own base."""
     rows = [
         (0.15, 0.5, 0.45, 0.0),

@@ -7,7 +7,6 @@ import re
 import signal
 import sys
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import patch
 
 import cv2
@@ -15,9 +14,9 @@ import numpy as np
 import pytest
 import rerun as rr
 from scipy.spatial.transform import Rotation
-from support.commands import Done, visioncal
+from support.commands import visioncal
 from support.drawn import column
-from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
+from support.live_cell import fake_devices, fake_plan
 from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
@@ -59,13 +58,13 @@ def cell(planned, monkeypatch):
     return arm, camera
 
 
-def _use(monkeypatch, arm: FakeArm, camera: FakeCamera) -> None:
+def _use(monkeypatch, arm, camera):
     monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm, "manual": lambda _: arm})
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
     monkeypatch.setattr(record_module, "HostClock", lambda: arm.clock)
 
 
-def record(out, *more: object) -> Done:
+def record(out, *more):
     return visioncal("record", "-o", out, *ARM, *CAMERA, *QUICK, *more)
 
 
@@ -143,7 +142,7 @@ def test_nothing_moves_without_a_word(planned, cell, tmp_path):
         assert arm.moves == 0
 
 
-def _at_terminal(typed: str, out: Path, *more: object) -> Done:
+def _at_terminal(typed, out, *more):
     terminal = io.StringIO(typed)
     terminal.isatty = lambda: True
     with patch.object(sys, "stdin", terminal):
@@ -371,7 +370,7 @@ def test_a_recording_is_drawn(tmp_path):
 
 
 def test_without_a_display_the_recording_goes_on(planned, cell, tmp_path, monkeypatch):
-    def none(_: str):
+    def none(_):
         raise DriverError("rerun's viewer cannot be shown here; is there a display?")
 
     monkeypatch.setattr(viewer, "live_viewer", none)

@@ -1,7 +1,6 @@
 """The calibrated arm in the report and in the recording."""
 
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,21 +8,21 @@ from rerun.chunk import RrdReader
 from support.arm_documents import calibrated, stays_stated, with_holdout
 from support.drawn import column
 from support.findings import with_findings
-from support.samples import Sample, made_up
+from support.samples import made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, read_calibration, write_recording
 from visioncal.present.recording.accuracy import ArmPicture
 from visioncal.present.viewer import blueprint
-from visioncal.results import Calibration, to_document
+from visioncal.results import to_document
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
-def with_arm(sample: Sample, document: dict[str, Any]) -> Calibration:
+def with_arm(sample, document):
     return with_findings(sample, {"kinematics": document})
 
 

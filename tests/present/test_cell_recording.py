@@ -16,8 +16,8 @@ from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_calibration, read_session
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.scene import Scene
-from visioncal.results import Calibration, Edge, ViewResult, to_document
-from visioncal.session import MemoryImages, Session
+from visioncal.results import Edge, ViewResult, to_document
+from visioncal.session import MemoryImages
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, cell_session, simulate
 
 OPTIONS = NetworkOptions(
@@ -33,11 +33,11 @@ def cell():
 
 
 @pytest.fixture(scope="module")
-def session(cell) -> Session:
+def session(cell):
     return cell_session(cell, "cell", seen="poses")
 
 
-def true_result(cell, session) -> Calibration:
+def true_result(cell, session):
     """What calibrating a simulated cell would give, were it exact."""
     origin = invert(cell.mountings["base_a"])
     edges = {

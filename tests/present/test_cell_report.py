@@ -8,16 +8,16 @@ from support.aligned_cells import made_up_cell
 from visioncal.core.number_format import significant
 from visioncal.present.network_layout import pairs
 from visioncal.present.report.page import render
-from visioncal.results import Calibration, ViewResult
+from visioncal.results import ViewResult
 
 CELL = made_up_cell(5)
 
 
-def render_cell(found: Calibration) -> str:
+def render_cell(found):
     return render(found, None, ())
 
 
-def text_of(html: str) -> str:
+def text_of(html):
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
 
 

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from support.kept import assert_same_evidence
 from support.samples import (
     BASE_FROM_FIXTURE,
     FLANGE_FROM_TOOL,
-    Sample,
     fixture_frame,
     made_up,
     with_frames,
@@ -30,12 +28,12 @@ from visioncal.results import to_document
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return with_frames(made_up())
 
 
 @pytest.fixture(scope="module")
-def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(sample, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, sample.evidence, None)
     return path

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import rerun as rr
 from rerun.chunk import OptimizationProfile, RrdReader
 from support.drawn import column
 from support.kept import assert_same, assert_same_evidence
-from support.samples import Sample, made_up
+from support.samples import made_up
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners
@@ -36,7 +35,7 @@ DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 
 
 @pytest.fixture(autouse=True)
-def strict_rerun() -> Iterator[None]:
+def strict_rerun():
     """Turns rerun's warnings, which it prints and forgets, into errors."""
     rr.set_strict_mode(True)
     yield
@@ -44,12 +43,12 @@ def strict_rerun() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
 @pytest.fixture(scope="module")
-def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(sample, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(
         path, sample.session, sample.calibration, sample.evidence, blueprint(sample.session)
@@ -57,17 +56,17 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def write_session(path: Path, session: Session) -> Path:
+def write_session(path, session):
     write_recording(path, session, None, (), None)
     return path
 
 
-def test_recording_gives_the_session_back(sample: Sample, recorded: Path) -> None:
+def test_recording_gives_the_session_back(sample, recorded):
     assert_same(sample.session, Session.load(recorded))
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted by Linux")
-def test_writing_leaves_no_threads(sample: Sample, tmp_path: Path) -> None:
+def test_writing_leaves_no_threads(sample, tmp_path):
     counts = []
     for index in range(4):
         write_session(tmp_path / f"{index}.rrd", sample.session)
@@ -76,12 +75,12 @@ def test_writing_leaves_no_threads(sample: Sample, tmp_path: Path) -> None:
     assert max(counts[1:]) <= counts[0]
 
 
-def test_results_do_not_change_the_session(sample: Sample, tmp_path: Path) -> None:
+def test_results_do_not_change_the_session(sample, tmp_path):
     alone = write_session(tmp_path / "session.rrd", sample.session)
     assert_same(sample.session, read_session(alone))
 
 
-def test_results_come_back_exactly(sample: Sample, tmp_path: Path) -> None:
+def test_results_come_back_exactly(sample, tmp_path):
     path = tmp_path / "recording.rrd"
     # In another order than the views': the report goes by it.
     evidence = sample.evidence[::-1]
@@ -95,20 +94,20 @@ def test_results_come_back_exactly(sample: Sample, tmp_path: Path) -> None:
     assert read_evidence(path) == ()
 
 
-def test_evidence_of_other_views_is_refused(sample: Sample, tmp_path: Path) -> None:
+def test_evidence_of_other_views_is_refused(sample, tmp_path):
     other = [replace(sample.evidence[0], view=9)]
     with pytest.raises(DataError, match="The evidence names view 9"):
         write_recording(tmp_path / "recording.rrd", sample.session, None, other, None)
 
 
-def test_folder_to_recording_to_folder(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+def test_folder_to_recording_to_folder(sample, recorded, tmp_path):
     sample.session.save(tmp_path / "folder")
     read_session(recorded).save(tmp_path / "again")
     assert_same(Session.load(tmp_path / "folder"), Session.load(tmp_path / "again"))
 
 
 @pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
-def test_real_session_round_trip(name: str, tmp_path: Path) -> None:
+def test_real_session_round_trip(name, tmp_path):
     folder = DATA / name
     if not folder.is_dir():
         pytest.skip("the shared sessions are not beside this checkout")
@@ -116,7 +115,7 @@ def test_real_session_round_trip(name: str, tmp_path: Path) -> None:
     assert_same(session, read_session(write_session(tmp_path / "real.rrd", session)))
 
 
-def test_odd_facts_survive(tmp_path: Path) -> None:
+def test_odd_facts_survive(tmp_path):
     document = {
         "schema": 1,
         "name": 'Prüf\n\t"1" \N{ROBOT FACE}',
@@ -136,9 +135,7 @@ def test_odd_facts_survive(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("step", "words"), [(1, "Install visioncal 9.1 or newer"), (-1, "folder again")]
 )
-def test_another_format_says_what_to_do(
-    step: int, words: str, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_format_says_what_to_do(step, words, sample, tmp_path, monkeypatch):
     with monkeypatch.context() as other:
         other.setattr(codec, "FORMAT", codec.FORMAT + step)
         other.setattr(codec, "__version__", "9.1")
@@ -149,9 +146,7 @@ def test_another_format_says_what_to_do(
         assert words in error.value.next_step
 
 
-def test_recording_that_rerun_saved_again_opens(
-    sample: Sample, recorded: Path, tmp_path: Path
-) -> None:
+def test_recording_that_rerun_saved_again_opens(sample, recorded, tmp_path):
     again = tmp_path / "again.rrd"
     # Rerun joins small chunks and orders them anew.
     RrdReader(recorded).stream().collect(optimize=OptimizationProfile()).write_rrd(
@@ -160,7 +155,7 @@ def test_recording_that_rerun_saved_again_opens(
     assert_same(sample.session, read_session(again))
 
 
-def test_images_stay_in_the_recording_until_they_are_read(sample: Sample, tmp_path: Path) -> None:
+def test_images_stay_in_the_recording_until_they_are_read(sample, tmp_path):
     path = write_session(tmp_path / "session.rrd", sample.session)
     session = read_session(path)
     image = session.views[2].image
@@ -171,7 +166,7 @@ def test_images_stay_in_the_recording_until_they_are_read(sample: Sample, tmp_pa
         session.images.read("none.png")
 
 
-def test_missing_and_shared_images_stay_so(sample: Sample, tmp_path: Path) -> None:
+def test_missing_and_shared_images_stay_so(sample, tmp_path):
     first, second, third = sample.session.views[:3]
     views = (first, replace(second, image=first.image), replace(third, image="images/none.png"))
     session = replace(sample.session, views=views)
@@ -180,7 +175,7 @@ def test_missing_and_shared_images_stay_so(sample: Sample, tmp_path: Path) -> No
     assert not again.images.exists("images/none.png")
 
 
-def test_what_is_no_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
+def test_what_is_no_recording_is_refused(recorded, tmp_path):
     junk, cut, foreign = (tmp_path / f"{name}.rrd" for name in ("junk", "cut", "foreign"))
     junk.write_bytes(b"no recording" * 100)
     cut.write_bytes(recorded.read_bytes()[:500])
@@ -194,9 +189,9 @@ def test_what_is_no_recording_is_refused(recorded: Path, tmp_path: Path) -> None
         assert path.name in error.value.message
 
 
-def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> None:
+def test_failed_write_leaves_the_old_file(sample, tmp_path):
     class Broken(MemoryImages):
-        def read(self, path: str) -> bytes:
+        def read(self, path):
             raise DataError(f"{path} cannot be read.")
 
     path = tmp_path / "recording.rrd"
@@ -213,9 +208,7 @@ def test_failed_write_leaves_the_old_file(sample: Sample, tmp_path: Path) -> Non
         write_session(path, sample.session)
 
 
-def test_full_disk_is_an_error(
-    sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_an_error(sample, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
     with pytest.raises(DataError, match="cannot be written: 3 MB are free"):
@@ -239,7 +232,7 @@ except DataError as error:
 """
 
 
-def test_a_writer_that_has_ended_is_not_waited_for_without_end(tmp_path: Path) -> None:
+def test_a_writer_that_has_ended_is_not_waited_for_without_end(tmp_path):
     command = [sys.executable, "-c", _LIMITED, str(tmp_path / "recording.rrd")]
     # A hundred times what it takes: without a limit it would not end at all.
     done = subprocess.run(
@@ -254,7 +247,7 @@ def test_a_writer_that_has_ended_is_not_waited_for_without_end(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample: Sample, recorded: Path) -> None:
+def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample, recorded):
     drawn = column(recorded, paths.DETECTED, "Points2D:positions")
     # View 3 found no corners: an empty batch takes those of view 2 off the screen.
     assert len(drawn[3]) == 0
@@ -264,7 +257,7 @@ def test_corners_are_drawn_where_the_viewer_has_the_pixels(sample: Sample, recor
     np.testing.assert_allclose(drawn[4], corners.px + 0.5, atol=1e-4)
 
 
-def test_camera_is_drawn_at_the_end_of_the_chain(sample: Sample, recorded: Path) -> None:
+def test_camera_is_drawn_at_the_end_of_the_chain(sample, recorded):
     flanges = column(recorded, paths.FLANGE, "Transform3D:translation")
     camera = column(recorded, paths.CAMERA, "Transform3D:translation")[0]
     edge = sample.calibration.transforms["flange_from_cam"]
@@ -275,7 +268,7 @@ def test_camera_is_drawn_at_the_end_of_the_chain(sample: Sample, recorded: Path)
         np.testing.assert_allclose(position[0], seen.base_from_flange[:3, 3], atol=1e-6)
 
 
-def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
+def test_session_without_images_can_be_recorded(tmp_path):
     sample = made_up(images=False)
     path = tmp_path / "poses.rrd"
     write_recording(
@@ -285,10 +278,10 @@ def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
     assert column(path, paths.DETECTED, "Points2D:positions") == {}
 
 
-def test_magnification_fits_the_residuals() -> None:
+def test_magnification_fits_the_residuals():
     px = np.zeros((4, 2))
 
-    def shown(error_px: float) -> ViewEvidence:
+    def shown(error_px):
         return ViewEvidence(0, Corners(0, np.arange(4), px, 1.0), px + np.array([error_px, 0.0]))
 
     # A fiftieth of 1000 px is 20 px: 0.1 px may grow 200 times, 30 px not at all.

@@ -2,11 +2,10 @@
 
 import os
 import random
-from pathlib import Path
 
 import pytest
 from support.kept import assert_same, assert_same_evidence
-from support.samples import Sample, made_up
+from support.samples import made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths, read_calibration, read_evidence, write_recording
@@ -15,18 +14,18 @@ from visioncal.session import Session
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
 @pytest.fixture(scope="module")
-def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(sample, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, sample.evidence, None)
     return path
 
 
-def test_a_cut_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
+def test_a_cut_recording_is_refused(recorded, tmp_path):
     rng, data, cut = random.Random(3), recorded.read_bytes(), tmp_path / "cut.rrd"
     for size in (12, 13, len(data) - 20, *(rng.randrange(len(data)) for _ in range(30))):
         # A loss of power leaves zeros.
@@ -36,7 +35,7 @@ def test_a_cut_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
                 Session.load(cut)
 
 
-def test_flipped_bytes_in_images_are_named(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+def test_flipped_bytes_in_images_are_named(sample, recorded, tmp_path):
     rng, broken = random.Random(4), tmp_path / "broken.rrd"
     for _ in range(20):
         view = rng.choice(sample.session.views)
@@ -54,9 +53,7 @@ def test_flipped_bytes_in_images_are_named(sample: Sample, recorded: Path, tmp_p
 
 
 @pytest.mark.parametrize("entity", [paths.SESSION, paths.IMAGE, paths.CALIBRATION])
-def test_no_flipped_bit_changes_anything_silently(
-    entity: str, sample: Sample, recorded: Path, tmp_path: Path
-) -> None:
+def test_no_flipped_bit_changes_anything_silently(entity, sample, recorded, tmp_path):
     rng, broken = random.Random(5), tmp_path / "broken.rrd"
     frames = [frame for frame, _, _ in chunks(recorded, (entity,))]
     refused = 0
@@ -78,7 +75,7 @@ def test_no_flipped_bit_changes_anything_silently(
     assert refused > 10
 
 
-def test_changed_result_leaves_the_session(sample: Sample, recorded: Path, tmp_path: Path) -> None:
+def test_changed_result_leaves_the_session(sample, recorded, tmp_path):
     data, path = recorded.read_bytes(), tmp_path / "changed.rrd"
     assert data.count(b"2026-11-20T10:11:12") == 1
     path.write_bytes(data.replace(b"2026-11-20T10:11:12", b"2026-11-20T10:11:13"))
@@ -87,7 +84,7 @@ def test_changed_result_leaves_the_session(sample: Sample, recorded: Path, tmp_p
     assert_same(sample.session, Session.load(path))
 
 
-def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
+def test_a_pipe_is_no_recording(tmp_path):
     os.mkfifo(tmp_path / "pipe.rrd")
     with pytest.raises(DataError, match="is no regular file"):
         Session.load(tmp_path / "pipe.rrd")

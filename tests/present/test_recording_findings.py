@@ -1,14 +1,13 @@
 """What a recording tells of board, arm and uncertainty, and how it draws views left out."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from support.drawn import column
 from support.findings import healthy, sick, with_findings
-from support.samples import TARGET, Sample, made_up
+from support.samples import TARGET, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, write_recording
@@ -18,12 +17,12 @@ from visioncal.vision.targets import corner_positions, load_target
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
 @pytest.fixture(scope="module")
-def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(sample, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "recording.rrd"
     write_recording(path, sample.session, sample.calibration, sample.evidence, None)
     return path
@@ -42,14 +41,12 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("uncertainty", ["no table"], r"uncertainty is \['no table'\]; a table is needed"),
     ],
 )
-def test_findings_that_cannot_be_read_are_named(
-    sample: Sample, name: str, document: dict, words: str
-) -> None:
+def test_findings_that_cannot_be_read_are_named(sample, name, document, words):
     with pytest.raises(DataError, match=words):
         with_findings(sample, {name: document})
 
 
-def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> None:
+def test_the_board_is_as_large_and_as_deep_as_its_corners(sample):
     target = load_target(TARGET)
     board = with_findings(sample, sick()).board
     flat, bent = corner_positions(target), board.corners(target)
@@ -61,9 +58,7 @@ def test_the_board_is_as_large_and_as_deep_as_its_corners(sample: Sample) -> Non
     assert 2.5e-4 < np.ptp(bent[:, 2]) <= 3e-4
 
 
-def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
-    sample: Sample, recorded: Path
-) -> None:
+def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(sample, recorded):
     used = [view.residual_mm for view in sample.calibration.views if view.used]
     beyond = column(recorded, f"{paths.POSITION_MM}/{paths.BEYOND}", "Scalars:scalars")
     # View 6 is off by 14 mm, fifty times as far as the others; view 3 has no residual at all.
@@ -74,7 +69,7 @@ def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
     assert "14.2 mm" in notes.view_markdown(sample.calibration.views[6])
 
 
-def test_residuals_of_views_left_out_are_drawn_to_scale(sample: Sample, recorded: Path) -> None:
+def test_residuals_of_views_left_out_are_drawn_to_scale(sample, recorded):
     overlay = Overlay.of(
         sample.session, sample.calibration, {view.view: view for view in sample.evidence}
     )
@@ -92,7 +87,7 @@ def test_residuals_of_views_left_out_are_drawn_to_scale(sample: Sample, recorded
             np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
-def test_placements_far_out_are_drawn_at_arm_s_length(sample: Sample, tmp_path: Path) -> None:
+def test_placements_far_out_are_drawn_at_arm_s_length(sample, tmp_path):
     away = np.eye(4)
     away[:3, 3] = [0.3, 0.0, 0.4]
     seen = sample.evidence[6]
@@ -113,18 +108,18 @@ def test_placements_far_out_are_drawn_at_arm_s_length(sample: Sample, tmp_path: 
     np.testing.assert_allclose(points, [arrow], atol=1e-6)
 
 
-def test_the_target_as_a_view_left_out_sees_it_is_marked(recorded: Path) -> None:
+def test_the_target_as_a_view_left_out_sees_it_is_marked(recorded):
     drawn = column(recorded, paths.SEEN_TARGET, "LineStrips3D:colors")
     assert drawn[6] != drawn[5] == drawn[4]
 
 
-def test_plots_explain_marks_only_where_there_are_some(sample: Sample) -> None:
+def test_plots_explain_marks_only_where_there_are_some(sample):
     views = tuple(replace(view, used=True, reason="") for view in sample.calibration.views)
     everything = replace(sample.calibration, views=views)
     assert "red: not used" in str(blueprint_names(sample, sample.calibration))
     assert "not used" not in str(blueprint_names(sample, everything))
 
 
-def blueprint_names(sample: Sample, calibration) -> list[str]:
+def blueprint_names(sample, calibration):
     tabs = blueprint(sample.session, calibration).root_container.contents
     return [view.name for view in tabs[1].contents[0].contents]

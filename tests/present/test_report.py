@@ -5,14 +5,13 @@ import re
 import shutil
 from dataclasses import replace
 from html import unescape
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from support.findings import CONTRADICTS, with_contradiction
 from support.pages import Page, section
-from support.samples import REJECTED, Sample, made_up
+from support.samples import REJECTED, made_up
 
 from visioncal.calibration.run import Run, run
 from visioncal.core.errors import DataError
@@ -31,16 +30,16 @@ from visioncal.vision.boards.imaging import decode_image
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     return made_up()
 
 
 @pytest.fixture(scope="module")
-def html(sample: Sample) -> str:
+def html(sample):
     return render(sample.calibration, sample.session, sample.evidence)
 
 
-def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
+def test_views_that_contradict_the_others_are_set_apart(sample):
     html = render(with_contradiction(sample), sample.session, sample.evidence)
     page, rows = Page(html), [" ".join(row.split()) for row in Page(html).rows]
     assert f"view 6 not used {CONTRADICTS}" in rows
@@ -53,7 +52,7 @@ def test_views_that_contradict_the_others_are_set_apart(sample: Sample) -> None:
     assert " 14 " in section(page, "Residuals by view", "Residuals over joint angles")
 
 
-def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
+def test_real_contradictions_are_recognised(tmp_path):
     cell = simulate(CellOptions(views=15, wrong_views=1))
     write_session(cell, tmp_path / "cell", images=False)
     calibration = run(tmp_path / "cell").calibration
@@ -62,7 +61,7 @@ def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def outputs(sample, tmp_path_factory):
     """What a calibration writes."""
     folder = tmp_path_factory.mktemp("out put")
     write_outputs(folder, sample.session, Run(sample.calibration, sample.evidence))
@@ -70,7 +69,7 @@ def outputs(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["", "calibration.json", "recording.rrd"])
-def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str) -> None:
+def test_report_made_again_is_the_same(outputs, tmp_path, name):
     stored = load_stored(outputs / name)
     write_report(
         tmp_path / "again.html",
@@ -83,7 +82,7 @@ def test_report_made_again_is_the_same(outputs: Path, tmp_path: Path, name: str)
     assert (tmp_path / "again.html").read_bytes() == (outputs / "report.html").read_bytes()
 
 
-def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> None:
+def test_views_lead_to_the_recording_and_back(sample, outputs):
     page = (outputs / "report.html").read_text(encoding="utf-8")
     worst = worst_view(sample.calibration.views, sample.calibration.rms)
     assert f"visioncal show '{outputs}' --viewer --view {worst}" in unescape(page)
@@ -95,7 +94,7 @@ def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> 
     assert "--viewer" not in render(sample.calibration, None, ())
 
 
-def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> None:
+def test_report_without_its_recording_says_so(outputs, tmp_path):
     shutil.copy(outputs / "calibration.json", tmp_path)
     stored = load_stored(tmp_path)
     assert "no recording.rrd" in stored.note
@@ -107,9 +106,7 @@ def test_report_without_its_recording_says_so(outputs: Path, tmp_path: Path) -> 
     assert "Pictures" not in page.words.replace(stored.note, "")
 
 
-def test_recording_of_another_result_is_not_mixed_in(
-    sample: Sample, outputs: Path, tmp_path: Path
-) -> None:
+def test_recording_of_another_result_is_not_mixed_in(sample, outputs, tmp_path):
     shutil.copy(outputs / "recording.rrd", tmp_path)
     replace(sample.calibration, created="2026-11-21T00:00:00+00:00").save(
         tmp_path / "calibration.json"
@@ -119,13 +116,13 @@ def test_recording_of_another_result_is_not_mixed_in(
     assert stored.session is None
 
 
-def test_session_alone_has_no_report(sample: Sample, tmp_path: Path) -> None:
+def test_session_alone_has_no_report(sample, tmp_path):
     write_recording(tmp_path / "session.rrd", sample.session, None, (), None)
     with pytest.raises(DataError, match="without a result"):
         load_stored(tmp_path / "session.rrd")
 
 
-def test_names_and_reasons_are_text(sample: Sample, html: str) -> None:
+def test_names_and_reasons_are_text(sample, html):
     page = Page(html)
     assert sample.session.name in page.words
     assert REJECTED[6] in page.words
@@ -133,14 +130,14 @@ def test_names_and_reasons_are_text(sample: Sample, html: str) -> None:
     assert "<b>robot moved" not in html
 
 
-def test_nothing_is_loaded_from_elsewhere(html: str) -> None:
+def test_nothing_is_loaded_from_elsewhere(html):
     for reference in Page(html).references:
         assert reference.startswith(("#", "data:image/")), reference
     assert not re.search(r"url\((?!#)", html)
     assert "@import" not in html
 
 
-def test_identifiers_of_figures_stay_apart(html: str) -> None:
+def test_identifiers_of_figures_stay_apart(html):
     identifiers = re.findall(r'\bid="([^"]+)"', html)
     assert len(identifiers) == len(set(identifiers))
     assert {value.removeprefix("#") for value in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
@@ -148,7 +145,7 @@ def test_identifiers_of_figures_stay_apart(html: str) -> None:
     )
 
 
-def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html: str) -> None:
+def test_pictures_show_the_best_the_worst_and_the_rejected(sample, html):
     words = Page(html).words
     used = [view for view in sample.calibration.views if view.used and view.rms_px is not None]
     best, worst = min(used, key=lambda item: item.rms_px), max(used, key=lambda item: item.rms_px)
@@ -162,7 +159,7 @@ def test_pictures_show_the_best_the_worst_and_the_rejected(sample: Sample, html:
         assert cv2.imdecode(jpeg, cv2.IMREAD_COLOR) is not None
 
 
-def test_spoilt_images_do_not_spoil_the_report(sample: Sample) -> None:
+def test_spoilt_images_do_not_spoil_the_report(sample):
     files = {view.image: b"no image" for view in sample.session.views[:5]}
     files[sample.session.views[5].image] = b""
     session = replace(sample.session, images=MemoryImages(files))
@@ -171,7 +168,7 @@ def test_spoilt_images_do_not_spoil_the_report(sample: Sample) -> None:
     assert REJECTED[3] in Page(html).words
 
 
-def test_pictures_lie_as_their_pixels_are_stored() -> None:
+def test_pictures_lie_as_their_pixels_are_stored():
     jpeg = cv2.imencode(".jpg", np.zeros((40, 64), np.uint8))[1].tobytes()
     # Exif, big-endian: one entry, the orientation (0x0112), which says "turned by 90 degrees".
     entry = bytes.fromhex("0112 0003 00000001 0006 0000")
@@ -185,7 +182,7 @@ def test_pictures_lie_as_their_pixels_are_stored() -> None:
 
 
 @pytest.mark.parametrize("size", [(65_000, 1), (1, 70_000), (20_000, 3)])
-def test_pictures_of_one_row_are_drawn(size: tuple[int, int]) -> None:
+def test_pictures_of_one_row_are_drawn(size):
     """Reduced by their width they have no row left, and a JPEG has a longest side."""
     width, height = size
     picture = thumbnail(np.full((height, width, 3), 200, np.uint8), None, "", 0, 1)
@@ -193,7 +190,7 @@ def test_pictures_of_one_row_are_drawn(size: tuple[int, int]) -> None:
     assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
 
 
-def test_many_corners_become_a_bitmap() -> None:
+def test_many_corners_become_a_bitmap():
     many = made_up(90, images=True)
     html = render(many.calibration, None, many.evidence)
     # As vectors, 88 views of 40 corners would be 3520 dots; the other figures have one a view or
@@ -219,5 +216,5 @@ def test_many_corners_become_a_bitmap() -> None:
         (float("inf"), "inf"),
     ],
 )
-def test_significant_digits(value: float | None, text: str) -> None:
+def test_significant_digits(value, text):
     assert significant(value) == text

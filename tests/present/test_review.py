@@ -23,11 +23,11 @@ from visioncal.present.viewer import blueprint
 ENVIRONMENT = os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 
 
-def command(*arguments) -> list[str]:
+def command(*arguments):
     return [sys.executable, "-m", "visioncal", "show", "--viewer", *map(str, arguments)]
 
 
-def review(*arguments, **environment) -> subprocess.CompletedProcess:
+def review(*arguments, **environment):
     return subprocess.run(
         command(*arguments),
         check=False,
@@ -39,7 +39,7 @@ def review(*arguments, **environment) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory) -> Path:
+def out(tmp_path_factory):
     """A folder as `visioncal calibrate` leaves it, of which only the recording matters here."""
     sample = made_up()
     folder = tmp_path_factory.mktemp("out put, größer")
@@ -50,7 +50,7 @@ def out(tmp_path_factory) -> Path:
     return folder
 
 
-def is_open(host: str, port: int) -> bool:
+def is_open(host, port):
     with socket.socket() as connection:
         connection.settimeout(60)
         return connection.connect_ex((host, port)) == 0
@@ -107,7 +107,7 @@ time.sleep(600)
 def stub(tmp_path):
     """Puts a script in the place of rerun's command; gives the environment that does it."""
 
-    def put(script: str) -> dict[str, str]:
+    def put(script):
         package = tmp_path / "site" / "rerun_cli"
         package.mkdir(parents=True)
         (package / "__init__.py").touch()

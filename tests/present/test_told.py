@@ -5,7 +5,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -15,13 +14,12 @@ import pytest
 from support.aligned_cells import made_up_cell, with_cell
 from support.arm_documents import calibrated, stays_stated, with_holdout
 from support.findings import sick, with_contradiction, with_findings
-from support.samples import Sample, fixture_frame, made_up, tool_frame, with_frames
+from support.samples import fixture_frame, made_up, tool_frame, with_frames
 
 from visioncal.core.types import Target
 from visioncal.present.recording.notes import result_markdown, view_markdown
 from visioncal.present.report.page import render
 from visioncal.results import (
-    Calibration,
     Finding,
     Moved,
     Remedy,
@@ -36,7 +34,7 @@ from visioncal.results.arm import ArmLevel, ArmResult
 KEPT = Path(__file__).parents[1] / "data" / "told.json"
 
 
-def bad(sample: Sample) -> Calibration:
+def bad(sample):
     """Two used views far from the others, views that share a reason, and five findings."""
     views = [
         replace(view, residual_mm=9.5) if view.view in (1, 4) else view
@@ -55,7 +53,7 @@ def bad(sample: Sample) -> Calibration:
     return replace(sample.calibration, views=tuple(views), verdict=Verdict("bad", found))
 
 
-def by_park(sample: Sample) -> Calibration:
+def by_park(sample):
     """The answer of a closed form, without a hold-out and with one view."""
     park = sample.calibration.solvers["park"].matrices
     edges = {
@@ -64,7 +62,7 @@ def by_park(sample: Sample) -> Calibration:
     return replace(sample.calibration, edges=edges)
 
 
-def poor(sample: Sample) -> Calibration:
+def poor(sample):
     """One used view, no residuals, no solvers."""
     views = tuple(
         replace(view, residual_mm=0.0, residual_deg=None, rms_px=None)
@@ -73,7 +71,7 @@ def poor(sample: Sample) -> Calibration:
     return replace(sample.calibration, views=views, rms=Rms(0.0, 0.0), solvers={})
 
 
-def exact(sample: Sample) -> Calibration:
+def exact(sample):
     documents = sick()
     documents["uncertainty"]["budget_mm"] = {"poses": 0.0, "total": 0.0}
     documents["uncertainty"]["spectrum"] = [0.0] * 12
@@ -81,7 +79,7 @@ def exact(sample: Sample) -> Calibration:
     return with_findings(sample, documents)
 
 
-def moved(cell: Calibration) -> Calibration:
+def moved(cell):
     """A cell in which a camera moved, a frame is untied, and an arm was calibrated."""
     former, of_top = "cam_top_until_stop_4", {"seer": "cam_top", "seen": "target_plate"}
     joint = replace(
@@ -107,7 +105,7 @@ def moved(cell: Calibration) -> Calibration:
     )
 
 
-def shown() -> Iterator[tuple[str, Calibration, Sample | None]]:
+def shown():
     """Results of many kinds, each with its session and evidence where these are shown, too."""
     sample, poses, cell = made_up(), made_up(5, images=False), made_up_cell(5)
     marker = Target("marker", "marker", 1, 1, 0.1, 1e-4, dictionary="DICT_4X4_50", marker_id=7)
@@ -136,7 +134,7 @@ def shown() -> Iterator[tuple[str, Calibration, Sample | None]]:
     yield "cell that moved", moved(cell), None
 
 
-def words_of(html: str) -> list[str]:
+def words_of(html):
     """What a page says; of its figures, their descriptions."""
     html = re.sub(r"<style>.*?</style>|(?<=<dt>software</dt>)<dd>.*?</dd>", "", html, flags=re.S)
     html = re.sub(r'<svg[^>]*aria-label="([^"]*)".*?</svg>', r"[\1]", html, flags=re.S)
@@ -146,7 +144,7 @@ def words_of(html: str) -> list[str]:
     return [unescape(" ".join(line.split())) for line in lines if line.strip()]
 
 
-def told() -> dict[str, list[str]]:
+def told():
     """Lines of all pages and notes."""
     lines: dict[str, list[str]] = {}
     for name, calibration, sample in shown():
@@ -163,12 +161,12 @@ def told() -> dict[str, list[str]]:
 
 
 @pytest.fixture(scope="module")
-def now() -> dict[str, list[str]]:
+def now():
     return told()
 
 
 @pytest.mark.parametrize("name", json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else [])
-def test_pages_and_notes_say_what_they_said(name: str, now: dict[str, list[str]]) -> None:
+def test_pages_and_notes_say_what_they_said(name, now):
     assert now[name] == json.loads(KEPT.read_text("utf-8"))[name]
 
 

@@ -1,9 +1,7 @@
 """What a recording shows: its layout, the cell and the charts, and how the viewer draws them."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +11,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import RigidTransform, Rotation
 from support.drawn import column
-from support.samples import Sample, made_up, with_frames
+from support.samples import made_up, with_frames
 
 from visioncal.core.transforms import exp, invert
 from visioncal.present import coverage
@@ -27,14 +25,14 @@ from visioncal.vision.targets import corner_positions, target_from_document
 
 
 @pytest.fixture(autouse=True)
-def strict_rerun() -> Iterator[None]:
+def strict_rerun():
     """Turns rerun's warnings, which it prints and forgets, into errors."""
     rr.set_strict_mode(True)
     yield
     rr.set_strict_mode(False)
 
 
-def without_joints(sample: Sample) -> Sample:
+def without_joints(sample):
     session = sample.session
     views = tuple(
         replace(
@@ -47,7 +45,7 @@ def without_joints(sample: Sample) -> Sample:
 
 
 @pytest.fixture(scope="module")
-def samples() -> dict[str, Sample]:
+def samples():
     return {
         "images and joints": made_up(),
         "poses alone": made_up(images=False),
@@ -57,9 +55,7 @@ def samples() -> dict[str, Sample]:
 
 
 @pytest.fixture(scope="module")
-def recordings(
-    samples: dict[str, Sample], tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def recordings(samples, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
     files = {}
     for name, sample in samples.items():
@@ -69,7 +65,7 @@ def recordings(
     return files
 
 
-def views_of(container: rrb.Container | rrb.View) -> Iterator[rrb.View]:
+def views_of(container):
     if isinstance(container, rrb.View):
         yield container
         return
@@ -77,7 +73,7 @@ def views_of(container: rrb.Container | rrb.View) -> Iterator[rrb.View]:
         yield from views_of(content)
 
 
-def tabs(sample: Sample) -> dict[str, list[str]]:
+def tabs(sample):
     root = blueprint(sample.session, sample.calibration).root_container
     return {tab.name: [view.name for view in views_of(tab)] for tab in root.contents}
 

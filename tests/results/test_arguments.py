@@ -1,10 +1,8 @@
 """Public functions given what they do not take: refused by name, never from inside."""
 
 import inspect
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,14 +34,14 @@ class Bench:
     folder: Path
 
     @property
-    def foreign(self) -> list[Any]:
+    def foreign(self):
         """What people hand over by mistake."""
         files = [None, BOARD, self.folder / "views.csv", {"a": 1}, 3.5, [1], object()]
         in_colour = np.dstack([self.image] * 3)
         return [*files, self.session, self.calibration, self.image.astype(float), in_colour]
 
     @property
-    def sound(self) -> dict[str, Any]:
+    def sound(self):
         """Arguments by name; what is not here is given as the wrong one is."""
         return {
             "session": self.session,
@@ -62,7 +60,7 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory) -> Bench:
+def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench") / "session"
     cell = simulate(CellOptions(views=4, seed=2))
     write_session(cell, folder)
@@ -72,7 +70,7 @@ def bench(tmp_path_factory) -> Bench:
     return Bench(session, calibration_of(cell), image, pose, folder)
 
 
-def public_functions() -> Iterator[Callable[..., Any]]:
+def public_functions():
     for name in visioncal.__all__:
         thing = getattr(visioncal, name)
         if callable(thing) and not inspect.isclass(thing):
@@ -81,7 +79,7 @@ def public_functions() -> Iterator[Callable[..., Any]]:
             yield getattr(thing, method)
 
 
-def is_refused(function: Callable[..., Any], given: dict[str, Any]) -> bool:
+def is_refused(function, given):
     try:
         function(**given)
     except VisioncalError:

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,31 +17,31 @@ from support.pairs import (
 from support.samples import made_up
 
 from visioncal.core.transforms import exp, invert, log
-from visioncal.core.types import Camera, Mount
+from visioncal.core.types import Camera
 from visioncal.results import Calibration, CameraResult, Edge, ViewResult
 from visioncal.results.compare import FALSE_ALARMS, compare, to_document
-from visioncal.simulation import CellOptions, SimulatedCell, simulate
+from visioncal.simulation import CellOptions, simulate
 
 PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
 
 
 @cache
-def cells(mount: Mount, seed: int) -> tuple[SimulatedCell, SimulatedCell]:
+def cells(mount, seed):
     """Two cells of one truth, with a lens that is to be estimated."""
     options = CellOptions(mount=mount, views=40, seed=seed, state_intrinsics=False)
     return halves(simulate(options))
 
 
 @cache
-def pair(mount: Mount, seed: int) -> tuple[Calibration, Calibration]:
+def pair(mount, seed):
     first, second = cells(mount, seed)
     return calibrated_cell(first), calibrated_cell(second)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_noise_is_no_change(mount: Mount) -> None:
+def test_noise_is_no_change(mount):
     compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
     # One in a hundred may be told apart: two of eight come once in four hundred such runs.
     assert sum(comparison.is_change for comparison in compared) <= 1
@@ -61,7 +60,7 @@ def test_noise_is_no_change(mount: Mount) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
-def test_a_camera_moved_by_five_sigma_is_found(mount: Mount) -> None:
+def test_a_camera_moved_by_five_sigma_is_found(mount):
     for seed in range(2):
         reference, second = pair(mount, seed)[0], cells(mount, seed)[1]
         sigma_m = 1e-3 * compare(*pair(mount, seed)).edges[0].sigma_mm
@@ -76,7 +75,7 @@ def test_a_camera_moved_by_five_sigma_is_found(mount: Mount) -> None:
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_a_moved_board_is_no_moved_camera(mount: Mount) -> None:
+def test_a_moved_board_is_no_moved_camera(mount):
     moved = calibrated_cell(with_moved_board(cells(mount, 0)[1], 2e-3 * SHIFT))
     comparison = compare(pair(mount, 0)[0], moved)
     assert [edge.is_change for edge in comparison.edges] == [False, True]
@@ -84,7 +83,7 @@ def test_a_moved_board_is_no_moved_camera(mount: Mount) -> None:
     assert "its calibration still holds" in comparison.findings[0]
 
 
-def test_a_turn_is_a_change_of_rotation() -> None:
+def test_a_turn_is_a_change_of_rotation():
     first, second = pair("eye-in-hand", 1)
     turned = calibrated_cell(with_moved_camera(cells("eye-in-hand", 1)[1], np.eye(6)[1] * 3e-3))
     (edge, _) = compare(first, turned).edges
@@ -94,7 +93,7 @@ def test_a_turn_is_a_change_of_rotation() -> None:
     assert edge.moved_deg == pytest.approx(np.rad2deg(3e-3), abs=0.07)
 
 
-def test_a_change_of_the_lens_is_found() -> None:
+def test_a_change_of_the_lens_is_found():
     first, second = pair("eye-in-hand", 0)
     assert second.camera is not None
     camera = second.camera.camera
@@ -109,7 +108,7 @@ def test_a_change_of_the_lens_is_found() -> None:
     assert not same.is_change
 
 
-def test_given_lenses_are_compared_as_they_stand() -> None:
+def test_given_lenses_are_compared_as_they_stand():
     calibration = replace(made_up(4).calibration)
     assert calibration.camera is not None
     camera = calibration.camera.camera
@@ -124,7 +123,7 @@ def test_given_lenses_are_compared_as_they_stand() -> None:
     assert any("model or resolution" in finding for finding in compare(given, small).findings)
 
 
-def test_covariances_are_added_in_one_tangent_space() -> None:
+def test_covariances_are_added_in_one_tangent_space():
     """Against sampling, where the two poses are a radian and a third of a metre apart."""
     rng = np.random.default_rng(5)
     spreads = []
@@ -144,7 +143,7 @@ def test_covariances_are_added_in_one_tangent_space() -> None:
     assert np.abs(away).max() < 0.03
 
 
-def with_edge(pose: np.ndarray, covariance: np.ndarray, views: int = 20) -> Calibration:
+def with_edge(pose, covariance, views=20):
     """The sample's calibration with another first edge and number of views."""
     calibration = made_up(4).calibration
     edge = Edge(pose, covariance)
@@ -153,7 +152,7 @@ def with_edge(pose: np.ndarray, covariance: np.ndarray, views: int = 20) -> Cali
     return replace(calibration, edges=edges, views=used, camera=None)
 
 
-def test_few_views_make_the_same_difference_less_sure() -> None:
+def test_few_views_make_the_same_difference_less_sure():
     covariance = 1e-8 * np.eye(6)
     away = exp(np.array([0.0, 0.0, 0.0, 5e-4, 0.0, 0.0]))
     p_values = [
@@ -168,7 +167,7 @@ def test_few_views_make_the_same_difference_less_sure() -> None:
     assert p_values[2] == pytest.approx(0.00585, rel=0.02)
 
 
-def test_a_calibration_does_not_differ_from_itself() -> None:
+def test_a_calibration_does_not_differ_from_itself():
     calibration = made_up(4).calibration
     comparison = compare(calibration, calibration)
     assert comparison.same_session
@@ -180,7 +179,7 @@ def test_a_calibration_does_not_differ_from_itself() -> None:
     assert not compare(exact, rounded).is_change
 
 
-def test_different_mounts_have_nothing_in_common() -> None:
+def test_different_mounts_have_nothing_in_common():
     in_hand, to_hand = pair("eye-in-hand", 0)[0], pair("eye-to-hand", 0)[0]
     comparison = compare(in_hand, to_hand)
     assert comparison.edges == ()
@@ -189,7 +188,7 @@ def test_different_mounts_have_nothing_in_common() -> None:
     assert "The mounts differ" in comparison.findings[0]
 
 
-def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> None:
+def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path):
     first, second = pair("eye-in-hand", 0)
     first.save(tmp_path / "calibration.json")
     moved = calibrated_cell(with_moved_camera(cells("eye-in-hand", 0)[1], 2e-3 * SHIFT))
@@ -209,7 +208,7 @@ def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path: Path) -> No
     )
 
 
-def test_command_names_what_is_no_calibration(tmp_path: Path) -> None:
+def test_command_names_what_is_no_calibration(tmp_path):
     (tmp_path / "other.json").write_text("{}")
     done = visioncal("diff", tmp_path / "other.json", tmp_path)
     assert done.status == 2

@@ -7,9 +7,7 @@ import pytest
 from support.cells import calibrated
 from support.wrong_arms import WRONG_LINKS
 
-from visioncal import Calibration
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.judge import judge
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import controller_form, write_pose
@@ -26,13 +24,13 @@ SURE = replace(WRONG_LINKS, target=replace(WRONG_LINKS.target, square_sigma_m=1e
 
 
 @pytest.fixture(scope="module", params=["eye-in-hand", "eye-to-hand"])
-def run(request) -> RunState:
+def run(request):
     """A cell with a wrong arm, which was calibrated along."""
     return calibrated(simulate(replace(SURE, mount=request.param)))
 
 
 @pytest.fixture(scope="module")
-def result(run) -> Calibration:
+def result(run):
     return result_of(run)
 
 

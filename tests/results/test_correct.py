@@ -15,7 +15,6 @@ import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
-from visioncal.results import Calibration
 from visioncal.results.arm import (
     ArmResult,
     ElasticResult,
@@ -40,18 +39,18 @@ def cell():
 
 
 @pytest.fixture(scope="module")
-def result(cell) -> Calibration:
+def result(cell):
     return result_of(calibrated(cell))
 
 
 @pytest.fixture(scope="module")
-def by_poses(cell) -> Calibration:
+def by_poses(cell):
     """What is known without joint angles: the nominal arm."""
     return result_of(calibrated(cell, joints=False))
 
 
 @pytest.fixture(scope="module")
-def exact(cell, result) -> Calibration:
+def exact(cell, result):
     """A calibration that found the true arm to the last digit."""
     arm, nominal = cell.robot.true_arm, result.robot
     numbers = zip(arm.a, arm.alpha, arm.beta, arm.d, arm.offset, strict=True)
@@ -64,20 +63,20 @@ def exact(cell, result) -> Calibration:
     return replace(result, arm=replace(result.arm, robot=robot.corrected()))
 
 
-def joints_near(count: int, seed: int = 1, size: float = 0.5) -> np.ndarray:
+def joints_near(count, seed=1, size=0.5):
     return HOME + np.random.default_rng(seed).uniform(-size, size, (count, 6))
 
 
-def targets_near(count: int, calibration: Calibration, **draw) -> np.ndarray:
+def targets_near(count, calibration, **draw):
     return calibration.robot.base_from_flange(joints_near(count, **draw))
 
 
-def cam_from_target(calibration: Calibration, flange) -> np.ndarray:
+def cam_from_target(calibration, flange):
     x, z = (edge.matrix for edge in calibration.edges.values())
     return invert(flange @ x) @ z
 
 
-def rms_mm(wanted, got) -> float:
+def rms_mm(wanted, got):
     """How far the camera is from where it is wanted, seen from the target."""
     away = (invert(wanted) - invert(got))[:, :3, 3]
     return 1e3 * float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
@@ -246,11 +245,11 @@ def stored(result, tmp_path):
     return tmp_path
 
 
-def rows_of(text: str) -> list[dict[str, str]]:
+def rows_of(text):
     return list(csv.DictReader(text.splitlines()))
 
 
-def numbers(row, names) -> np.ndarray:
+def numbers(row, names):
     return np.array([float(row[index]) for index in names])
 
 
@@ -379,7 +378,7 @@ def test_what_is_no_table_of_targets_is_named(stored, result):
     poses = targets_near(2, result)
     table = stored / "t.csv"
 
-    def refused(text: str) -> str:
+    def refused(text):
         table.write_text(text)
         done = run("correct", table, "-c", stored)
         assert done.status == 2

@@ -9,7 +9,7 @@ from visioncal.present.report.fleet import fleet_page
 from visioncal.results.fleet import FleetRow, with_outliers
 
 
-def row(robot: int, week: int, rng, **changes) -> FleetRow:
+def row(robot, week, rng, **changes):
     """A session of a sound robot; levels of noise from some twenty stops differ by a sixth."""
     levels = np.exp(rng.normal(0.0, 0.16, 4)).tolist()
     made = FleetRow(
@@ -31,7 +31,7 @@ def row(robot: int, week: int, rng, **changes) -> FleetRow:
     return replace(made, **changes)
 
 
-def fleet(seed: int) -> list[FleetRow]:
+def fleet(seed):
     rng = np.random.default_rng(seed)
     return [row(robot, week, rng) for robot in range(10) for week in range(20)]
 

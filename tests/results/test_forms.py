@@ -1,7 +1,6 @@
 """Results that were edited by hand, or damaged: refused with the place, before they are used."""
 
 import json
-from pathlib import Path
 
 import pytest
 from support.aligned_cells import made_up_cell
@@ -12,7 +11,7 @@ from visioncal.results import Calibration, to_document
 
 
 @pytest.fixture(scope="module")
-def calibrated(tmp_path_factory) -> str:
+def calibrated(tmp_path_factory):
     path = tmp_path_factory.mktemp("result") / "calibration.json"
     with_frames(made_up(5)).calibration.save(path)
     return path.read_text()
@@ -50,7 +49,7 @@ def calibrated(tmp_path_factory) -> str:
         (("schema",), 9, r"schema is 9, this version reads 2\. A newer"),
     ],
 )
-def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, place, value, words):
+def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path, place, value, words):
     content = json.loads(calibrated)
     inner = content
     for key in place[:-1]:
@@ -72,7 +71,7 @@ def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, p
         ("weakest", None, "weakest is None; a text is needed"),
     ],
 )
-def test_what_a_cell_s_result_does_not_hold_is_named(tmp_path: Path, key, value, words):
+def test_what_a_cell_s_result_does_not_hold_is_named(tmp_path, key, value, words):
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(to_document(made_up_cell(1)) | {key: value}))
     with pytest.raises(DataError, match=words):

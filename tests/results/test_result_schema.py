@@ -15,11 +15,11 @@ from support.result_schema import SHIPPED, faults
 DATA = Path(__file__).parents[1] / "data"
 
 
-def generated() -> str:
+def generated():
     return json.dumps(calibration_schema(), indent=1) + "\n"
 
 
-def stored(name: str) -> dict:
+def stored(name):
     return json.loads(gzip.decompress((DATA / f"calibration_{name}.json.gz").read_bytes()))
 
 

@@ -14,7 +14,7 @@ DATA = Path(__file__).parents[1] / "data"
 NAMES = ("elastic", "warm", "pick")
 
 
-def stored(name: str) -> str:
+def stored(name):
     return gzip.decompress((DATA / f"calibration_{name}.json.gz").read_bytes()).decode()
 
 

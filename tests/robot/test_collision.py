@@ -15,13 +15,13 @@ POST_SIZE = np.array([0.1, 0.15, 0.6])
 CLEARANCE = 0.03
 
 
-def ur5e_with_post(clearance_m: float = CLEARANCE) -> Collisions:
+def ur5e_with_post(clearance_m=CLEARANCE):
     robot = load_robot("ur5e")
     post = Body("post", 0, "box", POST_SIZE, POST)
     return Collisions(robot, [*arm_bodies(robot), post], clearance_m, 0.0)
 
 
-def random_joints(count: int, seed: int = 0) -> np.ndarray:
+def random_joints(count, seed=0):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 6))
 
 

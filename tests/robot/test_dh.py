@@ -12,7 +12,6 @@ from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import (
-    DHTable,
     Robot,
     convert_table,
     load_robot,
@@ -29,11 +28,11 @@ NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base
 KEYS = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")
 
 
-def table(name: str) -> DHTable:
+def table(name):
     return table_from_document(load_robot(name).document)
 
 
-def random_table(convention: str, seed: int = 1) -> DHTable:
+def random_table(convention, seed=1):
     """Rows in general position, one with all that a row can hold, a base and a flange."""
     rng = np.random.default_rng(seed)
     rows: list[dict[str, Any]] = [
@@ -49,24 +48,24 @@ def random_table(convention: str, seed: int = 1) -> DHTable:
     return table_from_document(document | {"base": pose, "flange": flange})
 
 
-def disturbed(name: str, seed: int) -> Robot:
+def disturbed(name, seed):
     """An arm off by 0.5 mm and 1 mrad in everything."""
     robot, rng = load_robot(name), np.random.default_rng(seed)
     scale = np.repeat([1e-3, 5e-4], 3)
     return robot.corrected(scale * rng.normal(size=(robot.joint_count + 1, 6)))
 
 
-def robot_of(dhtable: DHTable) -> Robot:
+def robot_of(dhtable):
     return Robot.from_document(json.loads(json.dumps(table_document(dhtable, "a test"))))
 
 
-def poses(dhtable: DHTable | Robot, count: int = 20) -> np.ndarray:
+def poses(dhtable, count=20):
     robot = dhtable if isinstance(dhtable, Robot) else robot_of(dhtable)
     q = np.random.default_rng(7).uniform(-2, 2, (count, robot.joint_count))
     return robot.base_from_flange(q)
 
 
-def assert_same_table(found: DHTable, expected: DHTable, atol: float) -> None:
+def assert_same_table(found, expected, atol):
     assert (found.convention, found.joint_names) == (expected.convention, expected.joint_names)
     for name in (*NUMBERS, "lower", "upper", "functions", "prismatic"):
         np.testing.assert_allclose(
@@ -74,7 +73,7 @@ def assert_same_table(found: DHTable, expected: DHTable, atol: float) -> None:
         )
 
 
-def elementary(row: dict[str, float], order: str) -> np.ndarray:
+def elementary(row, order):
     """A row's product by its textbook: Z and z turn about and go along z, X and x, Y likewise."""
     twists = {
         "Z": [0, 0, row.get("theta_offset_rad", 0.0), 0, 0, 0],
@@ -89,7 +88,7 @@ def elementary(row: dict[str, float], order: str) -> np.ndarray:
     return product
 
 
-def test_hayatis_rows_are_the_textbooks_product() -> None:
+def test_hayatis_rows_are_the_textbooks_product():
     rng = np.random.default_rng(3)
     rows = [dict(zip(KEYS, rng.normal(size=4).tolist(), strict=True)) for _ in range(4)]
     rows[1] |= {"beta_rad": 0.3}
@@ -104,7 +103,7 @@ def test_hayatis_rows_are_the_textbooks_product() -> None:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("name", robot_names())
-def test_conversions_keep_the_arm_and_come_back(name: str, convention: str) -> None:
+def test_conversions_keep_the_arm_and_come_back(name, convention):
     start = table(name)
     there = convert_table(start, convention)
     assert there.convention == convention
@@ -115,7 +114,7 @@ def test_conversions_keep_the_arm_and_come_back(name: str, convention: str) -> N
 
 @pytest.mark.parametrize("other", CONVENTIONS)
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_conversions_of_any_table_come_back(convention: str, other: str) -> None:
+def test_conversions_of_any_table_come_back(convention, other):
     start = random_table(convention)
     there = convert_table(start, other)
     # d of some hundred metres where beta had been: 1e-16 of it, a few times over.
@@ -125,7 +124,7 @@ def test_conversions_of_any_table_come_back(convention: str, other: str) -> None
 
 @pytest.mark.parametrize("other", ["standard", "modified"])
 @pytest.mark.parametrize("name", ["ur5e", "ur10e", "irb120", "generic-6r-1800"])
-def test_nearly_parallel_axes_come_back_too(name: str, other: str) -> None:
+def test_nearly_parallel_axes_come_back_too(name, other):
     for seed in range(5):
         robot = disturbed(name, seed)
         hayati = table_of(robot, "hayati", like=table(name))
@@ -137,7 +136,7 @@ def test_nearly_parallel_axes_come_back_too(name: str, other: str) -> None:
         assert_same_table(convert_table(there, "hayati"), hayati, atol=2e-12)
 
 
-def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel() -> None:
+def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel():
     for robot in (load_robot("ur5e"), disturbed("ur5e", 1)):
         assert parallel_axes(robot).tolist() == [False, True, True, False, False]
         assert table_of(robot, "hayati").parallel.tolist() == [0, 0, 1, 1, 0, 0, 0]
@@ -148,7 +147,7 @@ def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel() -> None:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("name", robot_names())
-def test_a_urdfs_table_is_the_published_one(name: str, convention: str) -> None:
+def test_a_urdfs_table_is_the_published_one(name, convention):
     nominal = table(name)
     document = {"schema": 1, "name": name, "tip": nominal.tip, "urdf": small_urdf(load_robot(name))}
     found = table_of(Robot.from_document(document), convention)
@@ -162,7 +161,7 @@ def test_a_urdfs_table_is_the_published_one(name: str, convention: str) -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_table_holds_what_a_corrected_arm_has(convention: str) -> None:
+def test_a_table_holds_what_a_corrected_arm_has(convention):
     robot = random_table("standard")
     rng = np.random.default_rng(2)
     functions = 1e-2 * rng.normal(size=(5, 4))
@@ -174,7 +173,7 @@ def test_a_table_holds_what_a_corrected_arm_has(convention: str) -> None:
         np.testing.assert_allclose(found.functions[:, 1:], corrected.chain.functions[:, 1:])
 
 
-def test_axes_in_one_line_have_a_table() -> None:
+def test_axes_in_one_line_have_a_table():
     straight = {"a_m": 0.0, "alpha_rad": 0.0, "d_m": 0.2}
     rows = [straight, straight | {"alpha_rad": np.pi}, straight]
     document = {"schema": 1, "name": "x", "convention": "standard", "joint": rows}
@@ -185,7 +184,7 @@ def test_axes_in_one_line_have_a_table() -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_table_is_written_and_read(convention: str) -> None:
+def test_a_table_is_written_and_read(convention):
     start = random_table(convention)
     again = table_from_document(json.loads(json.dumps(table_document(start, "a test"))))
     # Poses as roll, pitch and yaw; limits in degrees.
@@ -208,7 +207,7 @@ def test_a_table_is_written_and_read(convention: str) -> None:
         ({"type": "prismatic", "lower_m": 2.0, "upper_m": 1.0}, "less than upper_m = 1.0"),
     ],
 )
-def test_a_wrong_row_is_refused_by_field(change: dict[str, Any], words: str) -> None:
+def test_a_wrong_row_is_refused_by_field(change, words):
     document = json.loads(json.dumps(load_robot("ur5").document))
     document["joint"][1] |= change
     with pytest.raises(DataError) as caught:
@@ -219,12 +218,12 @@ def test_a_wrong_row_is_refused_by_field(change: dict[str, Any], words: str) -> 
 
 @pytest.mark.parametrize("place", ["base", "flange"])
 @pytest.mark.parametrize("content", [[1.0], {"xyz_m": [0, 0]}, {"xyz_m": [0, 0, 0]}])
-def test_a_wrong_constant_is_refused(place: str, content: Any) -> None:
+def test_a_wrong_constant_is_refused(place, content):
     with pytest.raises(DataError, match=place):
         Robot.from_document({**load_robot("ur5").document, place: content})
 
 
-def motions(robot: Robot, q: np.ndarray) -> np.ndarray:
+def motions(robot, q):
     """Turns [rad] and shifts along their axes [m] between poses: base and flange drop out."""
     poses = robot.base_from_flange(q)
     moved = log(invert(poses[:-1]) @ poses[1:])
@@ -233,7 +232,7 @@ def motions(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", robot_names())
-def test_the_other_convention_is_the_arm_of_a_misread_table(name: str) -> None:
+def test_the_other_convention_is_the_arm_of_a_misread_table(name):
     start = table(name)
     q = np.random.default_rng(1).uniform(-1.5, 1.5, (12, len(start)))
     seen = motions(load_robot(name), q)
@@ -244,7 +243,7 @@ def test_the_other_convention_is_the_arm_of_a_misread_table(name: str) -> None:
     assert motions(found, q) == pytest.approx(seen, abs=1e-9)
 
 
-def _misread(dhtable: DHTable) -> DHTable:
+def _misread(dhtable):
     """The same printed rows under the other convention."""
     document = table_document(dhtable)
     other = "standard" if dhtable.convention == "modified" else "modified"

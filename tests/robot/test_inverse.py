@@ -13,13 +13,13 @@ from visioncal.robot.inverse import Inverse
 HOME = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
 
 
-def with_chain(robot: Robot, **changes) -> Robot:
+def with_chain(robot, **changes):
     return Robot.from_document(
         chain_document(robot.name, robot.tip, replace(robot.chain, **changes))
     )
 
 
-def disturbed(robot: Robot, rng: np.random.Generator) -> Robot:
+def disturbed(robot, rng):
     """An arm whose links, gears and encoders all err."""
     n = robot.joint_count
     functions = np.column_stack([1e-3 * rng.normal(size=n), 1e-4 * rng.normal(size=n)])
@@ -28,7 +28,7 @@ def disturbed(robot: Robot, rng: np.random.Generator) -> Robot:
     return robot.corrected(5e-4 * rng.normal(size=(n + 1, 6)), functions)
 
 
-def reached(robot: Robot, pose, q, **options):
+def reached(robot, pose, q, **options):
     """The posture found from joint angles q, and its own joint angles."""
     found = Inverse(robot).solve(pose, robot.chain.effective(q[None])[0], **options)
     return found, robot.chain.encoded(found.positions[None])[0]

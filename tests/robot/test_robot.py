@@ -3,8 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +38,7 @@ URDF = """<?xml version="1.0"?>
 """
 
 
-def elementary(axis: str, angle: float = 0.0, along: float = 0.0) -> np.ndarray:
+def elementary(axis, angle=0.0, along=0.0):
     """A rotation about and a translation along one axis, written out."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -51,7 +49,7 @@ def elementary(axis: str, angle: float = 0.0, along: float = 0.0) -> np.ndarray:
     return matrix
 
 
-def dh_product(document: dict[str, Any], q: np.ndarray) -> np.ndarray:
+def dh_product(document, q):
     """The textbook's product of a DH table, row by row."""
     result = np.eye(4)
     rows = [(row, row.get("theta_offset_rad", 0.0)) for row in document["joint"]]
@@ -68,7 +66,7 @@ def dh_product(document: dict[str, Any], q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", robot_names())
-def test_forward_kinematics_is_the_product_of_the_table(name: str) -> None:
+def test_forward_kinematics_is_the_product_of_the_table(name):
     robot = load_robot(name)
     rng = np.random.default_rng(1)
     q = rng.uniform(robot.lower_rad, robot.upper_rad, (20, robot.joint_count))
@@ -78,7 +76,7 @@ def test_forward_kinematics_is_the_product_of_the_table(name: str) -> None:
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_offsets_and_flange_row_enter_in_both_conventions(convention: str) -> None:
+def test_offsets_and_flange_row_enter_in_both_conventions(convention):
     rng = np.random.default_rng(2)
     keys = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")
     document = {
@@ -107,12 +105,12 @@ def test_offsets_and_flange_row_enter_in_both_conventions(convention: str) -> No
         ("panda", [0, 0, 0, 0, 0, 0, 0], [0.088, 0.0, 0.926]),
     ],
 )
-def test_known_poses(name: str, q: list[float], position_m: list[float]) -> None:
+def test_known_poses(name, q, position_m):
     flange = load_robot(name).base_from_flange(np.array([q], float))[0]
     np.testing.assert_allclose(flange[:3, 3], position_m, atol=1e-12)  # sums of printed numbers
 
 
-def test_a_urdf_is_read_up_to_the_tip(tmp_path: Path) -> None:
+def test_a_urdf_is_read_up_to_the_tip(tmp_path):
     (tmp_path / "my arm.urdf").write_text(URDF)
     robot = load_robot("my arm.urdf", folder=tmp_path)
     assert (robot.tip, robot.joint_names) == ("tool0", ("turn", "bend"))
@@ -135,7 +133,7 @@ def test_a_urdf_is_read_up_to_the_tip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tip", [None, "upper"])
-def test_a_description_stands_alone(tmp_path: Path, tip: str | None) -> None:
+def test_a_description_stands_alone(tmp_path, tip):
     (tmp_path / "arm.urdf").write_text(URDF)
     for name in ("arm.urdf", "ur3e"):
         robot = load_robot(name, None if name == "ur3e" else tip, tmp_path)
@@ -149,7 +147,7 @@ def test_a_description_stands_alone(tmp_path: Path, tip: str | None) -> None:
             assert np.array_equal(copy.base_from_flange(q), robot.base_from_flange(q))
 
 
-def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path: Path) -> None:
+def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     with pytest.raises(DataError, match=r"no frame 'tool'; its frames are .*tool0") as caught:
         load_robot("arm.urdf", "tool", tmp_path)
@@ -159,7 +157,7 @@ def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path: Path) -> N
         load_robot("bare.urdf", None, tmp_path)
 
 
-def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     (tmp_path / "a.urdf").write_text("<robot name='x'><link name=")
     with pytest.raises(DataError, match="is no XML"):
         load_robot("a.urdf", "x", tmp_path)
@@ -199,30 +197,30 @@ def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture
         ),
     ],
 )
-def test_a_wrong_table_is_refused_by_field(change: dict[str, Any], words: str) -> None:
+def test_a_wrong_table_is_refused_by_field(change, words):
     with pytest.raises(DataError, match=words):
         Robot.from_document(read_robot_document("ur5") | change)
 
 
-def test_an_unknown_robot_lists_the_names() -> None:
+def test_an_unknown_robot_lists_the_names():
     with pytest.raises(DataError, match=r"no robot named 'ur5f'\. Did you mean .*ur5") as caught:
         load_robot("ur5f")
     assert "The names are generic-6r-1800, irb120, panda" in caught.value.next_step
 
 
 @pytest.mark.parametrize("shape", [(6,), (3, 7), (1, 2, 6)])
-def test_joint_angles_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+def test_joint_angles_of_another_shape_are_refused(shape):
     with pytest.raises(DataError, match="robot ur5 has 6 joints"):
         load_robot("ur5").base_from_flange(np.zeros(shape))
 
 
-def test_shipped_tables_cite_their_source() -> None:
+def test_shipped_tables_cite_their_source():
     for name in robot_names():
         assert read_robot_document(name)["source"]
         assert parse_toml(robot_file(read_robot_document(name))[1], name)
 
 
-def test_descriptions_are_read_without_pinocchio() -> None:
+def test_descriptions_are_read_without_pinocchio():
     code = (
         "import sys; sys.modules['pinocchio'] = None\n"
         "from visioncal.robot import read_robot_document as read; print(read('ur5')['name'])"

@@ -1,7 +1,6 @@
 """Robots as calibrations need them: derivatives, corrected models, and the files they go into."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,15 +18,15 @@ from visioncal.robot.writing import (
 )
 
 
-def robots() -> list[Robot]:
+def robots():
     return [*(load_robot(name) for name in robot_names()), of_urdf()]
 
 
-def other(robot: Robot) -> Robot:
+def other(robot):
     return robot.corrected(*some_changes(robot))
 
 
-def slope(poses, size: int) -> np.ndarray:
+def slope(poses, size):
     """Central differences (m, 6, size) of poses(step), a function of (size,) changes."""
     step, columns = 1e-5, []
     middle = invert(poses(np.zeros(size)))
@@ -39,7 +38,7 @@ def slope(poses, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
-def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot: Robot) -> None:
+def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
     q, count = some_joints(robot), robot.joint_count
     turning = np.where(robot.chain.prismatic[:, None], [1, 1, 0, 0], 1).ravel()
 
@@ -60,7 +59,7 @@ def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot: Robot) -> N
     np.testing.assert_allclose(robot.function_jacobian(q), functions, **tolerance)
 
 
-def test_corrections_are_what_they_say() -> None:
+def test_corrections_are_what_they_say():
     robot = load_robot("ur10e")
     placements, functions = some_changes(robot)
     corrected = robot.corrected(placements, functions)
@@ -80,7 +79,7 @@ def test_corrections_are_what_they_say() -> None:
 
 
 @pytest.mark.parametrize("robot", [load_robot("panda"), of_urdf()], ids=["panda", "urdf"])
-def test_a_corrected_robot_stands_alone(robot: Robot, tmp_path: Path) -> None:
+def test_a_corrected_robot_stands_alone(robot, tmp_path):
     corrected = other(robot)
     again = Robot.from_document(json.loads(json.dumps(corrected.document)))
     name, content = robot_file(corrected.document)
@@ -103,7 +102,7 @@ def test_a_corrected_robot_stands_alone(robot: Robot, tmp_path: Path) -> None:
         (None, -np.eye(3, 4, 1), "ratio is 0.0; a number above 0"),
     ],
 )
-def test_impossible_corrections_are_refused(placements, functions, words: str) -> None:
+def test_impossible_corrections_are_refused(placements, functions, words):
     with pytest.raises(DataError, match=words):
         of_urdf().corrected(placements, functions)
 
@@ -121,7 +120,7 @@ def test_impossible_corrections_are_refused(placements, functions, words: str) -
         ("ratio", -1.0, "ratio is -1.0"),
     ],
 )
-def test_a_wrong_chain_is_refused_by_field(field: str, value, words: str) -> None:
+def test_a_wrong_chain_is_refused_by_field(field, value, words):
     document = json.loads(json.dumps(other(load_robot("ur5")).document))
     document["joint"][1][field] = value
     with pytest.raises(DataError, match=words) as caught:
@@ -129,7 +128,7 @@ def test_a_wrong_chain_is_refused_by_field(field: str, value, words: str) -> Non
     assert "shoulder_lift_joint" in str(caught.value)
 
 
-def test_what_a_urdf_cannot_hold_is_said() -> None:
+def test_what_a_urdf_cannot_hold_is_said():
     robot = of_urdf()
     corrected = other(robot)
     assert [name.partition(":")[0] for name in unexportable_functions(corrected)] == list(
@@ -156,9 +155,7 @@ UR5E_KINEMATICS = {
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["base", "base_link"])
-def test_the_kinematics_of_urs_driver_are_those_of_its_description(
-    tmp_path: Path, turned: bool
-) -> None:
+def test_the_kinematics_of_urs_driver_are_those_of_its_description(tmp_path, turned):
     robot = load_robot("ur5e")
     if turned:
         half = '<joint name="h" type="fixed"><parent link="base_link"/><child link="base"/>'
@@ -174,7 +171,7 @@ def test_the_kinematics_of_urs_driver_are_those_of_its_description(
         np.testing.assert_allclose(found, numbers, atol=1e-12)  # rounding of half turns
 
 
-def test_abbs_arm_is_the_one_of_its_published_urdf() -> None:
+def test_abbs_arm_is_the_one_of_its_published_urdf():
     # ros-industrial/abb, irb120_3_58_macro.xacro: origins and axes of the joints, then tool0.
     origins = [(0, 0, 0), (0, 0, 0.29), (0, 0, 0.27), (0, 0, 0.07), (0.302, 0, 0), (0.072, 0, 0)]
     axes = np.eye(3)[[2, 1, 1, 0, 1, 0]]

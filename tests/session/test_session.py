@@ -47,7 +47,7 @@ TABLE = "\n".join((HEADER, *ROWS)) + "\n"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     session = tmp_path / "Prüfstand 1"
     (session / "images").mkdir(parents=True)
     (session / "session.toml").write_text(TOML, encoding="utf-8")
@@ -58,20 +58,20 @@ def folder(tmp_path: Path) -> Path:
     return session
 
 
-def edit(folder: Path, name: str, old: str, new: str) -> None:
+def edit(folder, name, old, new):
     text = (folder / name).read_text(encoding="utf-8")
     assert old in text
     (folder / name).write_text(text.replace(old, new), encoding="utf-8")
 
 
-def refusal(folder: Path) -> DataError:
+def refusal(folder):
     with pytest.raises(DataError) as caught:
         Session.load(folder)
     assert caught.value.culprits
     return caught.value
 
 
-def test_what_the_folder_holds_is_what_the_session_says(folder: Path) -> None:
+def test_what_the_folder_holds_is_what_the_session_says(folder):
     session = Session.load(folder)
     assert (session.name, session.mount) == ("bench", "eye-in-hand")
     assert session.camera is not None
@@ -92,7 +92,7 @@ def test_what_the_folder_holds_is_what_the_session_says(folder: Path) -> None:
     assert session.warnings == ()
 
 
-def test_transforms_come_from_the_rows(folder: Path) -> None:
+def test_transforms_come_from_the_rows(folder):
     first, second, third = Session.load(folder).views
     pose = second.base_from_flange()
     assert pose is not None
@@ -106,7 +106,7 @@ def test_transforms_come_from_the_rows(folder: Path) -> None:
     assert first.joints_rad is None
 
 
-def test_a_quaternion_is_stored_as_read_and_normalised_in_the_transform(folder: Path) -> None:
+def test_a_quaternion_is_stored_as_read_and_normalised_in_the_transform(folder):
     edit(folder, "views.csv", "0.6,0,0,0.8", "0.6003,0,0,0.8")
     view = Session.load(folder).views[1]
     assert view.cell("qx") == "0.6003"
@@ -116,7 +116,7 @@ def test_a_quaternion_is_stored_as_read_and_normalised_in_the_transform(folder: 
     assert determinant == pytest.approx(1.0, abs=1e-14)  # a product of a few rounded numbers
 
 
-def test_joints_come_in_order_beyond_nine() -> None:
+def test_joints_come_in_order_beyond_nine():
     columns = ("view", *(f"q{k}_rad" for k in (10, *range(1, 10))), "cft_x_m")
     columns += tuple(f"cft_{name}" for name in ("y_m", "z_m", "qx", "qy", "qz", "qw"))
     cells = ["1", "10", *map(str, range(1, 10)), "0", "0", "1", "0", "0", "0", "1"]
@@ -130,7 +130,7 @@ def test_joints_come_in_order_beyond_nine() -> None:
     assert session.camera is None
 
 
-def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
+def test_saving_keeps_everything(folder, tmp_path):
     session = Session.load(folder)
     copy = tmp_path / "elsewhere" / "copy"
     session.save(copy)
@@ -148,7 +148,7 @@ def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
     assert [entry.name for entry in copy.parent.iterdir()] == ["copy"]
 
 
-def test_images_of_another_kind_are_to_be_converted(folder: Path) -> None:
+def test_images_of_another_kind_are_to_be_converted(folder):
     views = folder / "views.csv"
     views.write_text(views.read_text().replace(".png", ".gif"))
     with pytest.raises(DataError) as refused:
@@ -156,16 +156,14 @@ def test_images_of_another_kind_are_to_be_converted(folder: Path) -> None:
     assert refused.value.next_step == "Convert the images without loss, to png."
 
 
-def test_a_session_is_not_saved_as_a_folder_that_looks_like_a_recording(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_session_is_not_saved_as_a_folder_that_looks_like_a_recording(folder, tmp_path):
     with pytest.raises(DataError, match="saved as a folder") as refused:
         Session.load(folder).save(tmp_path / "copy.rrd")
     assert "visioncal convert FOLDER copy.rrd" in refused.value.next_step
     assert not (tmp_path / "copy.rrd").exists()
 
 
-def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> None:
+def test_a_saved_session_needs_no_other_file(folder, tmp_path):
     shutil.move(folder / "board.toml", tmp_path / "shared board.toml")
     robot = 'schema=1\nconvention="standard"\n[[joint]]\na_m=0\nd_m=1\nalpha_rad=0.5\n'
     (tmp_path / "arm.toml").write_text(robot)
@@ -197,8 +195,8 @@ def test_a_saved_session_needs_no_other_file(folder: Path, tmp_path: Path) -> No
     ],
 )
 def test_what_is_wrong_with_a_file_outside_is_said_without_its_content(
-    field: str, file: str, content: str, folder: Path, tmp_path: Path
-) -> None:
+    field, file, content, folder, tmp_path
+):
     (tmp_path / file).write_text(content)
     edit(folder, "session.toml", field, f'"../{file}"')
     try:
@@ -212,14 +210,14 @@ def test_what_is_wrong_with_a_file_outside_is_said_without_its_content(
     assert "secret" not in said
 
 
-def test_a_link_to_another_kind_of_file_is_no_board(folder: Path, tmp_path: Path) -> None:
+def test_a_link_to_another_kind_of_file_is_no_board(folder, tmp_path):
     (tmp_path / "passwords").write_text(BOARD)
     (folder / "board.toml").unlink()
     (folder / "board.toml").symlink_to(tmp_path / "passwords")
     assert "passwords, outside of the session's folder, is no target" in str(refusal(folder))
 
 
-def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path: Path) -> None:
+def test_links_out_of_the_folder_are_not_followed(folder, tmp_path):
     shutil.move(folder / "images" / "a.png", tmp_path / "a.png")
     (folder / "images" / "a.png").symlink_to(tmp_path / "a.png")
     images = Session.load(folder).images
@@ -237,7 +235,7 @@ def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path: Path) 
     assert "leads out of its folder" in str(refusal(folder))
 
 
-def test_a_folder_of_images_beside_the_session_may_be_linked(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_of_images_beside_the_session_may_be_linked(folder, tmp_path):
     session = tmp_path / "sessions" / "cell"
     shutil.copytree(folder, session)
     shutil.move(session / "images", tmp_path / "sessions" / "shared")
@@ -253,22 +251,20 @@ def test_a_folder_of_images_beside_the_session_may_be_linked(folder: Path, tmp_p
     assert "leads out" in Session.load(session).images.absence("images/b 2.png")
 
 
-def test_a_name_that_no_file_has_leaves_its_view_alone(folder: Path) -> None:
+def test_a_name_that_no_file_has_leaves_its_view_alone(folder):
     edit(folder, "views.csv", "images/missing.png", f"images/{'a' * 300}.png")
     images = Session.load(folder).images
     assert "longer than 255 bytes" in images.absence(f"images/{'a' * 300}.png")
 
 
-def test_a_packaged_target_stays_a_name(folder: Path, tmp_path: Path) -> None:
+def test_a_packaged_target_stays_a_name(folder, tmp_path):
     edit(folder, "session.toml", "board.toml", "checkerboard_9x6_25mm")
     Session.load(folder).save(tmp_path / "copy")
     assert Session.load(tmp_path / "copy").document["target"] == "checkerboard_9x6_25mm"
     assert not list((tmp_path / "copy").glob("*board*"))
 
 
-def test_nothing_is_overwritten_and_nothing_is_left_half_written(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_nothing_is_overwritten_and_nothing_is_left_half_written(folder, tmp_path):
     session = Session.load(folder)
     full = tmp_path / "full"
     full.mkdir()
@@ -278,7 +274,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     assert [entry.name for entry in full.iterdir()] == ["precious"]
 
     class Broken(FolderImages):
-        def read(self, path: str) -> bytes:
+        def read(self, path):
             raise DataError(f"{path} is on a disk that died.")
 
     broken = Session(
@@ -298,7 +294,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     assert Session.load(tmp_path / "empty").digest() == session.digest()
 
 
-def test_some_views_alone_stay_as_they_were(folder: Path) -> None:
+def test_some_views_alone_stay_as_they_were(folder):
     session = Session.load(folder)
     some = session.only([7, 5])
     assert [(view.number, view.stop, view.image) for view in some.views] == [
@@ -314,9 +310,7 @@ def test_some_views_alone_stay_as_they_were(folder: Path) -> None:
         session.only([])
 
 
-def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(folder, tmp_path):
     plain = Session.load(folder)
     assert plain.need is None
     edit(folder, "session.toml", "[robot]", "[need]\nmm = 0.5\nat = [0.4, 0, 0.1]\n[robot]")
@@ -334,13 +328,13 @@ def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
 
 @pytest.mark.parametrize("name", ["mm", "deg"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_need_of_nothing_is_refused(folder: Path, value: float, name: str) -> None:
+def test_a_need_of_nothing_is_refused(folder, value, name):
     with pytest.raises(DataError, match="a number above 0 is needed") as caught:
         Session.load(folder).needing(**{name: value})
     assert f"--need-{name} 0.5" in caught.value.next_step
 
 
-def test_the_digest_sees_facts_and_not_their_spelling(folder: Path, tmp_path: Path) -> None:
+def test_the_digest_sees_facts_and_not_their_spelling(folder, tmp_path):
     digest = Session.load(folder).digest()
     other = tmp_path / "other"
     shutil.copytree(folder, other)
@@ -383,7 +377,7 @@ def test_the_digest_sees_facts_and_not_their_spelling(folder: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
-def test_real_sessions_round_trip(name: str, tmp_path: Path) -> None:
+def test_real_sessions_round_trip(name, tmp_path):
     if not (DATA / name).is_dir():
         pytest.skip("the third-party sessions are not on this machine")
     session = Session.load(DATA / name)
@@ -473,9 +467,7 @@ TOML_REFUSALS = [
 
 
 @pytest.mark.parametrize(("old", "new", "words"), TOML_REFUSALS)
-def test_a_wrong_session_toml_is_refused_by_field(
-    folder: Path, old: str, new: str, words: str
-) -> None:
+def test_a_wrong_session_toml_is_refused_by_field(folder, old, new, words):
     if new.startswith("robot"):
         # A bare key must stand before the tables.
         edit(folder, "session.toml", '[robot]\nmodel = "ur10e"\ntip = "tool0"\n', "")
@@ -497,7 +489,7 @@ def test_a_wrong_session_toml_is_refused_by_field(
         "[800, 801.5, 640, 400]",
     ],
 )
-def test_a_matrix_of_other_brackets_is_written_anew(folder: Path, written: str) -> None:
+def test_a_matrix_of_other_brackets_is_written_anew(folder, written):
     text = (folder / "session.toml").read_text()
     text = re.sub(r"(?m)^matrix = .*$", f"matrix = [{written}]", text)
     (folder / "session.toml").write_text(text)
@@ -506,7 +498,7 @@ def test_a_matrix_of_other_brackets_is_written_anew(folder: Path, written: str) 
     assert "[800, 801.5, 640, 400]" in error.message
 
 
-def test_all_wrong_fields_are_named_at_once(folder: Path) -> None:
+def test_all_wrong_fields_are_named_at_once(folder):
     edit(folder, "session.toml", '"bench"', "7")
     edit(folder, "session.toml", "1280, 800", "1280")
     assert refusal(folder).culprits == ("session.toml: name", "session.toml: camera.resolution")
@@ -550,28 +542,26 @@ CSV_REFUSALS = [
 
 
 @pytest.mark.parametrize(("old", "new", "words"), CSV_REFUSALS)
-def test_a_wrong_views_csv_is_refused_by_line_and_column(
-    folder: Path, old: str, new: str, words: str
-) -> None:
+def test_a_wrong_views_csv_is_refused_by_line_and_column(folder, old, new, words):
     edit(folder, "views.csv", old, new)
     error = refusal(folder)
     assert re.search(words, str(error))
     assert "views.csv" in error.culprits[0]
 
 
-def test_an_angle_that_no_joint_turns_is_refused(folder: Path) -> None:
+def test_an_angle_that_no_joint_turns_is_refused(folder):
     edit(folder, "views.csv", "stamp_s", "q1_rad")
     edit(folder, "views.csv", "0.10", "1e200")
     assert "q1_rad: 1e+200 rad is no angle of a joint" in refusal(folder).message
 
 
-def test_a_shared_column_that_names_two_cameras_is_refused(folder: Path) -> None:
+def test_a_shared_column_that_names_two_cameras_is_refused(folder):
     edit(folder, "views.csv", "note", "camera")
     edit(folder, "views.csv", "0.8,", "0.8,left")
     assert "names first, " in refusal(folder).message
 
 
-def test_what_is_wrong_alike_in_many_rows_is_said_once(folder: Path) -> None:
+def test_what_is_wrong_alike_in_many_rows_is_said_once(folder):
     rows = [f"{k},,,images/{k}.gif,1,,,,,,,,\n" for k in range(12)]
     (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows) + "x,,,a.png,1,,,,,,,,\n")
     error = refusal(folder)
@@ -582,14 +572,14 @@ def test_what_is_wrong_alike_in_many_rows_is_said_once(folder: Path) -> None:
     assert "line 14, column view: 'x' is no whole number" in lines[1]
 
 
-def test_a_table_without_a_column_of_images_is_said_to_lack_it(folder: Path) -> None:
+def test_a_table_without_a_column_of_images_is_said_to_lack_it(folder):
     (folder / "views.csv").write_text("view,x_m,y_m,z_m,qx,qy,qz,qw\n" + "1,0,0,1,0,0,0,1\n")
     error = refusal(folder)
     assert "there is no such column" in error.message
     assert "column image" in error.next_step
 
 
-def test_a_table_without_a_header_row_is_told_to_have_one(folder: Path) -> None:
+def test_a_table_without_a_header_row_is_told_to_have_one(folder):
     text = (folder / "views.csv").read_text()
     (folder / "views.csv").write_text("0,images/a.png,0.1,0,0.3,0,0,0,1\n" + text)
     error = refusal(folder)
@@ -597,33 +587,33 @@ def test_a_table_without_a_header_row_is_told_to_have_one(folder: Path) -> None:
     assert "view,image,x_m" in error.next_step
 
 
-def test_lines_are_counted_through_quoted_line_breaks(folder: Path) -> None:
+def test_lines_are_counted_through_quoted_line_breaks(folder):
     edit(folder, "views.csv", "first, ", "first\n\n")
     edit(folder, "views.csv", "0.6,0,0.3", "0.6,x,0.3")
     assert "line 5, column y_m" in refusal(folder).message
 
 
 @pytest.mark.parametrize("name", ["session.toml", "views.csv"])
-def test_a_missing_or_empty_file_is_named(folder: Path, name: str) -> None:
+def test_a_missing_or_empty_file_is_named(folder, name):
     (folder / name).write_text("")
     assert name in refusal(folder).message
     (folder / name).unlink()
     assert f"{name} does not exist" in refusal(folder).message
 
 
-def test_a_folder_in_the_place_of_a_file_is_named(folder: Path) -> None:
+def test_a_folder_in_the_place_of_a_file_is_named(folder):
     (folder / "board.toml").unlink()
     (folder / "board.toml").mkdir()
     assert "board.toml is a folder, and no file" in refusal(folder).message
 
 
-def test_a_header_without_rows_is_named(folder: Path) -> None:
+def test_a_header_without_rows_is_named(folder):
     (folder / "views.csv").write_text(HEADER + "\n,,,,,,,,,,,,\n")
     assert "a header row and no views" in refusal(folder).message
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
-def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separator: str) -> None:
+def test_the_separators_and_commas_of_spreadsheets_are_read(folder, separator):
     digest = Session.load(folder).digest()
     table = parse_csv((folder / "views.csv").read_text(), "views.csv")
     lines = [
@@ -638,7 +628,7 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder: Path, separa
     assert Session.load(folder).digest() == digest
 
 
-def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> None:
+def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder):
     edit(folder, "session.toml", 'model = "ur10e"\n', "")
     session = Session.load(folder)
     assert (session.robot_name, session.robot_document, session.declaration.only_robot.tip) == (
@@ -650,7 +640,7 @@ def test_a_robot_whose_tip_alone_is_named_goes_by_its_poses(folder: Path) -> Non
     assert not session.warnings
 
 
-def test_what_is_no_session_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_session_is_refused(tmp_path):
     with pytest.raises(DataError, match="nowhere does not exist"):
         Session.load(tmp_path / "nowhere")
     for name in ("notes.txt", "calibration.json", "recording.rrd"):
@@ -663,7 +653,7 @@ def test_what_is_no_session_is_refused(tmp_path: Path) -> None:
         assert f"name {tmp_path / 'recording.rrd'}" in caught.value.next_step
 
 
-def test_a_byte_order_mark_and_other_line_ends_are_read(folder: Path) -> None:
+def test_a_byte_order_mark_and_other_line_ends_are_read(folder):
     digest = Session.load(folder).digest()
     for name in ("session.toml", "views.csv"):
         text = (folder / name).read_text(encoding="utf-8").replace("\n", "\r\n")
@@ -688,9 +678,7 @@ WARNINGS = [
 
 
 @pytest.mark.parametrize(("name", "old", "new", "words"), WARNINGS)
-def test_the_suspicious_is_said_and_kept(
-    folder: Path, name: str, old: str, new: str, words: str
-) -> None:
+def test_the_suspicious_is_said_and_kept(folder, name, old, new, words):
     edit(folder, name, old, new)
     session = Session.load(folder)
     assert len(session.warnings) == 1
@@ -700,12 +688,12 @@ def test_the_suspicious_is_said_and_kept(
 
 
 @pytest.mark.parametrize("name", ["status", "pitch", "joint1", "time", "sample_id", "target_id"])
-def test_a_column_of_another_thing_is_no_misspelt_one(folder: Path, name: str) -> None:
+def test_a_column_of_another_thing_is_no_misspelt_one(folder, name):
     edit(folder, "views.csv", "note", name)
     assert not Session.load(folder).warnings
 
 
-def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:
+def test_millimetres_and_degrees_are_noticed(folder):
     edit(folder, "views.csv", "0.5,-0.1,.3", "500,-100,300")
     edit(folder, "views.csv", "0.6,0,0.3", "600,0,300")
     edit(folder, "views.csv", "stamp_s", "q1_rad")
@@ -716,7 +704,7 @@ def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:
     assert "It looks like degrees" in wide
 
 
-def test_positions_in_inches_are_not_called_millimetres(folder: Path) -> None:
+def test_positions_in_inches_are_not_called_millimetres(folder):
     edit(folder, "views.csv", "0.5,-0.1,.3", "29.5,-3.9,11.8")
     edit(folder, "views.csv", "0.6,0,0.3", "33.6,0,11.8")
     (far,) = Session.load(folder).warnings
@@ -724,7 +712,7 @@ def test_positions_in_inches_are_not_called_millimetres(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("extra", ["point", "meas_x_m,meas_y_m,meas_z_m"])
-def test_touches_and_readings_need_no_image(folder: Path, extra: str) -> None:
+def test_touches_and_readings_need_no_image(folder, extra):
     cells = "tip" if extra == "point" else "1,2,3"
     (folder / "views.csv").write_text(f"view,{extra}\n1,{cells}\n")
     edit(folder, "session.toml", 'target = "board.toml"\n', "")
@@ -737,9 +725,7 @@ finite = st.floats(-1e10, 1e10)
 
 @settings(deadline=None, max_examples=60)  # a busy disk takes its time to flush
 @given(rows=st.lists(st.tuples(cells, finite), min_size=1, max_size=5))
-def test_any_text_and_any_number_survive(
-    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[str, float]]
-) -> None:
+def test_any_text_and_any_number_survive(tmp_path_factory, rows):
     columns = ("view", "note", "stamp_s", "point")
     texts = [[str(k), note, repr(stamp), "p"] for k, (note, stamp) in enumerate(rows)]
     document = {"schema": 1, "name": "n", "mount": "eye-to-hand"}
@@ -752,7 +738,7 @@ def test_any_text_and_any_number_survive(
     assert again.digest() == session.digest()
 
 
-def test_a_table_of_samples_is_no_table_of_views() -> None:
+def test_a_table_of_samples_is_no_table_of_views():
     rows = "view,image\n" + "".join(f"{index},a.png\n" for index in range(20_001))
     with pytest.raises(DataError, match=r"more than 20,000 rows.*streams/NAME\.csv"):
         parse_csv(rows, "views.csv")

@@ -1,7 +1,5 @@
 """Sessions with several boards: what they declare, what is refused, and how they are stored."""
 
-from pathlib import Path
-
 import pytest
 from support.edited import changed
 
@@ -36,7 +34,7 @@ TABLE = """view,stop,target,image,x_m,y_m,z_m,qx,qy,qz,qw
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     session = tmp_path / "cell"
     (session / "boards").mkdir(parents=True)
     (session / "session.toml").write_text(TOML)

@@ -1,7 +1,5 @@
 """Sessions with several robots and cameras: what hangs on what, who saw what, what is refused."""
 
-from pathlib import Path
-
 import pytest
 from support.edited import changed
 
@@ -61,7 +59,7 @@ TABLE = f"""view,stop,role,camera,robot,target,image,x_m,y_m,z_m,qx,qy,qz,qw
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     session = tmp_path / "cell"
     (session / "arms").mkdir(parents=True)
     (session / "session.toml").write_text(TOML)

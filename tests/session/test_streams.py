@@ -1,14 +1,12 @@
 """Streams beside the views: read, checked, told, and kept in every storage of a session."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.kept import assert_same, kept_session, kept_streams
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray
 from visioncal.interchange.formats import convert
 from visioncal.present.recording import write_recording
 from visioncal.session import Session, Stream
@@ -17,17 +15,17 @@ from visioncal.session.streams import check_stream, parse_stream, read_streams
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
-def stream(**columns: FloatArray) -> Stream:
+def stream(**columns):
     return Stream(tuple(columns), np.stack(list(columns.values()), axis=1))
 
 
-def parsed(*lines: str) -> Stream:
+def parsed(*lines):
     robot = parse_stream("\n".join(lines) + "\n", "streams/robot.csv")
     check_stream("robot", robot)
     return robot
 
 
-def test_columns_are_the_numbers_as_they_were_read() -> None:
+def test_columns_are_the_numbers_as_they_were_read():
     robot = parsed("stamp_s,q1_rad, dq1_rad_s", "0.1,1e-3,-0.0", "0.3,.5,2", "")
     assert robot.columns == ("stamp_s", "q1_rad", "dq1_rad_s")
     np.testing.assert_array_equal(robot["q1_rad"], [1e-3, 0.5])
@@ -36,7 +34,7 @@ def test_columns_are_the_numbers_as_they_were_read() -> None:
         robot.values[0, 0] = 1.0
 
 
-def test_rows_without_a_pose_are_no_poses() -> None:
+def test_rows_without_a_pose_are_no_poses():
     robot = parsed(
         "stamp_s," + ",".join(POSE) + ",temp1_c",
         "0,0.4,0,0.5,0,0,0,1,",
@@ -49,7 +47,7 @@ def test_rows_without_a_pose_are_no_poses() -> None:
     assert np.isnan(robot["temp1_c"]).tolist() == [True, False, True]
 
 
-def test_a_file_of_windows_is_read_alike() -> None:
+def test_a_file_of_windows_is_read_alike():
     text = 'stamp_s,"temp1_c"\n0,1.5\n1,\n'
     one, other = (parse_stream(name, "s.csv") for name in (text, text.replace("\n", "\r\n")))
     assert one.columns == other.columns
@@ -79,12 +77,12 @@ def test_a_file_of_windows_is_read_alike() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_named(lines: list[str], words: str) -> None:
+def test_what_is_wrong_is_named(lines, words):
     with pytest.raises(DataError, match=words):
         parsed(*lines)
 
 
-def test_a_column_without_numbers_is_one_sentence_with_advice_that_fits() -> None:
+def test_a_column_without_numbers_is_one_sentence_with_advice_that_fits():
     rows = ["0,1,2", *(f"{index},nan,2" for index in range(1, 31)), "40,1,NaN"]
     with pytest.raises(DataError) as error:
         parsed("stamp_s,q1_rad,tau1_nm", *rows)
@@ -95,7 +93,7 @@ def test_a_column_without_numbers_is_one_sentence_with_advice_that_fits() -> Non
     assert "Leave a cell empty where there is no number" in words
 
 
-def test_lines_are_those_of_the_file_and_stamps_get_advice() -> None:
+def test_lines_are_those_of_the_file_and_stamps_get_advice():
     for empty in ([], [""], ["", " "]):
         line = 4 + len(empty)
         with pytest.raises(DataError, match=f"line {line}, column stamp_s: ") as error:
@@ -103,18 +101,18 @@ def test_lines_are_those_of_the_file_and_stamps_get_advice() -> None:
         assert "leave out what was recorded twice" in str(error.value)
 
 
-def test_rows_that_are_wrong_are_named_up_to_some() -> None:
+def test_rows_that_are_wrong_are_named_up_to_some():
     with pytest.raises(DataError, match=r"line 2: it has 1 fields.* And 999 more") as error:
         parsed("stamp_s,q1_rad", *["1"] * 1000)
     assert error.value.culprits == ("streams/robot.csv, line 2",)
 
 
-def test_a_name_that_leaves_the_folder_is_refused() -> None:
+def test_a_name_that_leaves_the_folder_is_refused():
     with pytest.raises(DataError, match="name"):
         kept_session().with_streams({"../robot": kept_streams()["robot"]})
 
 
-def test_gaps_are_told() -> None:
+def test_gaps_are_told():
     stamps_s = np.arange(1000) / 500
     there = (stamps_s < 0.5) | (stamps_s > 0.9)
     (told,) = kept_session().with_streams({"robot": stream(stamp_s=stamps_s[there])}).warnings[-1:]
@@ -123,7 +121,7 @@ def test_gaps_are_told() -> None:
     assert not parsed("stamp_s", *map(repr, stamps_s.tolist())).gaps().size
 
 
-def test_folder_recording_and_copies_hold_the_same(tmp_path: Path) -> None:
+def test_folder_recording_and_copies_hold_the_same(tmp_path):
     # A file of a robot's orders its keys anew.
     session = replace(kept_session(), robot_document=None)
     cells = [[view.cell(column) for column in session.columns] for view in session.views]
@@ -148,7 +146,7 @@ def test_folder_recording_and_copies_hold_the_same(tmp_path: Path) -> None:
     assert_same(session, Session.load(tmp_path / "again"))
 
 
-def test_the_digest_knows_streams_and_is_as_it_was_without() -> None:
+def test_the_digest_knows_streams_and_is_as_it_was_without():
     session, (robot,) = kept_session(), kept_streams().values()
     # As version 0.1.0 had it, before there were streams.
     assert session.digest() == "e83c60275bbfdebda5c33cd9109102a770f3f6bec9646e9bd73d2b99b9de1ba6"
@@ -183,9 +181,7 @@ def test_the_digest_knows_streams_and_is_as_it_was_without() -> None:
         ("note", "1e308", "no number that a cell has"),
     ],
 )
-def test_a_number_that_no_cell_has_is_named_by_its_column(
-    column: str, value: str, words: str, tmp_path: Path
-) -> None:
+def test_a_number_that_no_cell_has_is_named_by_its_column(column, value, words, tmp_path):
     names = ("stamp_s", *POSE, "q1_rad", "dq1_rad_s", "tau1_nm", "note")
     cells = dict.fromkeys(names, "0") | {"qw": "1"}
     first, second = cells, cells | {"stamp_s": "1"} | {column: value}

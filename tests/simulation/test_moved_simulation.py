@@ -17,7 +17,7 @@ from visioncal.simulation.dynamics import (
 )
 
 
-def states(seed: int = 0):
+def states(seed=0):
     return np.random.default_rng(seed).uniform(-2.0, 2.0, (3, 20, 6))
 
 

@@ -10,12 +10,10 @@ from support.marks import slow
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log, rotation_angle
-from visioncal.core.types import Camera, Target
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
     CellOptions,
-    SimulatedCell,
     fine_camera,
     fisheye_camera,
     forward,
@@ -41,26 +39,26 @@ RATIONAL = dataclasses.replace(
 )
 
 
-def base_from_target_chain(cell: SimulatedCell, base_from_flange: np.ndarray) -> np.ndarray:
+def base_from_target_chain(cell, base_from_flange):
     """(m, 4, 4) the board's pose through the arm and the camera, or on its way through the arm."""
     if cell.options.mount == "eye-in-hand":
         return base_from_flange @ cell.transforms["flange_from_cam"] @ cell.cam_from_target
     return base_from_flange @ cell.transforms["flange_from_target"]
 
 
-def base_from_target(cell: SimulatedCell) -> np.ndarray:
+def base_from_target(cell):
     """The same without the arm."""
     if cell.options.mount == "eye-in-hand":
         return cell.transforms["base_from_target"]
     return cell.transforms["base_from_cam"] @ cell.cam_from_target
 
 
-def cv_matrix(camera: Camera) -> np.ndarray:
+def cv_matrix(camera):
     fx, fy, cx, cy = camera.matrix
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def cv_project(camera: Camera, points: np.ndarray) -> np.ndarray:
+def cv_project(camera, points):
     matrix = cv_matrix(camera)
     zero = np.zeros(3)
     if camera.model == "fisheye":
@@ -176,7 +174,7 @@ def test_views_show_the_board_from_the_front_and_mostly_whole():
     assert corners.min() >= 24
 
 
-def rotation_angle_of_normal(cell: SimulatedCell) -> np.ndarray:
+def rotation_angle_of_normal(cell):
     """(m,) angle between the optical axis and the board's normal [rad]."""
     return np.arccos(cell.cam_from_target[:, 2, 2])
 
@@ -252,7 +250,7 @@ def test_impossible_options_are_refused():
         simulate(CellOptions(robot="kr16"))
 
 
-def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+def charuco_board(target):
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     size = (target.columns, target.rows)
     board = cv2.aruco.CharucoBoard(size, target.square_m, target.marker_m, dictionary)
@@ -260,7 +258,7 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     return board
 
 
-def found_corners(target: Target, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def found_corners(target, image):
     """Ids and pixels of the corners that OpenCV finds."""
     if target.kind == "charuco":
         px, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board(target)).detectBoard(image)
@@ -272,7 +270,7 @@ def found_corners(target: Target, image: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.arange(len(px))[::-1], px.reshape(-1, 2)
 
 
-def detection_errors(options: CellOptions) -> np.ndarray:
+def detection_errors(options):
     """(n, 2) found minus true corners [px], half of the pictures taken upside down."""
     cell = simulate(options)
     scene = prepare_scene(cell)

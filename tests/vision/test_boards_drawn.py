@@ -26,7 +26,7 @@ DICTIONARIES = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"
         charuco(30, 3, "DICT_4X4_50", square_m=0.005, marker_m=0.0037),
     ],
 )
-def test_a_charuco_board_is_found_in_its_picture(target: Target) -> None:
+def test_a_charuco_board_is_found_in_its_picture(target):
     drawn, zoom, rim = picture(target), 2, 60
     page = cv2.resize(drawn, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
     page = np.pad(page, rim, constant_values=255)
@@ -38,7 +38,7 @@ def test_a_charuco_board_is_found_in_its_picture(target: Target) -> None:
     np.testing.assert_allclose(seen.px, expected, atol=0.6)
 
 
-def test_two_copies_of_a_charuco_board_in_an_image_are_named() -> None:
+def test_two_copies_of_a_charuco_board_in_an_image_are_named():
     target = charuco(9, 6, square_m=0.025, marker_m=0.018)
     drawn = cv2.resize(picture(target), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     page = np.pad(drawn, 60, constant_values=255)
@@ -50,7 +50,7 @@ def test_two_copies_of_a_charuco_board_in_an_image_are_named() -> None:
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)
-def test_any_share_of_the_square_is_drawn_with_any_dictionary(name: str) -> None:
+def test_any_share_of_the_square_is_drawn_with_any_dictionary(name):
     rng = np.random.default_rng(DICTIONARIES.index(name))
     count = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
     for share in (0.02, 0.35, 0.83, 0.999):
@@ -80,7 +80,7 @@ def test_any_share_of_the_square_is_drawn_with_any_dictionary(name: str) -> None
         assert draw_sheet(target, 16).levels[0].any()
 
 
-def test_a_marker_is_drawn_by_its_bits() -> None:
+def test_a_marker_is_drawn_by_its_bits():
     target = Target("tag", "marker", 1, 1, 0.1, 1e-4, dictionary="DICT_7X7_50", marker_id=3)
     drawn, dictionary = picture(target), cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_7X7_50)
     _, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(

@@ -38,7 +38,7 @@ ODD = {
 BOARDS = {name: load_target(name) for name in target_names()} | ODD
 
 
-def scales(image, target, size_mm) -> tuple[int, np.ndarray]:
+def scales(image, target, size_mm):
     """How many corners are found, and their scale along x and y over the page's."""
     seen = find_target(image, target)
     assert isinstance(seen, DetectedCorners), seen

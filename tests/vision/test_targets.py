@@ -1,6 +1,5 @@
 """Targets: their files are checked, and their corners are where OpenCV and the print put them."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -39,24 +38,24 @@ MARKER: dict[str, Any] = {
 }
 
 
-def checkerboard(columns: int, rows: int) -> Target:
+def checkerboard(columns, rows):
     return Target("board", "checkerboard", columns, rows, 0.02, 1e-5)
 
 
 @pytest.mark.parametrize("name", target_names())
-def test_shipped_targets_load_and_round_trip(name: str, tmp_path: Path) -> None:
+def test_shipped_targets_load_and_round_trip(name, tmp_path):
     target, document = read_target(name, tmp_path)
     assert target.name == name
     assert target_from_document(target_document(target), name) == target
     assert target_from_document(document, name) == target
 
 
-def test_the_promised_boards_are_shipped() -> None:
+def test_the_promised_boards_are_shipped():
     promised = {"charuco_9x6_30mm", "charuco_14x9_20mm", "checkerboard_9x6_25mm"}
     assert promised <= set(target_names())
 
 
-def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path: Path) -> None:
+def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path):
     (tmp_path / "boards").mkdir()
     (tmp_path / "boards" / "my board.toml").write_text(
         '\ufeffkind = "checkerboard"\ncolumns = 4\nrows = 3\nsquare_m = 0.05\n', encoding="utf-8"
@@ -66,7 +65,7 @@ def test_a_path_is_relative_to_the_folder_that_names_it(tmp_path: Path) -> None:
     assert target.square_sigma_m == DEFAULT_RELATIVE_SIGMA * 0.05
 
 
-def test_an_unknown_name_lists_the_names_and_a_near_one() -> None:
+def test_an_unknown_name_lists_the_names_and_a_near_one():
     with pytest.raises(DataError, match="checkerboard_9x6_25mm") as caught:
         load_target("charuco_9x6", None)
     assert "Did you mean charuco_9x6_30mm" in caught.value.message
@@ -90,7 +89,7 @@ def test_an_unknown_name_lists_the_names_and_a_near_one() -> None:
         ({"legacy": 1}, "legacy is 1; true or false"),
     ],
 )
-def test_a_wrong_field_is_named_with_what_it_must_be(change: dict[str, Any], words: str) -> None:
+def test_a_wrong_field_is_named_with_what_it_must_be(change, words):
     with pytest.raises(DataError, match=words):
         target_from_document(CHARUCO | change, "mine")
 
@@ -107,9 +106,7 @@ def test_a_wrong_field_is_named_with_what_it_must_be(change: dict[str, Any], wor
         ({"marker_m": 0.866}, "marker_m in inches", "marker_m = 0.0219964"),
     ],
 )
-def test_a_side_in_another_unit_is_named_by_the_ratio(
-    change: dict[str, Any], unit: str, right: str
-) -> None:
+def test_a_side_in_another_unit_is_named_by_the_ratio(change, unit, right):
     with pytest.raises(DataError, match=unit) as caught:
         target_from_document(CHARUCO | change, "mine")
     assert caught.value.next_step.endswith(f"write {right}.")
@@ -119,7 +116,7 @@ def test_a_side_in_another_unit_is_named_by_the_ratio(
     ("old", "new", "meant"),
     [("square_m", "square", "square_m"), ("columns", "colums", "columns")],
 )
-def test_a_key_that_is_missing_and_misspelt_is_named(old: str, new: str, meant: str) -> None:
+def test_a_key_that_is_missing_and_misspelt_is_named(old, new, meant):
     document = {new if key == old else key: value for key, value in CHARUCO.items()}
     with pytest.raises(DataError, match=f"{old} is missing") as caught:
         target_from_document(document, "mine")
@@ -128,14 +125,14 @@ def test_a_key_that_is_missing_and_misspelt_is_named(old: str, new: str, meant: 
     )
 
 
-def test_a_marker_needs_an_id_of_its_dictionary() -> None:
+def test_a_marker_needs_an_id_of_its_dictionary():
     assert target_from_document(MARKER, "tag").marker_id == 7
     with pytest.raises(DataError, match="id is 587; a whole number from 0 to 586"):
         target_from_document(MARKER | {"id": 587}, "tag")
 
 
 @pytest.mark.parametrize(("columns", "rows", "legacy"), [(9, 6, False), (9, 6, True), (5, 7, True)])
-def test_charuco_corners_are_opencvs(columns: int, rows: int, legacy: bool) -> None:
+def test_charuco_corners_are_opencvs(columns, rows, legacy):
     document = CHARUCO | {"columns": columns, "rows": rows, "legacy": legacy}
     target = target_from_document(document, "b")
     board = charuco_board(target)
@@ -144,7 +141,7 @@ def test_charuco_corners_are_opencvs(columns: int, rows: int, legacy: bool) -> N
     assert board.getLegacyPattern() is legacy
 
 
-def test_marker_corners_are_in_opencvs_order_around_the_centre() -> None:
+def test_marker_corners_are_in_opencvs_order_around_the_centre():
     target = target_from_document(MARKER, "tag")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     page = np.full((400, 400), 255, np.uint8)
@@ -160,7 +157,7 @@ def test_marker_corners_are_in_opencvs_order_around_the_centre() -> None:
 @pytest.mark.parametrize(
     ("columns", "rows"), [(9, 6), (8, 6), (7, 5), (5, 5), (6, 6), (4, 4), (3, 4), (3, 3)]
 )
-def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns: int, rows: int) -> None:
+def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns, rows):
     target = checkerboard(columns, rows)
     page = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2
     turns = [k for k in range(4) if np.array_equal(np.rot90(page, k), page)]
@@ -177,7 +174,7 @@ def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns: int, 
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(8, 6), (6, 6), (5, 5)])
-def test_permutations_belong_to_their_transforms(columns: int, rows: int) -> None:
+def test_permutations_belong_to_their_transforms(columns, rows):
     target = checkerboard(columns, rows)
     positions = corner_positions(target)
     pairs = list(zip(rotations(target), rotation_transforms(target), strict=True))
@@ -190,7 +187,7 @@ def test_permutations_belong_to_their_transforms(columns: int, rows: int) -> Non
 
 
 @pytest.mark.parametrize("document", [CHARUCO | {"columns": 8}, MARKER])
-def test_markers_break_every_symmetry(document: dict[str, Any]) -> None:
+def test_markers_break_every_symmetry(document):
     target = target_from_document(document, "b")
     assert len(rotations(target)) == 1
     assert np.array_equal(rotation_transforms(target), np.eye(4)[None])

@@ -11,7 +11,7 @@ from support.rendered import Shot, photograph
 
 from visioncal.core.types import Target
 from visioncal.vision.boards import DetectedCorners, NotFound, blur_of, find_target, kind_of
-from visioncal.vision.boards.template import Refined, refine_tags
+from visioncal.vision.boards.template import refine_tags
 
 # Columns and rows differ by an odd number: the checkerboard has one numbering.
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
@@ -22,7 +22,7 @@ def detected(target, image):
     return kind_of(target).search(image, target)
 
 
-def refine(image, target, ids, px) -> Refined:
+def refine(image, target, ids, px):
     """Corners of a board, by its template."""
     return kind_of(target).refine(image, target, ids, px)
 

@@ -1,22 +1,24 @@
-"""Exciting motions: their series, their criterion, their limits, against plain calculations."""
+"""Exciting motions and sweeps against plain calculations, and `visioncal dynamics plan`."""
 
-import itertools
+import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
-import pinocchio as pin
 import pytest
+import rerun as rr
+import tomli_w
 from support.apart import clearances
-from support.small_arm import small_arm
+from support.commands import visioncal
+from support.small_arm import small_arm, small_document
 
+from visioncal.cli import dynamics
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
-from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, Harmonics, Objective, Series, excite
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_extremes, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
+from visioncal.dynamics.sweeps import Stroke, SweepRequest, plan_sweeps
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.collision import Body
 from visioncal.simulation.arms import ur_arm
@@ -24,24 +26,17 @@ from visioncal.simulation.arms import ur_arm
 QUICK = ExcitationRequest(harmonics=4, starts=1, steps=20)
 
 
-def some_series(joints: int = 3, seed: int = 0) -> Series:
+def some_series(joints=3, seed=0):
     harmonics = Harmonics(12.0, 4)
     return Series(harmonics, np.random.default_rng(seed).normal(size=(joints, 7)))
 
 
-def test_a_series_begins_and_ends_at_rest_where_it_began():
-    motion = some_series().sampled(100.0)
-    assert motion.times_s[[0, -1]].tolist() == [0.0, 12.0]
-    assert np.abs(motion.q[0] - motion.q[-1]).max() < 1e-12
-    assert np.abs(motion.q[0] - some_series().start).max() < 1e-12
-    for rates in (motion.dq, motion.ddq):
-        # Rounding of sums of some tens of terms of size 1.
-        assert np.abs(rates[[0, -1]]).max() < 1e-12
-        assert np.abs(rates).max() > 1.0
-
-
-def test_speeds_and_accelerations_are_derivatives():
+def test_a_series_begins_and_ends_at_rest_and_knows_its_derivatives():
     motion = some_series().sampled(2000.0)
+    assert motion.times_s[[0, -1]].tolist() == [0.0, 12.0]
+    # Rounding of sums of some tens of terms of size 1.
+    assert np.abs(motion.q[[0, -1]] - some_series().start).max() < 1e-12
+    assert np.abs([motion.dq[[0, -1]], motion.ddq[[0, -1]]]).max() < 1e-12
     for values, rates in ((motion.q, motion.dq), (motion.dq, motion.ddq)):
         jacobian = np.gradient(values, motion.times_s, axis=0)[1:-1]
         # Central differences err by a sixth of the third derivative times the squared step.
@@ -86,7 +81,7 @@ def test_the_objective_knows_its_jacobian(far):
     broken = (objective.value(free, 4.0, price)[0] - objective.value(free, 4.0, 0.0)[0]) / price
     assert (broken == 0.0) if far < 0.1 else (broken > 1.0)
 
-    def along(step: float) -> float:
+    def along(step):
         return objective.value(free + step * direction, 4.0, price)[0]
 
     jacobian = objective.value(free, 4.0, price)[1]
@@ -98,7 +93,7 @@ def test_the_objective_knows_its_jacobian(far):
 
 
 @pytest.fixture(scope="module")
-def ur5e() -> Robot:
+def ur5e():
     return load_robot("ur5e")
 
 
@@ -127,27 +122,6 @@ def test_a_found_motion_keeps_the_data_sheet_by_plain_differences(ur5e, found):
     assert found.extremes.breaches == ()
 
 
-def test_torques_have_room_for_wrong_inertias(ur5e, found):
-    """By Pinocchio's recursion with bodies of its own, not by a regressor."""
-    model, motion = pinocchio_with_bodies(ur5e), found.series.sampled(50.0)
-    data = model.createData()
-    states = zip(motion.q, motion.dq, motion.ddq, strict=True)
-    torques = np.array([pin.rnea(model, data, *state).copy() for state in states])
-    assert (1.2 * np.abs(torques).max(axis=0) <= ur5e.torque_nm).all()
-    # At a twentieth of the samples the peaks are lower by their curvature.
-    assert np.abs(torques).max(axis=0) == pytest.approx(found.extremes.torque, rel=0.01)
-
-
-def pinocchio_with_bodies(robot: Robot) -> pin.Model:
-    model = robot.pinocchio_model.copy()
-    masses, about = robot.inertias.masses, robot.inertias.about_centres
-    for place in range(robot.joint_count):
-        body = pin.Inertia(masses.kg[place], masses.centres_m[place], about[place])
-        model.inertias[place + 1] = body
-    model.gravity.linear = robot.gravity
-    return model
-
-
 def test_a_short_search_already_beats_random_motions(found):
     """By singular values of the regressor, with columns that pivots of its own choose."""
     assert found.base.rank == 54
@@ -160,20 +134,7 @@ def test_a_short_search_already_beats_random_motions(found):
     assert found.starts == 1
 
 
-@pytest.mark.slow
-def test_a_slow_computer_finds_the_same_motion_unless_a_limit_of_time_is_wished(monkeypatch):
-    allowed = motion_limits(small_arm(), MotionMargins())
-    wished = replace(QUICK, steps=3, harmonics=3, starts=2)
-    first = excite(allowed, wished)
-    hours = itertools.count(step=3600.0)
-    monkeypatch.setattr(excitation, "time", SimpleNamespace(process_time=lambda: next(hours)))
-    slow = excite(allowed, wished)
-    assert np.array_equal(first.series.free, slow.series.free)
-    assert slow.starts == 2
-    assert excite(allowed, replace(wished, seconds=60.0)).starts == 1
-
-
-def breaking(kind: str) -> JointMotion:
+def breaking(kind):
     """A motion of the small arm that breaks one limit alone."""
     times = np.linspace(0.0, 1.0, 201)
     still = np.zeros((len(times), 3))
@@ -224,20 +185,6 @@ def test_a_payload_counts_in_the_torques():
     )
 
 
-def test_without_inertias_the_torques_are_not_checked_and_that_is_said():
-    allowed = motion_limits(
-        small_arm(mass_kg=None, com_m=None, inertia_kg_m2=None), MotionMargins()
-    )
-    assert "no inertias" in allowed.unchecked[0]
-    quick = replace(QUICK, steps=2, harmonics=3)
-    found = excite(allowed, quick)
-    assert found.extremes.torque is None
-    assert "torque" not in found.extremes.shares
-    unknown = motion_limits(small_arm(torque_nm=None), MotionMargins())
-    assert "joint_1, joint_2, joint_3" in unknown.unchecked[0]
-    assert motion_limits(small_arm(), MotionMargins()).unchecked == ()
-
-
 # A joint that turns without end, and in whose URDF nobody can write an acceleration.
 ENDLESS = """<robot name="endless"><link name="base"/><link name="tool0"/>
 <joint name="wheel" type="continuous"><parent link="base"/><child link="tool0"/>
@@ -274,29 +221,205 @@ def test_missing_limits_are_named_and_can_be_given(robot, joints, option):
 def test_limits_that_leave_nothing_are_named():
     with pytest.raises(DataError, match=r"joint_1 10\.0 deg are left"):
         motion_limits(small_arm(lower_deg=-5.0, upper_deg=5.0), MotionMargins(margin_rad=0.2))
-    flooded = motion_limits(small_arm(), MotionMargins(floor_m=2.0))
-    with pytest.raises(DegenerateError, match="none of 2000 postures") as told:
-        excite(flooded, QUICK)
-    assert "floor" in told.value.culprits
     # Level within 20 degrees, its second joint holds more than 8 N m; upright it would hold none.
     weak = motion_limits(small_arm(torque_nm=8.0, lower_deg=-20.0, upper_deg=20.0), MotionMargins())
     with pytest.raises(DegenerateError, match="torque of joint_2"):
         excite(weak, replace(QUICK, harmonics=3))
 
 
+TABLES = {"excitation.csv", "sweeps.csv", "plan.json", "plan.rrd"}
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun():
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def sweeps():
+    post = Body(
+        "post", 0, "box", np.array([0.1, 0.1, 0.8]), compose(np.eye(3), np.array([0.5, 0.2, 0.4]))
+    )
+    return plan_sweeps(
+        motion_limits(load_robot("ur5e"), MotionMargins(), bodies=[post]), SweepRequest(speeds=4)
+    )
+
+
+def test_a_stroke_is_a_ramp_constant_speed_and_a_ramp():
+    stroke = Stroke(0, 1.0, -0.5, 0.6, 0.4, sweeps=True)
+    times = np.linspace(0.0, stroke.duration_s, 20001)
+    position, speed, acceleration = stroke.at(times)
+    assert position[[0, -1]] == pytest.approx([1.0, -0.5], abs=1e-12)
+    assert np.abs([speed[[0, -1]], acceleration[[0, -1]]]).max() < 1e-9
+    steady = (times > 0.4) & (times < stroke.duration_s - 0.4)
+    assert steady.mean() == pytest.approx(1.0 - 0.8 / 2.9, abs=1e-3)
+    assert speed[steady] == pytest.approx(-0.6)
+    assert np.abs(speed).max() < 0.6 + 1e-12
+    # Central differences at 0.15 ms, where the third derivative is below 25 rad/s^3.
+    assert np.abs(np.gradient(position, times)[1:-1] - speed[1:-1]).max() < 1e-6
+    assert np.abs(np.gradient(speed, times)[1:-1] - acceleration[1:-1]).max() < 3e-3
+    # After its end it rests.
+    assert np.abs(stroke.at(np.array([9.0]))[0] + 0.5).max() < 1e-12
+
+
+def test_sweeps_move_one_joint_at_a_time_within_all_limits(sweeps):
+    motion = sweeps.sampled(250.0)
+    assert ((np.abs(motion.dq) > 1e-9).sum(axis=1) <= 1).all()
+    assert motion.q[0] == pytest.approx(sweeps.home)
+    assert motion.q[-1] == pytest.approx(sweeps.home, abs=1e-12)
+    differences = np.diff(motion.q, axis=0) * 250.0
+    assert (np.abs(differences).max(axis=0) <= 0.9 * np.pi).all()
+    assert (np.abs(np.diff(differences, axis=0) * 250.0).max(axis=0) <= 9.0 + 1e-6).all()
+    pose = compose(np.eye(3), np.array([0.5, 0.2, 0.4]))
+    apart = clearances(ur_arm("ur5e"), motion.q[::10], 0.0, [(pose, np.array([0.1, 0.1, 0.8]))])
+    assert apart.min() > 0.03 - 1e-5
+    assert sweeps.extremes.breaches == ()
+    assert sweeps.left_out == ()
+
+
+def test_every_joint_sweeps_over_the_same_place_in_both_directions_at_every_speed(sweeps):
+    for joint in range(6):
+        own = [stroke for stroke in sweeps.strokes if stroke.sweeps and stroke.joint == joint]
+        there, back = own[::2], own[1::2]
+        speeds = [value.speed for value in there]
+        assert speeds == sorted(speeds)
+        assert len(speeds) == 4
+        assert speeds[0] == pytest.approx(0.02)
+        assert speeds[-1] > 1.0
+        for one, other in zip(there, back, strict=True):
+            assert (one.begin, one.end, one.speed) == (other.end, other.begin, other.speed)
+            # Besides its ramps it holds its speed for some time.
+            assert abs(one.end - one.begin) / one.speed - one.ramp_s > 0.39
+
+
+def test_joints_without_room_are_left_out_and_named():
+    document = small_document()
+    document["joint"][1] |= {"lower_deg": 80.0, "upper_deg": 96.0}
+    arm = type(small_arm()).from_document(document)
+    found = plan_sweeps(motion_limits(arm, MotionMargins()), SweepRequest(speeds=2))
+    assert found.left_out == ("joint_2",)
+    assert {stroke.joint for stroke in found.strokes} == {0, 2}
+    with pytest.raises(DegenerateError, match="no posture was found"):
+        plan_sweeps(motion_limits(arm, MotionMargins(floor_m=2.0)), SweepRequest())
+    with pytest.raises(DataError, match="1 speeds"):
+        SweepRequest(speeds=1)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Searches a little only: what is written does not depend on how good it is."""
+
+    def short(allowed, request, progress):
+        return excite(allowed, replace(request, steps=4), progress)
+
+    monkeypatch.setattr(dynamics, "excite", short)
+
+
+def plan(robot, out, *more):
+    return visioncal("dynamics", "plan", robot, "-o", out, "--starts", 1, *more)
+
+
+def table(path):
+    head = path.read_text().partition("\n")[0].split(",")
+    return head, np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+def small_file(folder):
+    path = folder / "small.toml"
+    path.write_text(tomli_w.dumps(small_document()))
+    return path
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_plan_has_tables_a_preview_and_all_of_it_as_json(tmp_path):
+    out = tmp_path / "größer"
+    done = plan("ur5e", out, "--rate", 100, "--harmonics", 3, "--duration", 12, "--sweep-speeds", 2)
+    assert done.status == 0, done.err
+    assert {path.name for path in out.iterdir()} == TABLES
+    assert "for 54 base parameters (random motions:" in done.out
+    assert "warning" not in done.out
+    document = json.loads((out / "plan.json").read_text(encoding="utf-8"))
+    found = document["excitation"]
+    assert len(found["base_parameters"]) == 54
+    assert min(found["condition"], found["condition_random"]) > 1.0
+    assert max(found["kept"]["share_of_allowed"]["torque"]) <= 1.0
+    head, rows = table(out / "excitation.csv")
+    assert head[:2] == ["stamp_s", "q1_rad"]
+    assert head[7] == "dq1_rad_s"
+    assert head[-1] == "ddq6_rad_s2"
+    assert rows[:, 0] == pytest.approx(np.arange(1201) / 100.0)
+    # The series as it is written down gives the table.
+    phases = 2.0 * np.pi / 12.0 * rows[:, :1] * np.arange(1, 4)
+    q = (
+        np.array(found["mean_rad"])
+        + np.sin(phases) @ np.transpose(found["sine_rad"])
+        + np.cos(phases) @ np.transpose(found["cosine_rad"])
+    )
+    # Ten digits are written.
+    assert np.abs(q - rows[:, 1:7]).max() < 1e-8
+    strokes = document["sweeps"]["strokes"]
+    assert len(strokes) == 6 * 2 * 2
+    swept = table(out / "sweeps.csv")[1]
+    fast = strokes[-1]
+    middle = fast["begin_s"] + 0.5 * fast["duration_s"]
+    row = swept[np.abs(swept[:, 0] - middle).argmin()]
+    assert abs(row[6 + fast["joint"]]) == pytest.approx(fast["speed_rad_s"])
+
+
+@pytest.mark.usefixtures("quick")
+def test_tables_of_an_earlier_plan_are_taken_away(tmp_path):
+    out = tmp_path / "motions"
+    out.mkdir()
+    for name in ("sweeps.csv", "notes.txt"):
+        (out / name).write_text("old")
+    done = plan(small_file(tmp_path), out, "--no-sweeps", "--harmonics", 3, "--json")
+    assert done.status == 0, done.err
+    assert {path.name for path in out.iterdir()} == {
+        "excitation.csv",
+        "plan.json",
+        "plan.rrd",
+        "notes.txt",
+    }
+    document = json.loads(done.out)
+    assert document == json.loads((out / "plan.json").read_text(encoding="utf-8"))
+    assert "sweeps" not in document
+    assert "null" not in done.out
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_cannot_be_checked_is_said(tmp_path):
+    document = small_document(inertia_kg_m2=None)
+    path = tmp_path / "light.toml"
+    path.write_text(tomli_w.dumps(document))
+    done = plan(path, tmp_path / "out", "--no-sweeps", "--harmonics", 3)
+    assert done.status == 0, done.err
+    assert "warning: not checked: torques: the description of small states no inertias" in done.out
+    written = json.loads((tmp_path / "out" / "plan.json").read_text(encoding="utf-8"))
+    assert "states no inertias" in written["not_checked"][0]
+
+
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("options", "words"),
     [
-        ({"period_s": 4.0}, "4 s is too short; 10 to 30 s"),
-        ({"period_s": 60.0}, "60 s is too long"),
-        ({"harmonics": 2}, "2 harmonics"),
-        ({"seconds": -1.0}, "-1 s from"),
-        ({"seconds": float("nan")}, "nan s from"),
-        ({"starts": 0}, "from 0 starts"),
+        (("--duration", 3), "a motion of 3 s is too short"),
+        (("--duration", 60), "60 s is too long"),
+        (("--harmonics", 2), "2 harmonics"),
+        (("--friction", "coulomb,stiction"), "--friction names stiction"),
+        (("--payload", "2,0,0"), "--payload is '2,0,0'; kg,x,y,z is needed"),
+        (("--payload", "-2,0,0,0"), "a mass of 0 kg or more"),
+        (("--tool", "100,0"), "a length and a radius above zero"),
+        (("--speed-deg", -5), "--speed-deg"),
+        (("--speed", 2), "speed is 2.0; 0.01 to 1 is needed"),
+        (("--floor", 1900), "no posture was found from which its joints could sweep"),
+        (("--floor", 1900, "--no-sweeps"), "none of 2000 postures within the limits is clear"),
     ],
 )
-def test_wishes_that_make_no_sense_are_refused(wrong, words):
-    with pytest.raises(DataError, match=words):
-        ExcitationRequest(**wrong)
-    with pytest.raises(DataError, match=r"speed is 1\.5"):
-        MotionMargins(speed=1.5)
+def test_wrong_wishes_end_with_status_2_and_no_folder(options, words, tmp_path):
+    out = tmp_path / "out"
+    done = plan("ur5e", out, *options)
+    assert done.status == 2
+    assert words in " ".join(done.err.split())
+    assert not out.exists()
