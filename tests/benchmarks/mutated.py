@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from results import write_section
 from support.fuzz.mutants import LONGEST_S, MOST_BYTES, READINGS, Ended, walk
 from support.fuzz.mutators import KINDS
 
@@ -24,6 +25,7 @@ QUICK = 3
 # Reasons that are given less often than once in so many mutants share a row.
 RARE = 250
 _COLUMNS = (*KINDS, "file system")
+_COMMAND = "PYTHONPATH=tests python tests/benchmarks/mutated.py"
 
 
 def reason(message: str) -> str:
@@ -105,6 +107,8 @@ def main() -> None:
         ]
     )
     print(text)
+    if not asked.quick:
+        write_section("Broken inputs", _COMMAND, text)
     sys.exit(bool(wrong))
 
 

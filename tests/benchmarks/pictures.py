@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rerun.experimental import ViewerClient
+from results import QUICK
 from support.browser import CHROMIUM, Page, chromium
 from support.commands import visioncal
 from support.fuzz.broken_sessions import BROKEN, broken_session
@@ -25,7 +26,6 @@ from visioncal.present.recording import paths
 from visioncal.present.viewer.native import free_port, viewer_process
 from visioncal.simulation import CellOptions, simulate, write_session
 
-QUICK = "--quick" in sys.argv[1:]
 _FOLDER = Path(__file__).parents[2] / "recordings"
 # How long the viewer has for its drawing, without a graphics card [s].
 _PATIENCE_S = 60.0

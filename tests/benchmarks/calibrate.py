@@ -1,0 +1,194 @@
+"""Time of a whole calibration against detection alone with OpenCV, and of what surrounds it.
+
+Both sides work on the same 40 five-megapixel images with the same number of threads, one after the
+other in turns. The peer reads each file and calls OpenCV's ChArUco detector. visioncal is the
+command with report and recording, started anew; and its API without outputs in a warm process.
+Processor time counts all threads, and other programs on the machine move it less than wall time.
+
+    PYTHONPATH=tests python tests/benchmarks/calibrate.py [REPEATS] [--quick]
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from results import few, first, wished, write_section
+from support.cells import calibrated
+
+import visioncal
+from visioncal.calibration.pipeline.result import result_of, view_evidence
+from visioncal.calibration.run import Run
+from visioncal.interchange.outputs import write_outputs
+from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
+from visioncal.vision.boards.charuco import charuco_board
+
+VIEWS, MANY = few((40, 1000), (5, 10))
+# As many as are wished on the command line.
+REPEATS = wished(3)
+THREADS = [name for name in (1, 2, 4) if name <= (os.cpu_count() or 1)]
+COMMAND = [sys.executable, "-m", "visioncal"]
+# Installed packages have their byte code beside them.
+ENVIRONMENT = {
+    name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+}
+
+
+def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int) -> int:
+    """Detects in all files with OpenCV and nothing else; returns the number of corners."""
+
+    def corners(file: Path) -> int:
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        ids = cv2.aruco.CharucoDetector(board).detectBoard(image)[1]
+        return 0 if ids is None else len(ids)
+
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(threads) as pool:
+        return sum(pool.map(corners, files))
+
+
+def seconds(work: Callable[[], object]) -> np.ndarray:
+    """Wall and processor time of one call, (2,)."""
+    start = time.perf_counter(), time.process_time()
+    work()
+    return np.subtract((time.perf_counter(), time.process_time()), start)
+
+
+def of_program(command: list[str]) -> np.ndarray:
+    """Wall and processor time of a program, (2,)."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True, env=ENVIRONMENT)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return np.array([wall, used])
+
+
+def medians(*works: Callable[[], np.ndarray]) -> np.ndarray:
+    """The medians of each over interleaved repetitions, after one that is not counted, (n, 2)."""
+    warm = few(1, 0)
+    rounds = [[work() for work in works] for _ in range(REPEATS + warm)][warm:]
+    return np.median(rounds, axis=0)
+
+
+def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[list[str]]:
+    """The rows of one kind of session, by the number of threads."""
+    options = CellOptions(
+        views=VIEWS, camera=fine_camera(), jpeg_quality=quality, cut_views=0.0, seed=1
+    )
+    if level == "arm":
+        options = replace(options, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)
+    session = write_session(simulate(options), folder / f"{ending}_{level}")
+    files, board = sorted((session / "images").iterdir()), charuco_board(options.target)
+    asked = "hand-eye" if level == "hand-eye" else "auto"
+    rows = []
+    for threads in first(THREADS):
+        command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
+        command += ["--threads", str(threads), "--level", asked]
+        times = medians(
+            lambda command=command: of_program(command),
+            lambda threads=threads: seconds(
+                lambda: visioncal.calibrate(session, level=asked, threads=threads)
+            ),
+            lambda threads=threads: seconds(lambda: opencv_alone(files, board, threads)),
+        )
+        ratios = times[:2] / times[2]
+        rows.append([ending, level, str(threads), *(f"{number:.2f}" for number in times[:, 1]),
+                     *(f"{ratio:.2f}" for ratio in ratios[:, 1]),
+                     *(f"{ratio:.2f}" for ratio in ratios[:, 0])])  # fmt: skip
+    return rows
+
+
+def started() -> list[list[str]]:
+    """Processor time of what is typed first, over that of importing typer."""
+    python = [sys.executable, "-c"]
+    commands = {
+        "--version": [*COMMAND, "--version"],
+        "--help": [*COMMAND, "--help"],
+        "calibrate --help": [*COMMAND, "calibrate", "--help"],
+        "import typer": [*python, "import typer"],
+        "nothing": [*python, "pass"],
+    }
+    found = medians(*(lambda number=command: of_program(number) for command in commands.values()))[
+        :, 1
+    ]
+    *_, typer, _ = found
+    return [[name, f"{number:.2f}", f"{number / typer:.1f}"]
+            for name, number in zip(commands, found, strict=True)]  # fmt: skip
+
+
+def small(folder: Path) -> list[list[str]]:
+    """Processor time of a small session, by what is drawn."""
+    session = write_session(simulate(CellOptions(seed=1, views=few(20, 6))), folder / "small")
+    command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "small_out")]
+    kinds = {
+        "all": [],
+        "--no-recording": ["--no-recording"],
+        "--no-report --no-recording": ["--no-report", "--no-recording"],
+    }
+    kinds = dict(first(list(kinds.items())))
+    found = medians(
+        *(lambda number=kind: of_program([*command, *number]) for kind in kinds.values())
+    )[:, 1]
+    return [[name, f"{number:.2f}"] for name, number in zip(kinds, found, strict=True)]
+
+
+def outputs(folder: Path) -> float:
+    """Processor time of report and recording of many views, a view [ms]."""
+    options = CellOptions(views=MANY, camera=fine_camera(), pixel_sigma_px=0.1)
+    known = calibrated(simulate(options))
+    done = Run(result_of(known), view_evidence(known))
+
+    def write() -> None:
+        # A result keeps its text once that is written.
+        fresh = replace(done, calibration=replace(done.calibration))
+        write_outputs(folder / "many", known.session, fresh)
+
+    return float(1e3 * medians(lambda: seconds(write))[0, 1] / MANY)
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(
+        "| " + " | ".join(group) + " |" for group in [head, ["---"] * len(head), *rows]
+    )
+
+
+def main() -> None:
+    """Prints the tables and keeps them."""
+    kinds = [
+        (*pair, level) for pair in (("png", None), ("jpg", 95)) for level in ("hand-eye", "arm")
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]
+        text = (
+            f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
+            "interleaved runs, processor time of all threads together. The command includes "
+            "process start, report and recording; the API is warm and writes nothing; "
+            "OpenCV only reads and detects. "
+            f"Load average meanwhile: {os.getloadavg()[2]:.0f} on {os.cpu_count()} cores."
+        )
+        head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
+                "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
+                "API / OpenCV, wall"]  # fmt: skip
+        text += f"\n\n{table(head, rows)}"
+        text += "\n\nProcessor time of the first commands:\n\n"
+        text += table(["", "s", "over import typer"], started())
+        text += "\n\nProcessor time of a small session, 20 views of 1280 x 800:\n\n"
+        text += table(["calibrate", "s"], small(folder))
+        text += f"\n\nReport and recording of {MANY} views: {outputs(folder):.1f} ms a view.\n"
+    print(text)
+    write_section(
+        "A whole calibration", "PYTHONPATH=tests python tests/benchmarks/calibrate.py", text
+    )
+
+
+if __name__ == "__main__":
+    main()
