@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from support.commands import visioncal
 from support.killed_calls import ALL, LESS, NAMES, expect_no_leftovers, visible, written
-from support.samples import made_up, with_frames
+from support.refusals import raised
+from support.samples import made_up
 
 from visioncal.calibration.run import Run
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically, write_generation
 from visioncal.interchange.outputs import write_outputs
-from visioncal.interchange.result_files import rewrite_result
 from visioncal.present import recording
 from visioncal.present.report import page
 from visioncal.results import Calibration
@@ -99,8 +99,7 @@ def test_an_error_within_the_switch_leaves_one_generation(tmp_path, monkeypatch,
 
     with monkeypatch.context() as broken:
         broken.setattr(Path, "replace", fails)
-        with pytest.raises(DataError, match="Input/output error"):
-            written(tmp_path, LESS)
+        raised(DataError, "Input/output error", written, tmp_path, LESS)
     assert visible(tmp_path) == (ALL if at == "before" else LESS)
     written(tmp_path, LESS)
     expect_no_leftovers(tmp_path, LESS)
@@ -124,10 +123,7 @@ def breaking(*_, **__):
 
 @pytest.mark.parametrize(
     ("module", "name", "file"),
-    [
-        (page, "write_report", "report.html"),
-        (recording, "write_recording", "recording.rrd"),
-    ],
+    [(page, "write_report", "report.html"), (recording, "write_recording", "recording.rrd")],
 )
 def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, name, file):
     sample = made_up()
@@ -145,29 +141,6 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
     assert missing.file == tmp_path / file
     assert "ValueError at test_generations.py" in missing.cause
     assert "18 mm of 25 mm" in missing.cause
-
-
-@pytest.mark.parametrize("file", ["report.html", "recording.rrd"])
-def test_what_is_not_wanted_does_not_stay_of_an_earlier_result(tmp_path, file):
-    sample = made_up()
-    before = write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
-    run = Run(sample.calibration, sample.evidence)
-    done = write_outputs(tmp_path, sample.session, run, without=(file,))
-    assert {path.name for path in before.files} - {path.name for path in tmp_path.iterdir()} == {
-        file
-    }
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        path.name for path in done.files
-    )
-
-
-def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch):
-    sample = made_up()
-    write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
-    monkeypatch.setattr(page, "write_report", breaking)
-    joined = with_frames(sample).calibration
-    assert len(rewrite_result(tmp_path, joined).failed_drawings) == 1
-    assert Calibration.load(tmp_path).frames.keys() == joined.frames.keys()
 
 
 @pytest.mark.parametrize("as_json", [False, True])

@@ -8,6 +8,7 @@ import pytest
 from support.commands import visioncal as run
 from support.marks import slow
 from support.moved_arms import changed, robot_with_bodies
+from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.dynamics.base import BaseModel
@@ -199,15 +200,11 @@ def without(*names):
     [
         (without("tau4_nm"), "lacks tau4_nm: the robot has 6 joints"),
         (without("q6_rad", "tau6_nm"), "lacks q6_rad, tau6_nm"),
-        (
-            lambda value: value.update(q7_rad=value["q1_rad"]),
-            "has q7_rad, but the robot has 6 joints",
-        ),
+        (lambda value: value.update(q7_rad=value["q1_rad"]), "has q7_rad, but the robot has 6"),
     ],
 )
 def test_missing_and_surplus_joints_are_named(moved, change, words):
-    with pytest.raises(DataError, match=words):
-        conditioned(changed(moved[1], change))
+    raised(DataError, words, conditioned, changed(moved[1], change))
 
 
 @pytest.mark.parametrize(
@@ -222,9 +219,7 @@ def test_stamps_of_another_unit_are_named(moved, per_s, words, step):
     def scale(columns):
         columns["stamp_s"] *= per_s
 
-    with pytest.raises(DataError, match=words) as told:
-        conditioned(changed(moved[1], scale))
-    assert told.value.next_step.endswith(step)
+    assert raised(DataError, words, conditioned, changed(moved[1], scale)).next_step.endswith(step)
 
 
 def test_short_recordings_are_refused(moved):
@@ -284,8 +279,7 @@ def stream():
     ],
 )
 def test_mistakes_are_named(stream, change, words):
-    with pytest.raises(DataError, match=words):
-        check(changed(stream, change))
+    raised(DataError, words, check, changed(stream, change))
 
 
 @pytest.mark.parametrize(
@@ -297,8 +291,7 @@ def test_mistakes_are_named(stream, change, words):
 )
 def test_mistakes_are_named_without_inertias(stream, change, words):
     """No inertias at all explain them: only a scale of all torques is open."""
-    with pytest.raises(DataError, match=words):
-        check(changed(stream, change), with_inertias=False)
+    raised(DataError, words, check, changed(stream, change), with_inertias=False)
 
 
 @pytest.mark.parametrize(
@@ -392,8 +385,7 @@ def test_late_torques_are_named_and_taken_earlier(tmp_path):
         }
         exercise_session("ur5e", streams).save(tmp_path / f"session {lag_s}")
         asked = ("--stream", "excite", "--validate-on", "fresh", "-o", tmp_path / str(lag_s))
-        done = run("dynamics", "identify", tmp_path / f"session {lag_s}", *asked)
-        assert done.status == 0, done.err
+        done = run("dynamics", "identify", tmp_path / f"session {lag_s}", *asked).good()
         results[lag_s] = Identified.load(tmp_path / str(lag_s)), done.out
     assert results[0.0][0].lag is None
     # Late by a little it is a note, by much a reason to look for the cause.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.kept import kept_session
 from support.moved_arms import recorded, robot_with_bodies, true_base
+from support.refusals import raised
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.dynamics import (
@@ -38,8 +39,6 @@ from visioncal.robot import (
     Robot,
     joint_torques,
     load_robot,
-    parameters_of,
-    pseudo_inertias,
     read_robot_document,
     robot_names,
     torque_regressor,
@@ -119,15 +118,6 @@ def test_encoders_may_be_eccentric():
     assert changed == pytest.approx(power, rel=1e-6)
 
 
-def test_a_pseudo_inertia_says_the_same():
-    values = load_robot("panda").inertias.values
-    assert parameters_of(pseudo_inertias(values)) == pytest.approx(values, abs=1e-12)
-    assert load_robot("panda").inertias.consistent
-    values = values.copy()
-    values[3, 4] *= 3.0
-    assert not Inertias(values).consistent
-
-
 @pytest.mark.parametrize(
     ("name", "inertial", "all_of_it"),
     [("ur5e", 36, 54), ("ur10e", 36, 54), ("panda", 43, 64), ("irb120", 36, 54)],
@@ -201,19 +191,6 @@ def urdf_of(robot):
     return {"schema": 1, "name": robot.name, "tip": robot.tip, "urdf": small_urdf(robot)}
 
 
-def test_drives_have_limits():
-    robot = load_robot("ur5e")
-    assert robot.torque_nm.tolist() == [150.0, 150.0, 150.0, 28.0, 28.0, 28.0]
-    assert np.rad2deg(robot.velocity_rad_s) == pytest.approx([180.0] * 6)
-    assert np.isinf(load_robot("irb120").torque_nm).all()
-    # A calibrated arm keeps them.
-    assert robot.corrected().rates.torque.tolist() == robot.rates.torque.tolist()
-    wrong = read_robot_document("ur5e")
-    wrong["joint"][1]["torque_nm"] = -150.0
-    with pytest.raises(DataError, match=r"joint shoulder_lift_joint: torque_nm is -150.0"):
-        Robot.from_document(wrong)
-
-
 def test_what_an_arm_weighs_is_no_fact_of_a_recording():
     """A session's digest stays what it was before its robot's table told inertias and drives."""
     told = read_robot_document("panda")
@@ -252,8 +229,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     )
     assert "<visual />" in written
     assert "<!-- identified - - yesterday -->" in written
-    with pytest.raises(DataError, match="a robot of a URDF is needed"):
-        urdf_with_inertias(load_robot("ur5e"), found)
+    raised(DataError, "a robot of a URDF is needed", urdf_with_inertias, load_robot("ur5e"), found)
 
 
 TRUE = np.array([2.0, -1.0, 0.5])

@@ -104,51 +104,6 @@ def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
     assert refused > 500
 
 
-def test_files_are_taken_by_text_and_a_folder_is_no_file(bench, tmp_path):
-    written = visioncal.convert(str(bench.folder), str(tmp_path / "copy"))
-    assert written.digest() == bench.session.digest()
-    with pytest.raises(DataError, match=r"Is a directory\. Name a file in it\."):
-        bench.calibration.save(str(tmp_path))
-
-
-def test_a_board_is_taken_by_its_name_and_from_its_file(bench, tmp_path):
-    target = visioncal.load_target(BOARD)
-    file = tmp_path / "board.toml"
-    file.write_text(
-        'kind = "charuco"\ncolumns = 9\nrows = 6\nsquare_m = 0.03\nmarker_m = 0.022\n'
-        'dictionary = "DICT_5X5_100"\nsquare_sigma_m = 3e-5\n'
-    )
-    seen = [
-        visioncal.locate_target(bench.calibration, bench.image, item, bench.pose.tolist()).p_base
-        for item in (target, BOARD, file, str(file))
-    ]
-    sights = [visioncal.Sight("1", bench.image, bench.pose)]
-    placed = [
-        visioncal.place_seen(bench.calibration, sights, item, "base").matrix[:3, 3]
-        for item in (target, BOARD, file)
-    ]
-    assert all(np.array_equal(array, seen[0]) for array in seen)
-    assert all(np.array_equal(array, placed[0]) for array in placed)
-
-
-def test_a_camera_is_taken_as_a_table_and_poses_as_a_list(bench):
-    camera = bench.session.camera
-    table = {
-        "resolution": camera.resolution,
-        "model": camera.model,
-        "matrix": camera.matrix,
-        "distortion": camera.distortion,
-    }
-    poses = [view.base_from_flange() for view in bench.session.views[:1]]
-    one, other = (
-        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera=value)
-        for value in (camera, table)
-    )
-    assert one.digest() == other.digest()
-    with pytest.raises(DataError, match="matrix"):
-        visioncal.Session.from_arrays([bench.image], poses, BOARD, camera={"matrix": [1, 2]})
-
-
 def test_pictures_of_16_bits_are_taken_where_they_are_stored(bench):
     deep = 257 * bench.image.astype(np.uint16)
     taken = visioncal.Session.from_arrays([deep], bench.pose[None], BOARD)

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.marks import slow
-from support.pairs import (
-    calibrated_cell,
-    halves,
-    with_moved_board,
-    with_moved_camera,
-)
+from support.pairs import calibrated_cell, halves, with_moved_board, with_moved_camera
 from support.samples import made_up
 
 from visioncal.core.transforms import exp, invert, log
@@ -81,16 +76,6 @@ def test_a_moved_board_is_no_moved_camera(mount):
     assert [edge.is_change for edge in comparison.edges] == [False, True]
     assert comparison.findings[0].startswith("The board was moved")
     assert "its calibration still holds" in comparison.findings[0]
-
-
-def test_a_turn_is_a_change_of_rotation():
-    first, second = pair("eye-in-hand", 1)
-    turned = calibrated_cell(with_moved_camera(cells("eye-in-hand", 1)[1], np.eye(6)[1] * 3e-3))
-    (edge, _) = compare(first, turned).edges
-    assert edge.rotation.is_change
-    assert edge.rotation.p_value < compare(first, second).edges[0].rotation.p_value
-    # 3 mrad, to within the noise of 0.6 mrad.
-    assert edge.moved_deg == pytest.approx(np.rad2deg(3e-3), abs=0.07)
 
 
 def test_a_change_of_the_lens_is_found():
@@ -179,15 +164,6 @@ def test_a_calibration_does_not_differ_from_itself():
     assert not compare(exact, rounded).is_change
 
 
-def test_different_mounts_have_nothing_in_common():
-    in_hand, to_hand = pair("eye-in-hand", 0)[0], pair("eye-to-hand", 0)[0]
-    comparison = compare(in_hand, to_hand)
-    assert comparison.edges == ()
-    assert comparison.only_in_a == ("flange_from_cam", "base_from_target")
-    assert comparison.only_in_b == ("base_from_cam", "flange_from_target")
-    assert "The mounts differ" in comparison.findings[0]
-
-
 def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path):
     first, second = pair("eye-in-hand", 0)
     first.save(tmp_path / "calibration.json")
@@ -195,8 +171,7 @@ def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path):
     moved.save(tmp_path / "moved.json")
     second.save(tmp_path / "same.json")
     for name, words in (("same", "No transform changed"), ("moved", "The camera moved")):
-        done = visioncal("diff", tmp_path, tmp_path / f"{name}.json")
-        assert done.status == 0, done.err
+        done = visioncal("diff", tmp_path, tmp_path / f"{name}.json").good()
         assert done.err == ""
         assert words in done.out
     printed = visioncal("diff", tmp_path, tmp_path / "moved.json", "--json").out
@@ -206,10 +181,3 @@ def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path):
     assert json.loads(printed)["transforms"]["flange_from_cam"]["translation"]["limit"] == (
         FALSE_ALARMS / 5
     )
-
-
-def test_command_names_what_is_no_calibration(tmp_path):
-    (tmp_path / "other.json").write_text("{}")
-    done = visioncal("diff", tmp_path / "other.json", tmp_path)
-    assert done.status == 2
-    assert "other.json" in done.err

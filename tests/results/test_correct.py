@@ -9,6 +9,7 @@ import pytest
 from support.cells import calibrated
 from support.commands import visioncal as run
 from support.commands import write_poses
+from support.refusals import raised
 from support.wrong_arms import WRONG_LINKS
 
 import visioncal
@@ -194,16 +195,13 @@ def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
     ],
 )
 def test_what_is_no_target_or_no_seed_is_refused(result, targets, seed, said):
-    with pytest.raises(DataError, match=said):
-        visioncal.correct(result, targets, seed)
+    raised(DataError, said, visioncal.correct, result, targets, seed)
 
 
 def test_without_a_calibrated_arm_there_is_nothing_to_correct(result, by_poses):
-    with pytest.raises(DataError, match="no joint angles"):
-        visioncal.correct(by_poses, np.eye(4))
+    raised(DataError, "no joint angles", visioncal.correct, by_poses, np.eye(4))
     nominal = ArmResult(level="nominal", levels=())
-    with pytest.raises(DataError, match="level nominal"):
-        visioncal.correct(replace(result, arm=nominal), np.eye(4))
+    raised(DataError, "level nominal", visioncal.correct, replace(result, arm=nominal), np.eye(4))
 
 
 def test_sigmas_come_from_the_map_or_else_from_the_median(result):
@@ -260,8 +258,9 @@ def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
     poses = targets_near(4, result)
     columns = {"view": range(7, 11), "note": ["", 'say "a, b"', "", "x"]}
     table = write_poses(stored / "t.csv", poses, columns)
-    done = run("correct", table, "--against", stored, "-o", stored / "o.csv", "--seed-joints", SEED)
-    assert done.status == 0, done.err
+    done = run(
+        "correct", table, "--against", stored, "-o", stored / "o.csv", "--seed-joints", SEED
+    ).good()
     assert "4 of 4 targets corrected" in done.out
     rows = rows_of((stored / "o.csv").read_text())
     assert [row["view"] for row in rows] == ["7", "8", "9", "10"]
@@ -275,9 +274,7 @@ def test_a_table_is_corrected_and_keeps_its_other_columns(stored, result):
         told = result.robot.base_from_flange(numbers(row, JOINTS)[None])[0, :3, 3]
         # Joints are written to 0.1 nrad, positions to 0.1 nm.
         assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(told, abs=2e-9)
-    again = run("correct", stored / "o.csv", "-c", stored)
-    assert again.status == 2
-    assert "would be so twice" in again.err
+    run("correct", stored / "o.csv", "-c", stored).refused("would be so twice")
 
 
 def test_seeds_in_the_rows_pick_the_branch(stored, result):
@@ -285,8 +282,7 @@ def test_seeds_in_the_rows_pick_the_branch(stored, result):
     poses = result.robot.base_from_flange(np.array([HOME, HOME, HOME]))
     seeds = np.array([flipped, HOME, flipped])
     columns = {name: [f"{seed:.6f}" for seed in seeds[:, at]] for at, name in enumerate(JOINTS)}
-    done = run("correct", write_poses(stored / "t.csv", poses, columns), "-c", stored)
-    assert done.status == 0, done.err
+    done = run("correct", write_poses(stored / "t.csv", poses, columns), "-c", stored).good()
     # The wrist turns its other side to the same pose.
     found = [float(row["q5_rad"]) for row in rows_of(done.out)]
     # What a correction of 2 mm turns is far less than what the other branch would.
@@ -310,50 +306,33 @@ def test_targets_of_a_tool_are_answered_for_the_tool(stored, result):
         q = numbers(row, JOINTS)[None]
         told = (result.robot.base_from_flange(q) @ flange_from_cam)[0, :3, 3]
         assert numbers(row, ("x_m", "y_m", "z_m")) == pytest.approx(told, abs=2e-9)
-    done = run("correct", table, "-c", stored, "--tool", "camm")
-    assert done.status == 2
-    assert "Did you mean cam?" in done.err
+    run("correct", table, "-c", stored, "--tool", "camm").refused("Did you mean cam?")
 
 
 def test_targets_out_of_reach_are_named_and_nothing_is_written(stored, result):
     poses = targets_near(3, result)
     poses[1, :3, 3] = [1.5, 0.0, 0.3]
     table, out = write_poses(stored / "t.csv", poses), stored / "o.csv"
-    done = run("correct", table, "-c", stored, "-o", out, "--seed-joints", SEED)
-    assert done.status == 2
-    assert "1 of 3 targets" in done.err
-    assert "t.csv, line 3: out of reach: the nearest posture leaves" in done.err
+    run("correct", table, "-c", stored, "-o", out, "--seed-joints", SEED).refused(
+        "1 of 3 targets", "t.csv, line 3: out of reach: the nearest posture leaves"
+    )
     assert not out.exists()
-    done = run("correct", table, "-c", stored, "-o", out, "--skip-unreachable")
-    assert done.status == 0, done.err
+    done = run("correct", table, "-c", stored, "-o", out, "--skip-unreachable").good()
     assert "left out: t.csv, line 3" in done.err
     assert len(rows_of(out.read_text())) == 2
-    done = run("correct", table, "-c", stored, "--json")
-    assert done.status == 2
+    done = run("correct", table, "-c", stored, "--json").refused()
     assert json.loads(done.out)["error"]["culprits"] == ["t.csv, line 3"]
     poses[:, :3, 3] = [1.5, 0.0, 0.3]
-    done = run("correct", write_poses(table, poses), "-c", stored, "--skip-unreachable")
-    assert done.status == 2
-    assert "3 of 3 targets" in done.err
-
-
-def test_json_has_the_same_numbers(stored, result):
-    table = write_poses(stored / "t.csv", targets_near(2, result), {"view": [3, 4]})
-    command = ("correct", table, "-c", stored, "--seed-joints", SEED)
-    document = json.loads(run(*command, "--json").out)
-    rows = rows_of(run(*command).out)
-    assert document["unreachable"] == document["warnings"] == []
-    for target, row in zip(document["targets"], rows, strict=True):
-        assert target["view"] == row["view"]
-        assert [target[joint] for joint in JOINTS] == pytest.approx(numbers(row, JOINTS), abs=1e-9)
+    run("correct", write_poses(table, poses), "-c", stored, "--skip-unreachable").refused(
+        "3 of 3 targets"
+    )
 
 
 def test_another_branch_is_told(stored, result):
     poses = result.robot.base_from_flange(np.array([HOME, [2.9, *HOME[1:]]]))
     table = write_poses(stored / "t.csv", poses)
     command = ("correct", table, "-c", stored, "--seed-joints", SEED)
-    done = run(*command)
-    assert done.status == 0
+    done = run(*command).good()
     assert "t.csv, line 3: " in done.err
     assert "no posture nearer was found" in done.err
     assert "warning" not in run(*command, "--widest-deg", 160).err
@@ -365,40 +344,14 @@ def test_singular_postures_are_told(stored, result):
     joints = np.tile([*HOME[:4], 0.0, 0.3], (41, 1))
     joints[:, 4] = np.linspace(-0.1, 0.1, 41)
     table = write_poses(stored / "t.csv", result.robot.base_from_flange(joints))
-    done = run("correct", table, "-c", stored, "--seed-joints", "0.4,-1.3,1.5,-1.75,-0.1,0.3")
-    assert done.status == 0, done.err
+    done = run(
+        "correct", table, "-c", stored, "--seed-joints", "0.4,-1.3,1.5,-1.75,-0.1,0.3"
+    ).good()
     assert "nearly singular; at t.csv, line 2" in done.err
     # Reached all the same, to the digits of the table.
     for row, pose in zip(rows_of(done.out), result.robot.base_from_flange(joints), strict=True):
         (there,) = result.base_from_flange(numbers(row, JOINTS)[None]).as_matrix()
         assert there == pytest.approx(pose, abs=1e-6)
-
-
-def test_what_is_no_table_of_targets_is_named(stored, result):
-    poses = targets_near(2, result)
-    table = stored / "t.csv"
-
-    def refused(text):
-        table.write_text(text)
-        done = run("correct", table, "-c", stored)
-        assert done.status == 2
-        assert done.out == ""
-        return done.err
-
-    good = write_poses(table, poses).read_text()
-    far = "x_m,y_m,z_m,qx,qy,qz,qw\n400,100,200,0,1,0,0\n"
-    assert "Positions are in metres" in refused(far)
-    assert "Write metres" in refused(good.replace("x_m,y_m,z_m", "x_mm,y_mm,z_mm"))
-    assert "qw are missing" in refused(good.replace(",qw", ",q4"))
-    assert "column z_m: it is empty" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,,0,0,0,1\n")
-    assert "norm is 1.41" in refused("x_m,y_m,z_m,qx,qy,qz,qw\n0.4,0.1,0.2,0,0,1,1\n")
-    joints = ",".join(JOINTS)
-    header = f"x_m,y_m,z_m,qx,qy,qz,qw,{joints}"
-    pose = "0.4,0.1,0.2,0,1,0,0"
-    assert "look like degrees" in refused(f"{header}\n{pose},10,-80,90,-100,-90,0\n")
-    assert "column q2_rad: it is empty" in refused(f"{header}\n{pose},0.1,,1,1,1,0\n")
-    assert "its joints are q1_rad" in refused(f"x_m,y_m,z_m,qx,qy,qz,qw,q1_rad\n{pose},0.1\n")
-    assert "does not exist" in run("correct", stored / "none.csv", "-c", stored).err
 
 
 def test_a_payload_is_counted_where_joints_bend(stored, result):
@@ -412,8 +365,7 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
     poses = targets_near(2, result)
     table = write_poses(stored / "t.csv", poses)
     load = ("--payload-kg", "3", "--payload-m", "0,0,0.1", "--seed-joints", SEED)
-    done = run("correct", table, "-c", stored, *load)
-    assert done.status == 0, done.err
+    done = run("correct", table, "-c", stored, *load).good()
     assert "--payload-kg 3 changes nothing" in " ".join(done.err.split())
     bending.save(stored / "calibration.json")
     done = run("correct", table, "-c", stored, *load)
@@ -422,14 +374,6 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
     stands = bending.base_from_flange(q, payload_kg=3.0, payload_m=(0.0, 0.0, 0.1)).as_matrix()
     # The table's digits, and what three looks at a bent arm leave.
     assert stands == pytest.approx(poses, abs=1e-5)
-    refused = run("correct", table, "-c", stored, "--payload-kg", "-1", "--seed-joints", SEED)
-    assert refused.status == 2
-    assert "payload of -1 kg" in refused.err
-
-
-def test_a_calibration_without_an_arm_says_what_to_do(stored, result, by_poses):
-    by_poses.save(stored / "calibration.json")
-    table = write_poses(stored / "t.csv", targets_near(1, result))
-    done = run("correct", table, "-c", stored)
-    assert done.status == 2
-    assert "--level auto or kinematics" in done.err
+    run("correct", table, "-c", stored, "--payload-kg", "-1", "--seed-joints", SEED).refused(
+        "payload of -1 kg"
+    )

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.present.report.fleet import fleet_page
 from visioncal.results.fleet import FleetRow, with_outliers
 
 
@@ -70,14 +69,3 @@ def test_the_odd_robot_comes_first(changes, words):
     wide = {"camera": "640 x 480", "focal_px": 457.0}
     other = [replace(item, **wide) if item.group == "robot_7" else item for item in fleet(1)]
     assert not any("focal" in outlier.stands_out for outlier in with_outliers(other))
-
-
-def test_robots_are_compared_with_their_own_model():
-    other = {"robot": "ur5e", "noise_mm": 0.3}
-    rows = [replace(item, **other) if item.group == "robot_2" else item for item in fleet(3)]
-    failed = FleetRow(name="robot_4/week_99", session="", state="failed", words="<no> table")
-    found = with_outliers([*rows, failed])
-    assert not any(item.stands_out for item in found if item.group == "robot_2")
-    page = fleet_page(found)
-    assert "&lt;no&gt; table" in page
-    assert 'href="robot_2/week_00/calibration.json"' in page

@@ -7,31 +7,19 @@ import numpy as np
 import pytest
 from support.arm_documents import arm_of
 from support.commands import visioncal
-from support.whole_cells import (
-    FLOOR,
-    LATER,
-    OPTIONS,
-    misfit,
-    part,
-    recorded,
-    saved,
-    simulated,
-    truth,
-)
+from support.refusals import raised
+from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
 import visioncal as package
 from visioncal.calibration.verification import verify
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import invert, log
-from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, RobotResult, to_document
 from visioncal.results.views import left_out_rms
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.simulation import BoardAt, NetworkOptions, RobotAt, cell_session, simulate
-from visioncal.vision.camera import project
-from visioncal.vision.targets import corner_positions
+from visioncal.simulation import cell_session, simulate
 
 # Chi-square of twelve, and of six, exceed these in one case of a thousand.
 MOST_OF_TWELVE, MOST_OF_SIX = 32.9, 22.5
@@ -47,8 +35,7 @@ def cell():
 def folder(cell, tmp_path_factory):
     place = tmp_path_factory.mktemp("whole")
     session, _ = saved(place, cell)
-    done = visioncal("calibrate", session, "-o", place / "out", "--json")
-    assert done.status == 0, done.err
+    done = visioncal("calibrate", session, "-o", place / "out", "--json").good()
     written = json.loads((place / "out" / "calibration.json").read_text())
     assert json.loads(done.out) == written
     return place
@@ -109,30 +96,6 @@ def test_the_file_says_how_well_the_noise_of_each_robot_is_known(folder, found):
     assert f"95 %: {significant(low)} to" in (folder / "out" / "report.html").read_text()
 
 
-@pytest.mark.slow
-def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, folder):
-    session = Session.load(folder / "session")
-    stop = 7
-    rest = replace(session, views=tuple(view for view in session.views if view.stop != stop))
-    corners = session.corner_table.of_views([view.number for view in rest.views])
-    again = package.calibrate(replace(rest, corner_table=corners))
-    mine = [view for view in found.views if view.stop == stop and view.left_out_px is not None]
-    away = []
-    for value in mine:
-        robots = {name: cell.robots[name].base_from_flange[stop] for name in ("a", "b")}
-        pose = again.between(value.seer, value.seen, robots).matrix
-        seen = session.corners[value.view]
-        positions = corner_positions(session.plates[value.seen.removeprefix("target_")])
-        camera = again.cell.lenses[value.seer].camera
-        off = project(camera, positions[seen.ids] @ pose[:3, :3].T + pose[:3, 3]) - seen.px
-        rms = np.sqrt(np.mean(np.sum(off**2, axis=1)))
-        away.append((value.left_out_px - rms, value.rms_px - rms))
-    # That fit has levels of noise of its own, and its lenses fields of their own: both differ by a
-    # stop's share of what they rest on.
-    left_out, fitted = np.sum(np.abs(away), axis=0)
-    assert left_out < 0.8 * fitted
-
-
 def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
     written = json.loads((folder / "out" / "calibration.json").read_text())["validation"]
     assert written["method"] == "leave-one-out over stops"
@@ -141,13 +104,6 @@ def test_what_was_left_out_is_told_by_camera_and_target(folder, found):
     one = found.of("hand", target="floor").validation
     seen = [view for view in found.views if (view.seer, view.seen) == ("cam_hand", "target_floor")]
     assert (one.method, one.held_out) == (written["method"], left_out_rms(seen))
-
-
-def test_it_reads_back_as_it_was_written(found, folder, tmp_path):
-    found.save(tmp_path / "again.json")
-    one = (folder / "out" / "calibration.json").read_text()
-    assert (tmp_path / "again.json").read_text() == one
-    assert to_document(load_result(folder / "out" / "recording.rrd")) == json.loads(one)
 
 
 @pytest.mark.parametrize(("camera", "robot", "target"), PAIRS)
@@ -173,27 +129,6 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
     assert [view.view for view in one.views] == mine
 
 
-def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_path):
-    options = NetworkOptions(
-        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=12
-    )
-    several = recorded(simulate(options))
-    plain = {name: several.document[name] for name in ("schema", "name", "cameras")}
-    columns = [column for column in several.columns if column not in ("robot", "target")]
-    session = Session.assemble(
-        {**plain, "mount": "eye-to-hand", "robot": {"model": "ur5e"}, "target": FLOOR.name},
-        columns,
-        [[view.cell(column) for column in columns] for view in several.views],
-        several.images,
-        corners=several.corner_table,
-    )
-    package.calibrate(session).save(tmp_path / "calibration.json")
-    found = Calibration.load(tmp_path)
-    assert set(to_document(found)["robots"]) == {"robot"}
-    assert found.of("left", "robot", "target").joint_covariance.shape == (12, 12)
-    assert len(found.of("right").views) == len(session.of("right").views)
-
-
 @pytest.mark.slow
 def test_a_stated_camera_of_measured_poses_is_kept(cell):
     whole = package.calibrate(cell_session(cell, "poses", seen="poses"), need_mm=0.1)
@@ -217,8 +152,7 @@ def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):
     assert to_document(again) == to_document(one)
     assert again.cell is None
     assert again.of() is again
-    with pytest.raises(DataError, match="which have no names"):
-        again.of(camera="hand")
+    raised(DataError, "which have no names", again.of, camera="hand")
 
 
 @pytest.mark.parametrize("of", [Calibration, Session])
@@ -231,19 +165,13 @@ def test_what_is_taken_out_can_be_kept_by_itself(found, tmp_path):
         ({"robot": "c"}, "no robot 'c': its robots are a, b", ""),
         ({"camera": "left", "target": "floor"}, "no robot moves them before each other", "carries"),
         ({"camera": "hand", "target": "plate_b"}, "robots a and b part them", "one robot"),
-        (
-            {"camera": "left", "robot": "a", "target": "plate_b"},
-            "robot b parts them, and robot a does not",
-            "--robot b",
-        ),
+        ({"camera": "left", "robot": "a", "target": "plate_b"}, "robot b parts them", "--robot b"),
         ({"camera": "hand", "robot": "b"}, "robot b has no part in what it sees", "another robot"),
     ],
 )
 def test_what_cannot_be_meant_is_said_with_the_names(found, folder, of, names, words, step):
     whole = found if of is Calibration else Session.load(folder / "session")
-    with pytest.raises(DataError, match=words) as caught:
-        whole.of(**names)
-    assert step in caught.value.next_step
+    assert step in raised(DataError, words, whole.of, **names).next_step
 
 
 def test_a_session_of_one_pair_has_its_rows_with_the_poses_of_their_stops(cell, folder):
@@ -289,17 +217,6 @@ def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
     np.testing.assert_allclose(
         one.robot.base_from_flange(q), Robot.from_document(arm.model.document).base_from_flange(q)
     )
-
-
-def test_the_result_of_one_pair_replaces_that_of_the_cell(folder, tmp_path):
-    Session.load(folder / "session").of("left", "b").save(tmp_path / "one")
-    assert visioncal("calibrate", tmp_path / "one", "-o", tmp_path).status == 0
-    assert Calibration.load(tmp_path).cell is None
-
-
-def test_what_a_whole_cell_does_not_have_is_refused(cell):
-    with pytest.raises(DataError, match="solver park cannot be asked"):
-        package.calibrate(part(recorded(cell), 0, LATER), solver="park")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.apart import UR5E_PAIRS, clearances, corners
+from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
@@ -98,29 +99,10 @@ def test_what_is_guessed_is_kept_farther_away_but_from_the_arm_that_carries_it()
     assert needed[frozenset({"plug", "link shoulder_lift_joint"})] == CLEARANCE
 
 
-@pytest.mark.parametrize("name", ["panda", "irb120", "generic-6r-1800", "ur3e", "ur10e"])
-def test_other_arms_have_free_postures_and_blocked_ones(name):
-    robot = load_robot(name)
-    cell = Collisions(robot, arm_bodies(robot), CLEARANCE, 0.0)
-    rng = np.random.default_rng(0)
-    q = rng.uniform(robot.lower_rad, robot.upper_rad, (300, robot.joint_count))
-    # Most of an arm's joints can stand anywhere; thick links would leave next to nothing.
-    assert 0.2 < (cell.first_contact(q) < 0).mean() < 0.99
-
-
-def test_bodies_stay_with_a_corrected_arm():
-    robot = load_robot("ur5e")
-    moved = robot.corrected(np.full((7, 6), 1e-3))
-    for was, now in zip(arm_bodies(robot), arm_bodies(moved), strict=True):
-        assert was.size_m[0] == now.size_m[0]
-        assert abs(was.size_m[1] - now.size_m[1]) < 0.01
-
-
 def test_a_body_in_millimetres_is_refused():
     document = read_robot_document("ur5e")
     document["joint"][1]["body_radius_m"] = 60.0
-    with pytest.raises(DataError, match=r"body_radius_m = 60\.0"):
-        arm_bodies(Robot.from_document(document))
+    raised(DataError, r"body_radius_m = 60\.0", arm_bodies, Robot.from_document(document))
 
 
 URDF = """<robot name="r"><link name="base"><collision><origin xyz="0 0 0.05"/>

@@ -1,4 +1,4 @@
-"""Inverse kinematics: poses are reached, near to the seed and within the limits."""
+"""Inverse kinematics: poses are reached, near to the seed, within the limits, many at a time."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from visioncal.robot import Robot, load_robot, robot_names
 from visioncal.robot.chain import chain_document
-from visioncal.robot.inverse import Inverse
+from visioncal.robot.inverse import Inverse, chain_frames
 
 # A wrist bent and an elbow bent: far from every singular posture of a UR.
 HOME = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
@@ -75,17 +75,6 @@ def test_whole_turns_keep_to_the_seed():
     assert robot.base_from_flange(joints[None])[0] == pytest.approx(pose, abs=1e-9)
 
 
-def test_beyond_the_last_turn_it_goes_back_by_a_whole_one():
-    robot = load_robot("ur5e")
-    seed = np.array([*HOME[:5], 6.27])
-    past = np.array([*HOME[:5], 6.32])
-    (pose,) = robot.base_from_flange(past[None])
-    found, joints = reached(robot, pose, seed, widest_rad=1.0)
-    assert found.reached
-    # The same posture but for the turn: its other branches turn five joints.
-    assert joints == pytest.approx(past - [0, 0, 0, 0, 0, 2 * np.pi], abs=1e-8)
-
-
 def test_a_limit_in_the_way_is_named():
     free = load_robot("irb120")
     q = np.array([0.2, 0.4, 0.3, 0.5, 0.9, 0.1])
@@ -147,3 +136,43 @@ def test_five_axes_reach_the_position_and_nearly_the_rotation():
     assert 1e-5 < found.off_rad < 1e-2
     pose[:3, :3] = pose[:3, :3] @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     assert not reached(real, pose, q)[0].reached
+
+
+ARMS = [name for name in robot_names() if load_robot(name).joint_count >= 6]
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_frames_are_those_of_pinocchio(name):
+    robot = load_robot(name)
+    positions = Inverse(robot).starts(4, np.random.default_rng(1))
+    frames = chain_frames(robot.chain, positions)
+    # Some hundred roundings of lengths about 1.
+    for found, q in zip(frames, robot.chain.encoded(positions), strict=True):
+        np.testing.assert_allclose(found, robot.link_frames(q), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_random_starts_lead_to_poses_in_reach_by_all_branches(name):
+    robot, rng = load_robot(name), np.random.default_rng(2)
+    inverse = Inverse(robot)
+    q = robot.chain.encoded(inverse.starts(100, rng))
+    poses = np.repeat(robot.base_from_flange(q), 4, axis=0)
+    positions, reached = inverse.from_starts(poses, inverse.starts(400, rng))
+    # What fails ends at a limit, or near a singular posture. The search for stops tries three times
+    # as many views as it still needs: a quarter that succeeds takes it a second round.
+    assert reached.mean() > 0.25
+    there = robot.base_from_flange(robot.chain.encoded(positions[reached]))
+    # A nanometre and a nanoradian, as promised.
+    np.testing.assert_allclose(there, poses[reached], atol=1e-9)
+    bounds = robot.chain.effective(np.array([robot.lower_rad, robot.upper_rad]))
+    assert np.all((positions[reached] >= bounds[0]) & (positions[reached] <= bounds[1]))
+    # Four starts of one pose end on several branches of most.
+    ends = [
+        found[mask]
+        for found, mask in zip(positions.reshape(100, 4, -1), reached.reshape(100, 4), strict=True)
+    ]
+    apart = [np.ptp(np.sin(end), axis=0).max() > 0.1 for end in ends if len(end) > 1]
+    assert np.mean(apart) > 0.5
+    farther = poses.copy()
+    farther[:, :3, 3] *= 10.0 / np.linalg.norm(farther[:, :3, 3], axis=1, keepdims=True)
+    assert not inverse.from_starts(farther, inverse.starts(400, rng))[1].any()

@@ -1,15 +1,22 @@
-"""Robots: forward kinematics against plain matrices, and descriptions that stand alone."""
+"""Robots: kinematics against plain matrices, derivatives, corrections, and their files."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from support.refusals import raised
+from support.urdf_arm import of_urdf, some_changes, some_joints
 
+from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
-from visioncal.core.files import parse_toml
+from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import Robot, load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot.writing import (
+    corrected_urdf,
+    small_urdf,
+    unexportable_functions,
+    ur_kinematics_yaml,
+)
 
 # Joint, then tool, with a branch (camera) and a wheel that are not between base and tip.
 URDF = """<?xml version="1.0"?>
@@ -132,65 +139,36 @@ def test_a_urdf_is_read_up_to_the_tip(tmp_path):
     np.testing.assert_allclose(robot.base_from_flange(q), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("tip", [None, "upper"])
-def test_a_description_stands_alone(tmp_path, tip):
-    (tmp_path / "arm.urdf").write_text(URDF)
-    for name in ("arm.urdf", "ur3e"):
-        robot = load_robot(name, None if name == "ur3e" else tip, tmp_path)
-        again = Robot.from_document(json.loads(json.dumps(robot.document)))
-        file_name, content = robot_file(robot.document)
-        (tmp_path / file_name).write_text(content)
-        from_file = load_robot(file_name, robot.tip, tmp_path)
-        q = np.full((1, robot.joint_count), 0.3)
-        for copy in (again, from_file):
-            assert (copy.tip, copy.joint_names) == (robot.tip, robot.joint_names)
-            assert np.array_equal(copy.base_from_flange(q), robot.base_from_flange(q))
-
-
 def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     with pytest.raises(DataError, match=r"no frame 'tool'; its frames are .*tool0") as caught:
         load_robot("arm.urdf", "tool", tmp_path)
     assert "Did you mean tool0" in caught.value.next_step
     (tmp_path / "bare.urdf").write_text(URDF.replace("tool0", "gripper"))
-    with pytest.raises(DataError, match="no tip is named; its frames are"):
-        load_robot("bare.urdf", None, tmp_path)
+    raised(DataError, "no tip is named; its frames are", load_robot, "bare.urdf", None, tmp_path)
 
 
 def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     (tmp_path / "a.urdf").write_text("<robot name='x'><link name=")
-    with pytest.raises(DataError, match="is no XML"):
-        load_robot("a.urdf", "x", tmp_path)
+    raised(DataError, "is no XML", load_robot, "a.urdf", "x", tmp_path)
     (tmp_path / "a.urdf").write_text("<robot/>")
-    with pytest.raises(DataError, match="cannot be parsed"):
-        load_robot("a.urdf", "x", tmp_path)
+    raised(DataError, "cannot be parsed", load_robot, "a.urdf", "x", tmp_path)
     capfd.readouterr()  # the parser speaks on its own
     # One that Pinocchio's reader takes, and no other.
     (tmp_path / "bold.urdf").write_text(URDF.replace("<link name=", "<link note='<i>' name=", 1))
-    with pytest.raises(DataError, match="is no XML: not well-formed"):
-        load_robot("bold.urdf", "tool0", tmp_path)
+    raised(DataError, "is no XML: not well-formed", load_robot, "bold.urdf", "tool0", tmp_path)
     (tmp_path / "long.urdf").write_text(f"<robot name='x'>{'<joint/>' * 2001}</robot>")
-    with pytest.raises(DataError, match="has 2001 joints; up to 2000"):
-        load_robot("long.urdf", "x", tmp_path)
+    raised(DataError, "has 2001 joints; up to 2000", load_robot, "long.urdf", "x", tmp_path)
     (tmp_path / "b.urdf").write_bytes(b" " * 10_000_001)
-    with pytest.raises(DataError, match="has more than 10 MB"):
-        read_robot_document("b.urdf", folder=tmp_path)
+    raised(DataError, "has more than 10 MB", read_robot_document, "b.urdf", folder=tmp_path)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"schema": 2}, "schema is 2"),
-        (
-            {"convention": "craig"},
-            'convention is \'craig\'; "standard" or "modified" or "hayati" is needed',
-        ),
-        ({"joint": []}, r"one \[\[joint\]\] table for each joint"),
         ({"joint": [{"a_m": 0.0, "d_m": 0.1}]}, "joint joint_1: alpha_rad is missing"),
-        (
-            {"joint": [{"name": "j", "a_m": 0, "d_m": 0, "alpha_rad": 0}] * 2},
-            "a name of its own for each joint",
-        ),
+        ({"joint": [{"name": "j", "a_m": 0, "d_m": 0, "alpha_rad": 0}] * 2}, "a name of its own"),
         (
             {"joint": [{"a_m": 0, "d_m": 0, "alpha_rad": 0, "lower_deg": 9, "upper_deg": 3}]},
             r"lower_deg is 9\.0; less than upper_deg = 3\.0",
@@ -198,32 +176,187 @@ def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     ],
 )
 def test_a_wrong_table_is_refused_by_field(change, words):
-    with pytest.raises(DataError, match=words):
-        Robot.from_document(read_robot_document("ur5") | change)
+    raised(DataError, words, Robot.from_document, read_robot_document("ur5") | change)
 
 
-def test_an_unknown_robot_lists_the_names():
-    with pytest.raises(DataError, match=r"no robot named 'ur5f'\. Did you mean .*ur5") as caught:
-        load_robot("ur5f")
-    assert "The names are generic-6r-1800, irb120, panda" in caught.value.next_step
+def robots():
+    return [*(load_robot(name) for name in robot_names()), of_urdf()]
 
 
-@pytest.mark.parametrize("shape", [(6,), (3, 7), (1, 2, 6)])
-def test_joint_angles_of_another_shape_are_refused(shape):
-    with pytest.raises(DataError, match="robot ur5 has 6 joints"):
-        load_robot("ur5").base_from_flange(np.zeros(shape))
+def other(robot):
+    return robot.corrected(*some_changes(robot))
 
 
-def test_shipped_tables_cite_their_source():
-    for name in robot_names():
-        assert read_robot_document(name)["source"]
-        assert parse_toml(robot_file(read_robot_document(name))[1], name)
+def slope(poses, size):
+    """Central differences (m, 6, size) of poses(step), a function of (size,) changes."""
+    step, columns = 1e-5, []
+    middle = invert(poses(np.zeros(size)))
+    for at in range(size):
+        change = np.zeros(size)
+        change[at] = step
+        columns.append((log(middle @ poses(change)) - log(middle @ poses(-change))) / (2 * step))
+    return np.stack(columns, axis=-1)
 
 
-def test_descriptions_are_read_without_pinocchio():
-    code = (
-        "import sys; sys.modules['pinocchio'] = None\n"
-        "from visioncal.robot import read_robot_document as read; print(read('ur5')['name'])"
+@pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
+def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
+    q, count = some_joints(robot), robot.joint_count
+    turning = np.where(robot.chain.prismatic[:, None], [1, 1, 0, 0], 1).ravel()
+
+    def placed(change):
+        return robot.corrected(placements=change.reshape(-1, 6)).base_from_flange(q)
+
+    def functioning(change):
+        changes = (turning * change).reshape(-1, 4)
+        return robot.corrected(functions=changes).base_from_flange(q)
+
+    # The third order of a step of 1e-5, and rounding of 1e-16 over it: 1e-10 for metres.
+    tolerance = {"rtol": 0, "atol": 1e-9}
+    joints = slope(lambda change: robot.base_from_flange(q + change), count)
+    np.testing.assert_allclose(robot.joint_jacobian(q), joints, **tolerance)
+    links = slope(placed, 6 * (count + 1))
+    np.testing.assert_allclose(robot.placement_jacobian(q), links, **tolerance)
+    functions = slope(functioning, 4 * count)
+    np.testing.assert_allclose(robot.function_jacobian(q), functions, **tolerance)
+
+
+def test_corrections_are_what_they_say():
+    robot = load_robot("ur10e")
+    placements, functions = some_changes(robot)
+    corrected = robot.corrected(placements, functions)
+    expected = robot.chain.placements @ exp(placements)
+    assert np.array_equal(corrected.chain.placements, expected)
+    q = some_joints(robot)
+    offset, ratio, sine, cosine = functions.T
+    at = robot.corrected(placements).base_from_flange(
+        q + offset + ratio * q + sine * np.sin(q) + cosine * np.cos(q)
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "ur5"
+    # The same angles, added in another order.
+    np.testing.assert_allclose(corrected.base_from_flange(q), at, atol=1e-14)
+    once_more = corrected.corrected(functions=-functions)
+    np.testing.assert_allclose(
+        once_more.base_from_flange(q), robot.corrected(placements).base_from_flange(q), atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("robot", [load_robot("panda"), of_urdf()], ids=["panda", "urdf"])
+def test_a_corrected_robot_stands_alone(robot, tmp_path):
+    corrected = other(robot)
+    again = Robot.from_document(json.loads(json.dumps(corrected.document)))
+    name, content = robot_file(corrected.document)
+    (tmp_path / name).write_text(content)
+    q = some_joints(robot)
+    for copy in (again, load_robot(name, folder=tmp_path)):
+        assert (copy.name, copy.tip, copy.joint_names) == (robot.name, robot.tip, robot.joint_names)
+        assert np.array_equal(copy.base_from_flange(q), corrected.base_from_flange(q))
+        assert np.array_equal(copy.lower_rad, robot.lower_rad)
+        assert np.array_equal(copy.upper_rad, robot.upper_rad)
+
+
+def test_what_a_urdf_cannot_hold_is_said():
+    robot = of_urdf()
+    corrected = other(robot)
+    assert [name.partition(":")[0] for name in unexportable_functions(corrected)] == list(
+        robot.joint_names
+    )
+    assert unexportable_functions(robot) == ()
+    for text in (corrected_urdf(robot, corrected), small_urdf(corrected)):
+        assert "Not in this file" in text
+        assert "turn: ratio " in text
+        Robot.from_document({"schema": 1, "name": "x", "tip": "flange", "urdf": text})
+    raised(DataError, "a robot of a URDF", corrected_urdf, load_robot("ur5"), load_robot("ur5"))
+
+
+# What ur_description's config/ur5e/default_kinematics.yaml holds, pi / 2 in full.
+UR5E_KINEMATICS = {
+    "shoulder": (0, 0, 0.1625, 0, 0, 0),
+    "upper_arm": (0, 0, 0, np.pi / 2, 0, 0),
+    "forearm": (-0.425, 0, 0, 0, 0, 0),
+    "wrist_1": (-0.3922, 0, 0.1333, 0, 0, 0),
+    "wrist_2": (0, -0.0997, 0, np.pi / 2, 0, 0),
+    "wrist_3": (0, 0.0996, 0, -np.pi / 2, 0, 0),
+}
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["base", "base_link"])
+def test_the_kinematics_of_urs_driver_are_those_of_its_description(tmp_path, turned):
+    robot = load_robot("ur5e")
+    if turned:
+        half = '<joint name="h" type="fixed"><parent link="base_link"/><child link="base"/>'
+        half += '<origin xyz="0 0 0" rpy="0 0 3.141592653589793"/></joint><link name="base_link"/>'
+        urdf = small_urdf(robot).replace("</robot>", half + "</robot>")
+        robot = Robot.from_document({"schema": 1, "name": "ur", "tip": "tool0", "urdf": urdf})
+    path = tmp_path / "kinematics.yaml"
+    path.write_text(ur_kinematics_yaml(robot, calibration_hash="calib_12788084448423163542"))
+    content = read_yaml(path)["kinematics"]
+    assert content.pop("hash") == "calib_12788084448423163542"
+    for link, numbers in UR5E_KINEMATICS.items():
+        found = [content[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")]
+        np.testing.assert_allclose(found, numbers, atol=1e-12)  # rounding of half turns
+
+
+def test_abbs_arm_is_the_one_of_its_published_urdf():
+    # ros-industrial/abb, irb120_3_58_macro.xacro: origins and axes of the joints, then tool0.
+    origins = [(0, 0, 0), (0, 0, 0.29), (0, 0, 0.27), (0, 0, 0.07), (0.302, 0, 0), (0.072, 0, 0)]
+    axes = np.eye(3)[[2, 1, 1, 0, 1, 0]]
+    robot = load_robot("irb120")
+    q = some_joints(robot)
+    for angles, pose in zip(q, robot.base_from_flange(q), strict=True):
+        chain = np.eye(4)
+        for origin, axis, angle in zip(origins, axes, angles, strict=True):
+            chain = (
+                chain
+                @ exp(np.array([0, 0, 0, *origin]))
+                @ exp(np.array([*(angle * axis), 0, 0, 0]))
+            )
+        chain = chain @ exp(np.array([0, np.pi / 2, 0, 0, 0, 0]))
+        np.testing.assert_allclose(pose, chain, atol=1e-14)
+
+
+def some_harmonics(robot, orders=5):
+    rng = np.random.default_rng(2)
+    return 1e-3 * rng.standard_normal((robot.joint_count, orders, 2))
+
+
+@pytest.fixture
+def wavy():
+    robot = load_robot("ur5e")
+    return robot.corrected(*some_changes(robot), some_harmonics(robot))
+
+
+def test_they_turn_each_joint_as_they_say():
+    robot = load_robot("ur5e")
+    q, harmonics = some_joints(robot), some_harmonics(robot)
+    turned = q.copy()
+    for at in range(5):
+        sine, cosine = harmonics[:, at].T
+        turned += sine * np.sin((at + 2) * q) + cosine * np.cos((at + 2) * q)
+    found = robot.corrected(harmonics=harmonics).base_from_flange(q)
+    np.testing.assert_allclose(found, robot.base_from_flange(turned), atol=1e-14)
+
+
+def test_their_jacobian_is_that_of_the_forward_kinematics(wavy):
+    q, step = some_joints(wavy), 1e-5
+    middle = invert(wavy.base_from_flange(q))
+    jacobian = wavy.harmonic_jacobian(q, 7)
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        change = rng.standard_normal((wavy.joint_count, 7, 2))
+        ends = [
+            log(middle @ wavy.corrected(harmonics=value * change).base_from_flange(q))
+            for value in (step, -step)
+        ]
+        # The third order of the step, and rounding over it.
+        slope = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(jacobian @ change.ravel(), slope, rtol=0, atol=1e-8)
+
+
+def test_encoders_tell_again_where_the_joints_stand(wavy):
+    q = some_joints(wavy)
+    # Newton's last step squares what it was off by.
+    np.testing.assert_allclose(wavy.chain.encoded(wavy.chain.effective(q)), q, atol=1e-13)
+    step = 1e-6
+    slopes = (wavy.chain.effective(q + step) - wavy.chain.effective(q - step)) / (2 * step)
+    np.testing.assert_allclose(wavy.chain.jacobian(q), slopes, atol=1e-8)
+    bends = (wavy.chain.jacobian(q + step) - wavy.chain.jacobian(q - step)) / (2 * step)
+    np.testing.assert_allclose(wavy.chain.curvatures(q), bends, atol=1e-8)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, deflected_joints, load_robot, table_of, with_base
@@ -72,13 +73,11 @@ def test_an_arm_of_unknown_masses_weighs_nothing():
     assert not robot.load_torques(np.zeros((1, 6))).any()
     table = table_document(table_of(load_robot("ur5e"), "standard"))
     table["joint"][2]["mass_kg"] = -3.0
-    with pytest.raises(DataError, match=r"mass_kg is missing"):
-        Robot.from_document(table)
+    raised(DataError, r"mass_kg is missing", Robot.from_document, table)
     for row in table["joint"]:
         row |= {"mass_kg": 1.0, "com_m": [0, 0, 0]}
     table["joint"][2]["mass_kg"] = -3.0
     with pytest.raises(DataError, match=r"joint elbow_joint: mass_kg is -3.0; a mass of 0 kg"):
         Robot.from_document(table)
     document = dict(robot.document) | {"gravity_m_s2": [0, 0, -1000]}
-    with pytest.raises(DataError, match="gravity_m_s2"):
-        Robot.from_document(document)
+    raised(DataError, "gravity_m_s2", Robot.from_document, document)

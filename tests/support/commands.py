@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 from unittest.mock import patch
 
 import numpy as np
@@ -37,6 +37,18 @@ class Done:
     def said(self) -> str:
         """Results and messages, as a terminal shows them."""
         return self.out + self.err
+
+    def good(self) -> Self:
+        """Itself, which has to have ended well."""
+        assert self.status == 0, self.said
+        return self
+
+    def refused(self, *words: str) -> Self:
+        """Itself, which has to have ended with status 2 and a message that holds these words."""
+        assert self.status == 2, self.said
+        for expected in words:
+            assert expected in self.err or expected in " ".join(self.err.split()), self.err
+        return self
 
 
 # A wide terminal, so that messages are not folded.

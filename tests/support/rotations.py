@@ -10,12 +10,12 @@ RNG = np.random.default_rng(3)
 def rotation_cases():
     """Rotations by kind: any, and those at which some form of writing them is singular."""
     quarter, half = np.pi / 2, np.pi
-    turns = RNG.uniform(-half, half, (40, 2))
-    axes = RNG.normal(size=(20, 3))
+    turns = RNG.uniform(-half, half, (10, 2))
+    axes = RNG.normal(size=(8, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     r = readers
     return {
-        "any": list(Rotation.random(60, rng=RNG).as_matrix()),
+        "any": list(Rotation.random(16, rng=RNG).as_matrix()),
         "identity": [np.eye(3)],
         "pitch of 90": [r.rz(a) @ r.ry(s * quarter) @ r.rx(b) for a, b in turns for s in (-1, 1)],
         "second x y z angle of 90": [
