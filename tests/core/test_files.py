@@ -88,3 +88,16 @@ def test_a_link_that_leads_nowhere_is_not_replaced_unasked(tmp_path):
     link.symlink_to(tmp_path / "nowhere")
     raised(DataError, "nothing is overwritten", check_free, link, force=False)
     check_free(link, force=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 3000 + "]" * 3000, "nested deeper"),
+        (".".join("a" * 100) + " = 1", "nested deeper"),
+        (f"a.b = {2**63}", r"a\.b has more than the 64 bits"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
+    ],
+)
+def test_toml_that_no_one_writes_is_refused(text, words):
+    raised(DataError, words, parse_toml, text, "x.toml")

@@ -354,6 +354,24 @@ def test_singular_postures_are_told(stored, result):
         assert there == pytest.approx(pose, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{POSE}\n400,100,200,0,1,0,0\n", "Positions are in metres"),
+        ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n0.4,0.1,0.2,0,1,0,0\n", "Write metres"),
+        ("x_m,y_m,z_m,qx,qy,qz,q4\n0.4,0.1,0.2,0,1,0,0\n", "qw are missing"),
+        ("{POSE}\n0.4,0.1,,0,0,0,1\n", "column z_m: it is empty"),
+        ("{POSE}\n0.4,0.1,0.2,0,0,1,1\n", "norm is 1.41"),
+        ("{POSE},{JOINTS}\n0.4,0.1,0.2,0,1,0,0,10,-80,90,-100,-90,0\n", "look like degrees"),
+        ("{POSE},q1_rad\n0.4,0.1,0.2,0,1,0,0,0.1\n", "its joints are q1_rad"),
+    ],
+)
+def test_what_is_no_table_of_targets_is_named(stored, text, words):
+    names = {"POSE": "x_m,y_m,z_m,qx,qy,qz,qw", "JOINTS": ",".join(JOINTS)}
+    (stored / "t.csv").write_text(text.format(**names))
+    assert run("correct", stored / "t.csv", "-c", stored).refused(words).out == ""
+
+
 def test_a_payload_is_counted_where_joints_bend(stored, result):
     spring = {"compliance_rad_per_nm": 1e-4, "sigma_rad_per_nm": 1e-6, "determined": True}
     springs = tuple(

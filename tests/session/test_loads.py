@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.loaded import HUNG, NOMINAL, postures
+from support.refusals import raised
 from support.tracked import known_of
 
 from visioncal.core.errors import DataError, DegenerateError
@@ -49,8 +50,7 @@ def test_loads_are_read_and_nothing_is_no_load():
     ],
 )
 def test_what_can_be_no_load_is_refused(cells, words):
-    with pytest.raises(DataError, match=words):
-        session_with(**cells)
+    raised(DataError, words, session_with, **cells)
 
 
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
@@ -67,18 +67,6 @@ def test_views_of_one_stop_share_its_load():
     # Where stops have no numbers, a stop is a pose under a load.
     bare = replace(session, views=tuple(replace(view, stop=None) for view in session.views))
     assert len({observation.station for observation in bare.observations}) > 6
-
-
-def test_springs_need_something_that_bends_them():
-    options = InstrumentOptions(robot=NOMINAL.name)
-    session = hung(options, postures(6)[::4])
-    bare = dict(session.robot_document)
-    bare["joint"] = [
-        {key: value for key, value in row.items() if key not in ("mass_kg", "com_m")}
-        for row in bare["joint"]
-    ]
-    with pytest.raises(DataError, match="does not state the masses of its links, and no view has"):
-        known_of(replace(session, robot_document=bare), level="elastic")
 
 
 def test_gravity_goes_with_the_session():

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -24,7 +23,6 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
-from visioncal.simulation.recordings import is_symmetric
 
 EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(
@@ -110,20 +108,6 @@ def test_faults_are_where_the_truth_says(cell):
     assert other & moved & {sight.view for sight in cell.sights if sight.stop == 4}
 
 
-def test_a_board_that_looks_alike_from_both_ends_begins_anywhere(cell):
-    assert is_symmetric(EVEN)
-    turned = []
-    for sight in cell.sights:
-        if sight.board == "even":
-            # Pixel noise is far below the 10 px and more between corners.
-            first, last = (
-                np.linalg.norm(sight.corners.px[0] - sight.exact.px[end]) for end in (0, -1)
-            )
-            assert min(first, last) < 1.0
-            turned.append(bool(last < first))
-    assert set(turned) == {True, False}
-
-
 def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
     options = replace(
         OPTIONS,
@@ -172,40 +156,6 @@ def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
             assert view.text["approach"] == "-+"[view.stop % 2]
 
 
-def test_stops_of_a_whole_cell_are_misreported_where_the_truth_says():
-    exact = RobotAt("a", (-0.6, 0.0, 0.0), robot_sigma_m=0.0, robot_sigma_rad=0.0, wrong_stops=2)
-    robot = simulate(replace(ONE_ARM, robots=(exact,))).robot
-    both = zip(robot.base_from_flange, robot.true_base_from_flange, strict=True)
-    mm, deg = np.array([pose_difference(*pair) for pair in both]).T
-    wrong = np.isin(np.arange(STOPS), robot.wrong_stops)
-    assert wrong.sum() == 2
-    assert ((mm > 4.9) == wrong).all()
-    assert ((deg > 0.9) == wrong).all()
-    with pytest.raises(DataError, match="wrong_stops of a is 9, 0 to 8 are possible"):
-        replace(ONE_ARM, robots=(replace(exact, wrong_stops=9),))
-
-
-def test_cameras_of_a_whole_cell_are_misstated_and_write_their_own_images(tmp_path):
-    low = CameraAt("low", place_m=(0.0, -0.5, 0.7), lens_mismatch_px=0.5, jpeg_quality=80)
-    cell = simulate(replace(ONE_ARM, cameras=(low,), stops=1))
-    session = Session.load(write_session(cell, tmp_path / "cell"))
-    assert {view.image.rpartition(".")[2] for view in session.views} == {"jpg"}
-    assert all(session.images.exists(view.image) for view in session.views)
-    off = np.array(session.cameras["low"].matrix) - low.camera.matrix
-    assert 0.01 < np.abs(off).max() < 20.0
-
-
-def test_corners_stand_in_for_images():
-    cell = simulate(replace(ONE_ARM, lens_views=2))
-    session = cell_session(cell, "cell", seen="corners")
-    assert "image" not in session.columns
-    assert [view.has_corners for view in session.views] == [True] * len(cell.sights)
-    assert session.corner_table is not None
-    np.testing.assert_array_equal(
-        session.corner_table.px, np.concatenate([view_corners.px for view_corners in cell.corners])
-    )
-
-
 def test_one_robot_with_one_camera_is_a_cell_whose_things_have_no_names():
     single = simulate(CellOptions(views=4, second=Second()))
     assert single.robot_of("cam") == ""
@@ -216,10 +166,3 @@ def test_one_robot_with_one_camera_is_a_cell_whose_things_have_no_names():
         seen = invert(flange @ single.mountings["cam"]) @ board
         # A product of matrices of order one.
         np.testing.assert_allclose(seen, sight.cam_from_target, atol=1e-12)
-
-
-def test_what_is_nowhere_is_refused():
-    with pytest.raises(DataError, match="hand is on 'c'; there are a, b, cell"):
-        NetworkOptions(cameras=(CameraAt("hand", "c"),))
-    with pytest.raises(DataError, match="'target_flor' cannot be pushed"):
-        simulate(replace(OPTIONS, moved=(Moved("target_flor"),)))

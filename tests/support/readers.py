@@ -265,7 +265,7 @@ FIXTURE_READERS = {
     "kuka-base": kuka_base,
 }
 
-# Those of an arm, which test_arm_exports.py reads.
+# Those of an arm, which test_cell_exports.py reads.
 ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")
 
 # By the format's name: every format that holds any transform.
