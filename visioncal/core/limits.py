@@ -114,6 +114,13 @@ class DynamicsLimits:
 
 # Fewest views, or stops, that determine a frame: turns about two axes take three of them.
 FEWEST_VIEWS = 3
+# Fewest stops, or rows, of which a majority tells which are wrong.
+FEWEST_COMPARED = 5
+# Fewest stops whose residuals tell an error from noise: fewer leave hardly more of them than edges
+# and noise have parameters.
+FEWEST_STOPS = 6
+# Ratio of residuals from which on the smaller is clearly better.
+CLEAR_RATIO = 3.0
 # Sigmas from which on a stated value counts as contradicted.
 CONTRADICTION = 3.0
 # Greatest blur of an image in which a board is detected, as a Gaussian's sigma [px].

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import qr, solve_triangular
 
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.dynamics.conditioning import Conditioned
@@ -28,9 +28,6 @@ from visioncal.estimation.linalg import covariance_from, damped_step, gram
 # Rows of a QR decomposition at a time, so that they stay in the processor's cache.
 _CHUNK = 2000
 _ROUNDS, _SETTLED = 30, 1e-4
-# Outliers are residuals with less than this probability of being exceeded by any of them.
-_OUTLIER_CHANCE = 1e-3
-_OUTLIER_ROUNDS = 10
 # Autocorrelations count up to the first insignificant one (in sigmas), and over this share of
 # samples.
 _LOST, _FOLLOWED = 3.0, 0.1
@@ -39,8 +36,6 @@ _LEAST_POWER = 0.02
 # Start values and bounds of the Stribeck speed [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
 _HUMP_SETTLED, _NOISE_SETTLED, _HUMP_ROUNDS = 1e-6, 1e-2, 8
-# Significance level of a hump.
-_CHANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +60,7 @@ class NoiseBlock:
     def within(self, values: FloatArray, sigma: FloatArray) -> "NoiseBlock":
         """The same without outliers of a fit."""
         count = max(int(self.used.sum()), 1)
-        limit = float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / count, 1.0)))
+        limit = float(np.sqrt(chi2_limit(FALSE_REJECTION / count, 1.0)))
         near = np.abs(self.y - self.predicted(values)) <= limit * sigma
         return replace(self, used=self.used & near)
 
@@ -107,7 +102,7 @@ def regress(blocks: Sequence[NoiseBlock]) -> Regression:
     """
     blocks = tuple(blocks)
     with one_blas_thread():
-        for _ in range(_OUTLIER_ROUNDS):
+        for _ in range(10):
             values, sigmas, root = _weighted(blocks)
             masked = tuple(
                 block.within(values, sigma) for block, sigma in zip(blocks, sigmas, strict=True)
@@ -345,7 +340,7 @@ def _significant(humps: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> Fl
     # Fs below 0 would drive the joint at low speeds: something else is fitted then.
     count = len(humps.joints)
     sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
-    limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))
+    limit = float(np.sqrt(chi2_limit(FALSE_REJECTION, 2.0)))
     inside = (humps.speed_rad_s > 1.01 * _SLOWEST) & (humps.speed_rad_s < 0.99 * _FASTEST)
     resists = coulomb_nm + humps.hump_nm > 0.0
     return np.asarray((np.abs(humps.hump_nm) > limit * sigma) & inside & resists)

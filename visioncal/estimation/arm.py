@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_STOPS
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.budget import less_noise
@@ -27,12 +29,10 @@ LEVER_M = 0.5
 # Units of a twist: a rotation by 1 rad, or a translation by the lever.
 TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 # Limits of twice the gain in log-likelihood that noise exceeds in one session of ten thousand, and
-# of twenty: chi-square of one degree of freedom.
-SIGNIFICANT, _LIKELY = 15.1, 3.84
+# of twenty.
+SIGNIFICANT, _LIKELY = map(float, chi2_limit([FALSE_ALARM, 0.05], 1))
 # Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
-# Fewer stops have hardly more residuals than edges and noise have parameters.
-FEWEST_STOPS = 6
 # Position by which the errors change in proportion [m]: typical reach of an arm.
 _REACH_M = 0.6
 

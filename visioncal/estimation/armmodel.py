@@ -6,7 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
+from visioncal.core.limits import FEWEST_STOPS
+from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
@@ -20,8 +21,6 @@ COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
 # Functions of the joints beyond their eccentricity.
 HARMONICS = "harmonics"
 RIGID = ("links", *_FUNCTIONS)
-# The mean of fewer twists does not show whether it is noise; chance of taking noise for a tool.
-_FEWEST_TWISTS, _BY_CHANCE = 6, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,11 +261,11 @@ class ArmModel:
 def _is_noise(twists: FloatArray) -> bool:
     """Tests whether the mean of (m, 6) twists is zero, by isotropic scatter (F test)."""
     count = len(twists)
-    if count < _FEWEST_TWISTS:
+    if count < FEWEST_STOPS:
         return False
     mean = twists.mean(axis=0).reshape(2, 3)
     scatter = (twists - twists.mean(axis=0)).reshape(count, 2, 3).var(axis=(0, 2), ddof=1)
-    limit = f_limit(_BY_CHANCE, 3, 3 * (count - 1))
+    limit = f_limit(FALSE_REJECTION, 3, 3 * (count - 1))
     return bool((count * (mean**2).mean(axis=1) <= limit * scatter).all())
 
 

@@ -19,9 +19,6 @@ from visioncal.vision.camera import intrinsics, with_intrinsics
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
 _State: TypeAlias = tuple[FloatArray, FloatArray]
 
-# Relative decrease of the cost at which the fit has converged.
-_CONVERGED = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class BundleFit:
@@ -59,7 +56,7 @@ def fit_bundle(
 
         return Linearised(at, float(np.sum(reprojection.residuals**2) + weight @ offset**2), step)
 
-    (values, poses), settled = levenberg_marquardt((start, cam_from_target), linearise, _CONVERGED)
+    (values, poses), settled = levenberg_marquardt((start, cam_from_target), linearise)
     fitted = with_intrinsics(camera, values)
     reprojection = reproject(stack, fitted, poses)
     information, _, _ = _reduced(stack, reprojection, 0.0)

@@ -42,7 +42,7 @@ from visioncal.estimation.trajectory import Trajectory
 
 # Frames for a start; most frames of a fit; most with dozens of corners each.
 _START_FRAMES, _MOST_FRAMES, _MOST_STACKED = 60, 1200, 400
-_ROUNDS, _CONVERGED_S = 12, 1e-7
+_CONVERGED_S = 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
 # Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
@@ -53,9 +53,8 @@ _MOST_OWN = 600
 # Ratio of residual noise, rotations times positions, up to which fits are equally good; share to
 # which a change of the offset must reduce it.
 _ALIKE, _CLEARLY_LESS = 1.2, 0.9
-# A change is refined for this number of rounds at most, or until its step is below this share of
-# its sigma.
-_REFINING, _SETTLED = 6, 0.3
+# A change is refined until its step is below this share of its sigma.
+_SETTLED = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +209,7 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     change = _tested_change(frames.stamps_s[chosen], own_s, weights)
     if change is None:
         return None
-    for _ in range(_REFINING):
+    for _ in range(6):
         corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
         fits = fit_offset(robot, corrected, [fit.offset_s])
         if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
@@ -320,7 +319,7 @@ def _iterated(
     recorded: _Recorded, offset_s: float, readout_s: float, start: State | None
 ) -> ClockFit | None:
     """Iterates readout, offset and edges to convergence; None where too few frames are covered."""
-    for _ in range(_ROUNDS):
+    for _ in range(12):
         covered = recorded.covered(offset_s)
         count = len(covered.frames)
         if count < FEWEST_FRAMES:

@@ -30,7 +30,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation, quaternions, skew
 from visioncal.core.types import FloatArray
 
-_FEWEST_VIEWS, _GROUP = 2, 100
+_GROUP = 100
 # Scalar products of the quaternions from which pairs count in full: up to 165 degrees.
 _FULL_WEIGHT = float(np.cos(np.radians(82.5)) ** 2)
 # Least rotation (root mean square) about a direction that determines a translation: less is the
@@ -417,10 +417,10 @@ def _check(robot: FloatArray, camera: FloatArray) -> None:
             f"{camera.shape} cannot be paired; both must be (views, 4, 4)."
         )
     views = robot.shape[-3]
-    if views < _FEWEST_VIEWS:
+    if views < 2:
         raise DegenerateError(
             f"hand-eye: {counted(views, 'view', ('was', 'were'))} given; a relative motion needs "
-            f"at least {_FEWEST_VIEWS}, and a full solution 3 with two different rotation axes.",
+            "at least 2, and a full solution 3 with two different rotation axes.",
             next_step="Add views that are tilted about different axes.",
         )
     finite = np.isfinite(robot + camera).all(axis=(-2, -1)).reshape(-1, views).all(axis=0)

@@ -18,7 +18,7 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.linalg import covariance_among, covariance_from
+from visioncal.estimation.linalg import ROUNDING, covariance_among, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
@@ -31,15 +31,13 @@ from visioncal.estimation.solve import (
     fitted_covariance,
 )
 
-# Values that change by less than this share of their sigma have converged; maximum of iterations.
-_SETTLED, _ROUNDS = 0.02, 8
-# A step is halved while it increases the corner residuals by this factor; maximum of halvings.
-FOLLOWS, _HALVINGS = 2.0, 12
+# Values that change by less than this share of their sigma have converged.
+_SETTLED = 0.02
+# A step is halved while it increases the corner residuals by this factor.
+FOLLOWS = 2.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
 # by this factor.
 UNEVEN_LINKS = 2.0
-# Information on a size below this share of its prior is rounding.
-_UNMEASURED = 1e-6
 
 
 class FrameModel(Protocol):
@@ -144,7 +142,7 @@ def diverging() -> Iterator[None]:
 
 
 def _settled(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
-    for _ in range(_ROUNDS):
+    for _ in range(8):
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
@@ -164,7 +162,7 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     limits = [FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
     optics, free = fitted.linearised.camera_parameters, fitted.linearised.free
     change = fitted.change
-    for _ in range(_HALVINGS):
+    for _ in range(12):
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
         # Focal lengths are positive.
@@ -267,5 +265,5 @@ def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
     information = covariance_from(covariance)
     offset = information @ (optics.values - optics.stated)[places]
     values, vectors = np.linalg.eigh(information - prior)
-    kept = values > _UNMEASURED * np.diag(information).max()
+    kept = values > ROUNDING * np.diag(information).max()
     return float(np.sum((offset @ vectors[:, kept]) ** 2 / values[kept]))

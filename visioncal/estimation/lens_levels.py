@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
@@ -60,8 +61,6 @@ _FLANGE_ERRORS = (1e-7, 1e-1, 1e-6)
 # Likelihood-ratio limit with a false alarm in one session of ten thousand; half of the
 # chi-square's mass is at zero, as a level cannot be negative.
 SIGNIFICANT = float(chi2_limit(2e-4, 1))
-# Breathing and jitter are not identifiable with fewer stops.
-_FEWEST_STOPS = 6
 # Indices of the sizes: corner noise, field, breathing, jitter, one that is not estimated, three of
 # a given lens; then three of each printed board, and two of each flange.
 _NOISE, _FIELD, _BREATHING, _JITTER, _ONE, _FOCAL, _CENTRE, _SHAPE, _BOARDS = range(9)
@@ -253,7 +252,7 @@ def _closed(problem: CornerProblem, stops: int) -> tuple[int, ...]:
         if problem.scene.matrix_sigma_px is None:
             closed |= {_FOCAL, _CENTRE}
         closed |= {at for at in boards if not _is_scale(at)}
-    if stops < _FEWEST_STOPS or problem.scene.is_focus_fixed:
+    if stops < FEWEST_STOPS or problem.scene.is_focus_fixed:
         closed |= {_BREATHING, _JITTER}
     if problem.is_flat[0]:
         closed |= {_FOCAL, _CENTRE, _SHAPE}

@@ -10,6 +10,8 @@ State = TypeVar("State")
 
 # Well-posed problems take far fewer; flat valleys of rational lens models take two hundred.
 ITERATIONS = 400
+# Decrease of the cost, relative to the cost plus one, below which it has converged.
+SETTLED = 1e-10
 START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
 # The iteration ends at a step that raises the cost with a smaller predicted decrease (a hundredth
 # of a sigma).
@@ -17,8 +19,6 @@ _LITTLE = 1e-4
 # At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
 # so that the problem is already linearised at the returned state.
 _NOTHING = 0.1
-# Smallest damping factor after a step.
-_LEAST_CHANGE = 0.1
 # Near the solution, where poorly determined directions would need many damped steps.
 NEAR_DAMPING = 1e-9
 
@@ -37,7 +37,7 @@ class Linearised(Generic[State]):
 def levenberg_marquardt(
     start: State,
     linearise: Callable[[State], Linearised[State]],
-    settled: float,
+    settled: float = SETTLED,
     damping: float = START_DAMPING,
     most: int = ITERATIONS,
 ) -> tuple[State, bool]:
@@ -76,6 +76,6 @@ def levenberg_marquardt(
 def _change(decrease: float, predicted: float) -> float:
     """Factor of the damping after a step that lowered the cost, by its gain (Nielsen 1999)."""
     if not 0.0 < predicted < np.inf:
-        return _LEAST_CHANGE
+        return 0.1
     gain = min(decrease / predicted, 1.0)
-    return max(_LEAST_CHANGE, 1.0 - (2.0 * gain - 1.0) ** 3)
+    return max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)

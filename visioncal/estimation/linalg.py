@@ -13,8 +13,10 @@ _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
 # Squared Cholesky pivots of a unit-diagonal matrix below which the factor is mostly rounding.
 _LEAST_PIVOT_SQ = 1e-11
-# Share of the noise variance below which a residual direction has no redundancy left.
-_VANISHED = 1e-6
+# Share of a variance, or of an information, below which what is left is rounding.
+ROUNDING = 1e-6
+# The same of eigenvalues beside the largest.
+NULL_SHARE = 1e-9
 
 
 # Scaled eigenvalue ratio below which a direction is undetermined.
@@ -121,7 +123,7 @@ def squared_lengths(
     whitening = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(whitening @ left @ np.swapaxes(whitening, 1, 2))
     white = (np.swapaxes(vectors, 1, 2) @ whitening @ residuals[:, :, None])[:, :, 0]
-    redundant = values > _VANISHED
+    redundant = values > ROUNDING
     squares = np.where(redundant, white**2 / np.where(redundant, values, 1.0), 0.0)
     return np.asarray(squares.sum(axis=1)), np.asarray(redundant.sum(axis=1))
 

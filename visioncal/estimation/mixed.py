@@ -17,12 +17,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import expit, logit
 
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance_root, gram
+from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram
 
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
-_ITERATIONS = 60
 # A step changes a sigma by a factor of e at most; a change of 1e-4 is far below its uncertainty.
 _LONGEST_STEP, SETTLED = 1.0, 1e-4
 _WORST_DAMPING = 1e6
@@ -34,14 +34,13 @@ HARDLY, _VARIANCES = 0.1, 3.0
 # The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
 # this length: at three times the initial level it is three times the prediction.
 _SURELY, _SHORT_STEP = 3.0, 0.5
-# Square root of the likelihood-ratio limit of a 95 % interval of one unknown (chi-square); first
-# and largest half width and tolerance of its search, in logarithms of the sigma.
-SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
+# Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
+SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
+# First and largest half width and tolerance of its search, in logarithms of the sigma.
+_FIRST_WIDTH, _WIDEST, _EXACT = 0.125, 4.0, 0.02
 
 # Spacing of the grid over the logarithm of a random effect's size.
 _SIZE_STEP = 0.2
-# Eigenvalues of the remaining information below this share of the original trace are rounding.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +168,7 @@ class MixedEstimate(LikelihoodValue):
         information = gram(moved, own.weights[among] @ moved) - absorbed.T @ absorbed
         values, vectors = np.linalg.eigh(information)
         # Directions that the parameters absorb entirely hold rounding only.
-        kept = values > _ROUNDING * np.trace(information + absorbed.T @ absorbed)
+        kept = values > NULL_SHARE * np.trace(information + absorbed.T @ absorbed)
         values, vectors = values[kept], vectors[:, kept]
         squares = (gram(moved, own.pulled[among]) @ vectors) ** 2
         sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
@@ -304,7 +303,7 @@ class MixedModel:
         low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
         logs = np.clip(logs, low, high)
         now, damping = self.at(logs), 1e-3
-        for _ in range(_ITERATIONS):
+        for _ in range(60):
             # Levels at a bound that they would cross are held there.
             free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
             curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))

@@ -40,8 +40,8 @@ _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
 # Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-normal
 # prior of what is new.
 _REPEATABILITY_M, _FACTOR = 3e-5, 2.0
-# Steps of a cause converge after two or three, to far below any arm's repeatability.
-_ROUNDS, _CONVERGED = 6, 1e-7
+# Far below any arm's repeatability.
+_CONVERGED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def evidence_of(
     prior_of = dict(zip(shares, log_priors.tolist(), strict=True))
     sizes_m, widest = SIZES_M if len(cause.units) else SIZES_M[:1], SIZES_M[-1] * cause.units
     values = np.zeros(len(cause.units)) if cause.start is None else cause.start
-    for _ in range(_ROUNDS):
+    for _ in range(6):
         trials = tuple(product(cause.noise_factors, shares))
         variants = _whitened(problem, belief, cause, values, trials)
         likeliest = max(

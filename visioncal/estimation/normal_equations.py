@@ -5,12 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import gram
+from visioncal.estimation.linalg import NULL_SHARE, gram
 from visioncal.estimation.problem import ANYTHING, Linear, Problem
 from visioncal.estimation.problem_parts import Noise, State
-
-# Eigenvalues of the information on a flange below this share of the largest count as zero.
-_NULL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +160,7 @@ def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pseudo-inverses (u, w, w), and the variance `ANYTHING` on the null spaces."""
     values, vectors = np.linalg.eigh(information)
     most = values[:, -1:] if values.shape[1] else values
-    determined = values > _NULL * np.maximum(most, np.finfo(float).tiny)
+    determined = values > NULL_SHARE * np.maximum(most, np.finfo(float).tiny)
     inverse = np.where(determined, 1.0 / np.where(determined, values, 1.0), 0.0)
     transposed = np.swapaxes(vectors, 1, 2)
     null = np.where(determined, 0.0, ANYTHING)

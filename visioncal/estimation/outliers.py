@@ -14,6 +14,7 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -58,8 +59,6 @@ _GROSS = 20.0
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # Least share of inliers; with fewer, the outliers cannot be identified.
 _LEAST_SHARE = 0.5
-# Fewest inliers: with fewer, outliers cannot be separated from noise.
-LEAST_VIEWS = 5
 # Share of the limit from which an observation is tested again, with noise estimated without it.
 _SUSPECT_SHARE = 0.4
 
@@ -190,7 +189,7 @@ def find_inliers(
     cannot be identified: all stay except gross outliers.
     """
     all_rows = np.ones(len(problem), dtype=bool)
-    if len(problem) > LEAST_VIEWS:
+    if len(problem) > FEWEST_COMPARED:
         mask, fit = (
             _trimmed_core(problem, state, all_rows)
             if used is None
@@ -198,11 +197,11 @@ def find_inliers(
         )
         mask, fit = _refined(problem, mask, fit)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
-        if mask.sum() >= max(_LEAST_SHARE * len(problem), LEAST_VIEWS) and is_noise:
+        if mask.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
             return _inlier_fit(problem, mask, fit, ())
     fit = fit_problem(problem, state)
     near = _near(problem, fit.state, all_rows, _GROSS)
-    if not LEAST_VIEWS <= near.sum() < len(problem):
+    if not FEWEST_COMPARED <= near.sum() < len(problem):
         return _inlier_fit(problem, all_rows, fit, ())
     return _inlier_fit(problem, near, fit_problem(problem.subset(near), fit.state), ())
 
@@ -286,7 +285,7 @@ def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solutio
 
 
 def _refined(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
-    return settled(_ObservationSearch(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
+    return settled(_ObservationSearch(problem), used, fit, FEWEST_COMPARED, _SUSPECT_SHARE)
 
 
 def _inlier_fit(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> InlierFit:

@@ -30,13 +30,11 @@ from visioncal.estimation.linalg import (
     gram,
 )
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, Units
+from visioncal.estimation.robot_likelihood import START_SIGMA
+from visioncal.estimation.robust import ROUNDS
 
 # Fewest points of a frame, and fewest touches of a point.
 FEWEST_POINTS = 3
-_ROUNDS = 10
-_CONVERGED = 1e-10
-# Least start of the noise level [m]: it is searched from above.
-_START_SIGMA = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +217,8 @@ def fit_groups(
     chosen = np.ones(len(groups), dtype=bool) if used is None else used
     inside = groups.subset(chosen)
     square = float(np.sum(inside.residuals**2)) / max(int(inside.observed.sum()), 1)
-    sigma = max(float(np.sqrt(square)), _START_SIGMA)
-    for _ in range(_ROUNDS):
+    sigma = max(float(np.sqrt(square)), START_SIGMA)
+    for _ in range(ROUNDS):
         # Weights are held during the descent: weights that follow the state would favour states
         # with large noise.
         weights = np.asarray(np.linalg.inv(groups.covariance(sigma)), dtype=float)
@@ -255,4 +253,4 @@ def descended(
             lambda damping: problem.move(at, damped_step(information, gradient, damping)),
         )
 
-    return levenberg_marquardt(start, linearise, _CONVERGED)[0]
+    return levenberg_marquardt(start, linearise)[0]

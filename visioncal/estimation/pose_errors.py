@@ -23,17 +23,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import FEWEST_STOPS, TWIST_UNITS, ArmErrors, pose_basis, stops_of
-from visioncal.estimation.linalg import gram
+from visioncal.estimation.arm import LEVER_M, TWIST_UNITS, ArmErrors, pose_basis, stops_of
+from visioncal.estimation.linalg import ROUNDING, gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, CommonRows, MixedModel, Units
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import ratio_prior, robot_likelihood
 
-# Distance between postures equivalent to a rotation by a radian [m].
-_REACH_M = 0.5
 # Ranges of the processes over the posture [rad], and memories of those over time [stops]. The size
 # of a memory longer than the session is undetermined: a hundred stands for it.
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
@@ -54,8 +53,6 @@ _ONE_BLOCK, _BLOCK, _MOST_TIES = 200, 96, 16
 _MOST_COLUMNS = 360
 # Least information of stops on a combination of these, over its prior, and most combinations.
 _FAINT, _MOST_COMBINED = 0.1, 96
-# Variances below this share of the total are rounding.
-_FACTORED = 1e-6
 # Start of a process's size in units of the noise, and the size that counts as zero.
 _START_SIZE, _NOTHING = 0.7, 1e-2
 # Least gain in log-likelihood of a step.
@@ -205,7 +202,7 @@ def posture_correlation(poses: FloatArray) -> FloatArray:
 
 def _squared_distances(poses: FloatArray) -> FloatArray:
     """(s, s) squared distances of postures; 2 (1 - cos) of an angle [rad^2]."""
-    places, turns = (poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
+    places, turns = (poses[:, :3, 3] / LEVER_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
     features = np.concatenate([places, turns], axis=1)
     return np.asarray(np.sum((features[:, None] - features) ** 2, axis=2))
 
@@ -224,9 +221,9 @@ def _columns(
         sizes = np.diagonal(remainder[observed], axis1=1, axis2=2) / scale**2
         pivot = int(observed[np.argmax(sizes.sum(axis=1))])
         values, vectors = np.linalg.eigh(remainder[pivot] / np.outer(scale, scale))
-        if values[-1] < _FACTORED:
+        if values[-1] < ROUNDING:
             break
-        kept = values > _FACTORED
+        kept = values > ROUNDING
         cross = -columns @ columns[pivot].T
         for process in processes:
             cross += process.between(all_stops, np.array([pivot]))[:, 0]

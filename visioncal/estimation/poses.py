@@ -15,10 +15,9 @@ from visioncal.estimation.linalg import damped_step
 from visioncal.vision.camera import normalise
 
 # Least points of a homography; relative distance from a line below which points are collinear.
-_FEWEST, _ON_LINE = 4, 1e-6
+FEWEST_CORNERS, _ON_LINE = 4, 1e-6
 # Ratio of depth to width below which points count as coplanar.
 _FLAT = 0.1
-_ITERATIONS = 30
 # Converged step [rad or m]: the next, some hundred times smaller, is negligible beside any noise.
 _CONVERGED = 1e-6
 # Step below which a view no longer iterates with others: it is rounding.
@@ -90,7 +89,7 @@ def determines_pose(points: FloatArray) -> bool:
 
     A line through all points but one contains two of any three: three lines are enough to try.
     """
-    if len(points) < _FEWEST:
+    if len(points) < FEWEST_CORNERS:
         return False
     starts, span = points[[0, 0, 1]], float(np.ptp(points, axis=0).max())
     along = points[[1, 2, 2]] - starts
@@ -120,7 +119,7 @@ class PoseFit:
 def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:
     """Minimises each view's reprojection error by Levenberg-Marquardt, from (v, 4, 4) starts."""
     damping = np.full(len(cam_from_target), _START_DAMPING)
-    return _descended(stack, camera, cam_from_target, damping, _ITERATIONS)
+    return _descended(stack, camera, cam_from_target, damping, 30)
 
 
 def _descended(

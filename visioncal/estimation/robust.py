@@ -14,17 +14,16 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 
 Fit = TypeVar("Fit")
 State = TypeVar("State")
 
-_ROUNDS = 10
+# Most rounds in which inliers and fit follow each other: most take three.
+ROUNDS = 10
 # Number of small sets: with 40 % outliers, all 60 sets of three contain one with probability 3e-7.
 SETS = 60
-# Chance that an inlier is missed before units are tested one by one.
-_MISSED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def _concentrated(
     `solve` may minimise another measure than the distances: their sum may rise.
     """
     least, mask = trimmed_sum(distances, count), nearest(distances, count)
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         trial = solve(mask, state)
         distances = distances_of(trial)
         if (lower := trimmed_sum(distances, count)) >= least:
@@ -139,12 +138,12 @@ def widened(
             limits at the noise of the used ones.
     """
     fewest, before = int(used.sum()) if among is not None else 1, used
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         distances = search.distances(used, fit)
         directions = np.maximum(distances.directions, 1)
         shares = distances.squares / chi2_limit(0.5, directions)
         scale = max(float(np.median(shares[used if among is None else among])), 1.0)
-        limit = distances.limit if among is None else chi2_limit(_MISSED, directions)
+        limit = distances.limit if among is None else chi2_limit(FALSE_REJECTION, directions)
         reached = (distances.squares < scale * limit) | (distances.directions < 1)
         if among is not None:
             reached &= among

@@ -11,6 +11,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.levenberg_marquardt import (
     ITERATIONS,
     NEAR_DAMPING,
+    SETTLED,
     START_DAMPING,
     Linearised,
     levenberg_marquardt,
@@ -32,9 +33,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import START_SIGMA, robot_likelihood
 
-# Iterations of the noise levels; relative decrease of the cost at convergence, and while the noise
-# levels still change.
-_ROUNDS, _SETTLED, _NEARLY = 20, 1e-10, 1e-7
+# Relative decrease of the cost at convergence while the noise levels still change.
+_NEARLY = 1e-7
 # A well-posed fit converges within a few steps. One that creeps, such as along the flat valley of
 # arm errors that mimic another cause, gets new noise levels after this many.
 _STEPS = 30
@@ -70,7 +70,7 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
     is_unchanged = is_near and _are_close(given, noise)
     if is_unchanged:
         noise = given
-    for turn in range(0 if is_unchanged else _ROUNDS):
+    for turn in range(0 if is_unchanged else 20):
         start, previous = state, noise
         state, _ = solve_problem(
             problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY
@@ -97,7 +97,7 @@ def solve_problem(
     *,
     is_near: bool = False,
     most: int = ITERATIONS,
-    settled: float = _SETTLED,
+    settled: float = SETTLED,
 ) -> tuple[State, bool]:
     """Minimises the residuals whitened by a given noise.
 

@@ -16,7 +16,7 @@ from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of, stops_of
-from visioncal.estimation.linalg import covariance_from
+from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
@@ -43,8 +43,6 @@ _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
     JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
     SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
 }
-# Least information of a change beside the other unknowns, as a share of that without them.
-_LEAST_INFORMATION = 1e-6
 # Largest share of the residuals that a change explains.
 _MOST_EXPLAINED = 0.99
 
@@ -199,7 +197,7 @@ def find_steps(
             marginal = alone + across[mine] @ following[:, mine]
             scale = np.sqrt(np.maximum(np.diag(alone), np.finfo(float).tiny))
             scaled = np.linalg.eigvalsh(np.stack([alone, marginal]) / np.outer(scale, scale))
-            if scaled.min() < _LEAST_INFORMATION:
+            if scaled.min() < ROUNDING:
                 continue
             covariance = covariance_from(marginal)
             value = -covariance @ gradient[mine]

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
@@ -24,10 +25,10 @@ CLOSING_SCORE = 0.05
 STARTS = 12
 # Share of the views that is fitted: two rows exchanged among eight are a quarter; fewer than the
 # second would agree with any reading.
-_KEPT_SHARE, _FEWEST_KEPT = 0.7, 5
+_KEPT_SHARE = 0.7
 _SUBSET = 4
-# Starts that are followed, and concentration steps.
-_FOLLOWED, _STEPS = 3, 6
+# Starts that are followed.
+_FOLLOWED = 3
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the equations of a view.
@@ -35,8 +36,8 @@ _UNKNOWNS, _PER_VIEW = 12, 6
 # Standard deviation by axis [rad, or share of the distance]: readings are not distinguished by less
 # than the first, and beyond the second no reading explains the views.
 _LEAST_SIGMA, _UNEXPLAINED_SIGMA = 5e-4, 0.12
-# Prior probability of an outlier view, and rounds in which outliers are weighted down.
-_OUTLIER_PRIOR, _ROUNDS = 0.05, 5
+# Prior probability of an outlier view.
+_OUTLIER_PRIOR = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ class Fit:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
         sigma, squares = np.full(2, _UNEXPLAINED_SIGMA), self._squares
         weights = np.where(np.isin(np.arange(len(self.angle)), self.kept), 1.0, 0.0)
-        for _ in range(_ROUNDS if self.is_readable else 0):
+        for _ in range(5 if self.is_readable else 0):
             # Three equations a view each, less the six unknowns of the edges.
             freedom = max(3.0 * weights.sum() - 0.5 * _UNKNOWNS, 3.0)
             sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _UNEXPLAINED_SIGMA)
@@ -191,7 +192,7 @@ def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[
         followed = np.arange(len(robot))[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
         nearest = np.hstack([nearest, more[2]])[followed]
         edges, sums = edges[followed], sums[followed]
-    for _ in range(_STEPS if starts else 2):
+    for _ in range(6 if starts else 2):
         trial, lower, rows = solved(nearest)
         falls = lower < sums
         if not falls.any():
@@ -222,4 +223,4 @@ def distances(
 
 def _kept_count(rows: int) -> int:
     """Number of rows that a fit of this many keeps."""
-    return max(int(np.ceil(_KEPT_SHARE * rows)), min(rows, _FEWEST_KEPT))
+    return max(int(np.ceil(_KEPT_SHARE * rows)), min(rows, FEWEST_COMPARED))

@@ -14,13 +14,12 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fits
 from visioncal.calibration.guess.search import thinned
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot import Robot, load_robot, other_convention, robot_names
 
-# Two constant transforms and a zero have thirteen unknowns; fewer rows fit anything.
-FEWEST_JOINT_ROWS = 5
 # Largest deviation of an arm from its model, as a share of its reach and an angle [rad]: 2 mm and 3
 # mrad a link add up to half of it. Another arm of the same shape deviates by as much again.
 _MODEL_DEVIATION = 0.03
@@ -28,9 +27,9 @@ _MODEL_DEVIATION = 0.03
 # leave more, unless they change nothing. Scores below the second are alike: controllers print their
 # poses no more finely.
 _FITS, _FLOOR = 2e-3, 1e-4
-# Ratio of the declared reading's score to that of one that replaces it, and ratio to the best score
-# within which readings are equivalent: those with the fewest mistakes are chosen.
-_STANDS_OUT, _EQUIVALENT = 3.0, 2.0
+# Ratio to the best score within which readings are equivalent: those with the fewest mistakes are
+# chosen.
+_EQUIVALENT = 2.0
 # Rows of the first screening, readings refined, and the share of the declared score below which.
 _SCREENED, _REFINED, _REFINED_SHARE = 10, 6, 0.6
 # Steps of a joint's zero from afar to the finest. A shift of 180 degrees is left out: it looks like
@@ -180,7 +179,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
 
     Args:
         robot: The declared model.
-        q: (m, n) joint angles as recorded [rad], of `FEWEST_JOINT_ROWS` rows or more.
+        q: (m, n) joint angles as recorded [rad], of `FEWEST_COMPARED` rows or more.
         poses: (m, 4, 4) `base_from_flange` of the same rows, up to a constant on either side.
 
     Returns:
@@ -196,13 +195,13 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         start, *tried = _fitted([recorded, *joint_readings(robot)], q, poses, few)
         tried.sort(key=lambda item: item.score * (1.0 + item.reading.cost))
         tried = [*tried[:_REFINED], *_with_zeros(robot, q, poses, few)]
-        limit = min(_REFINED_SHARE * start.score, _STANDS_OUT * _MODEL_DEVIATION)
+        limit = min(_REFINED_SHARE * start.score, CLEAR_RATIO * _MODEL_DEVIATION)
         near = [item.reading for item in tried if item.score < limit]
         tried = _fitted(near, q, poses, rows, STARTS)
     least = min((item.score for item in tried), default=np.inf)
     equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
     equivalent.sort(key=lambda item: (item.reading.cost, item.score))
-    if least > _MODEL_DEVIATION or declared.score <= _STANDS_OUT * equivalent[0].score:
+    if least > _MODEL_DEVIATION or declared.score <= CLEAR_RATIO * equivalent[0].score:
         return JointGuess(declared, declared)
     best, *others = equivalent
     rivals = (item.reading for item in others if item.reading.cost == best.reading.cost)

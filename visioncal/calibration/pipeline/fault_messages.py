@@ -27,8 +27,6 @@ _ALIKE = 0.5
 # Views that a large step explains agree on it to within this share of the step: the uncertainty
 # that the fit leaves grows with it.
 _SURELY_ALIKE = 0.05
-# A robot's pose is wrong where at least so many observations of its stop show it.
-_FEWEST = 2
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
@@ -247,7 +245,8 @@ def _exchanged_poses(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[P
         )
         for stations, count in pairs.items():
             at_both = [at for at in by_robot if rows[at].station in stations]
-            if count < 2 * _FEWEST or used[at_both].any():
+            # One observation of a stop may itself be wrong.
+            if count < 4 or used[at_both].any():
                 continue
             first, second = (cell_fit.cell.stops[station] for station in stations)
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
@@ -271,7 +270,7 @@ def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[Pose
         parts = [[station] for station in wrong if not pushed or station <= last] + pushed
         for part in parts:
             rows = np.flatnonzero(by_robot & np.isin(stops, part))
-            if len(rows) < _FEWEST or used[rows].any() or {*explained} & {*rows.tolist()}:
+            if len(rows) < 2 or used[rows].any() or {*explained} & {*rows.tolist()}:
                 continue
             at_flange = None if len(part) > 1 else problem.poses[robot][part[0]]
             moved = _base_displacement(cell_fit, base, rows, at_flange)

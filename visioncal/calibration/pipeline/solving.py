@@ -25,7 +25,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
 from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
-from visioncal.calibration.stages.refine import refine_jointly, with_sizes
+from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, with_sizes
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.types import Mask, Mount
@@ -55,9 +55,6 @@ from visioncal.estimation.steps import find_steps, joints_of
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
 _ROUNDS, _CONVERGED_RAD = 4, 1e-7
-# Prior sigma of targets' sizes in the search for inliers, as a share: prints are scaled to fit a
-# page.
-_SIZE_SIGMA = 0.03
 
 
 def solve(
@@ -342,7 +339,7 @@ def initial_inliers(start: Start) -> InlierFit:
     printed = list(dict.fromkeys(target for target, sensor in pairs if sensor < 0 and movable))
     if printed:
         # Otherwise all observations of a board of another size would be outliers.
-        problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
+        problem = problem.with_effects([target_sizes(problem, printed, PRINTED_SCALE)])
         state = State(state.edges, problem.start_values)
     if not cell.priors:
         inliers = inliers_and_moves(problem, state, movable)

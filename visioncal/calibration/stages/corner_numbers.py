@@ -11,14 +11,14 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
-from visioncal.estimation.poses import determines_pose
+from visioncal.estimation.poses import FEWEST_CORNERS, determines_pose
 from visioncal.session import Session, View
 from visioncal.vision.targets import corner_positions, point_numbers
 
 # Largest homography residual as a share of the corners' spread.
 _MOST_LEFT = 0.3
-# Fewest corners of a view, and of one whose numbers are checked: a homography takes four.
-_FEWEST, _FEWEST_CHECKED = 4, 6
+# Fewest corners of a view whose numbers are checked.
+_FEWEST_CHECKED = 6
 # Distance outside the image from which on corners are none, as a share of its size.
 _OUTSIDE = 0.1
 # Share of the views whose corners are numbered as from behind: single ones may be wrong.
@@ -75,7 +75,7 @@ def _outside(corners: Corners, size: FloatArray) -> Mask:
 def _usable(
     corners: Corners, target: Target, outside: Mask, resolution: tuple[int, int]
 ) -> Corners | Rejection:
-    reason = lack_of_corners(corners, target, _FEWEST)
+    reason = lack_of_corners(corners, target, FEWEST_CORNERS)
     if outside.any():
         at = int(np.argmax(outside))
         u_px, v_px = corners.px[at].tolist()

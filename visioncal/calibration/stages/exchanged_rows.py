@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from visioncal.calibration.stages.init_frames import CLEAR_RATIO
-from visioncal.core.quantiles import chi2_limit
+from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.moves import Move
@@ -17,7 +17,7 @@ from visioncal.estimation.solve import Solution, by_noise_alone
 
 # False-alarm probability of an observation at its own stop, and the factor on its squared distance
 # for other ones: the prediction has errors, too, and wrong stops are much farther.
-_CHANCE, _NEAR = 1e-3, 4.0
+_NEAR = 4.0
 
 
 def other_stops(
@@ -42,7 +42,9 @@ def other_stops(
         alike = turns.get(seen.observed[at].partition("@")[0], np.eye(4)[None])
         squares = np.min([_at_stops(problem, fit, at, moves, turn) for turn in alike], axis=0)
         # Stops in the same posture do not count: an observation fits its own about as well.
-        limit = min(_NEAR * chi2_limit(_CHANCE, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
+        limit = min(
+            _NEAR * chi2_limit(FALSE_REJECTION, 6), squares[seen.stops[at]] / CLEAR_RATIO**2
+        )
         near = np.flatnonzero(squares < limit)
         if len(near):
             found[at] = near[np.argsort(squares[near])].tolist()

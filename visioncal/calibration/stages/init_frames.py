@@ -30,7 +30,7 @@ from visioncal.calibration.stages.pairwise import (
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError
-from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection, Target
 from visioncal.estimation.outliers import EARLY_SHARE, FEWEST_EARLY
@@ -40,8 +40,6 @@ from visioncal.estimation.procrustes import align, spreads
 from visioncal.estimation.tree import PathStep, Tree
 from visioncal.vision.targets import rotation_transforms
 
-# A rival within this ratio of the chosen candidate's distance is as likely.
-CLEAR_RATIO = 3.0
 # Most orientations of boards that are tried.
 _MOST_TRIED = 256
 # Fewest stops at which points are read to determine them and the instrument; assumed sigma of these

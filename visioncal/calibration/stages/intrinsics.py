@@ -18,7 +18,6 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.poses import planar_poses
 from visioncal.vision.targets import numbered_positions
 
-_ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
 # Limits of the warning: relative sigma of the focal length, and that of the principal point [px].
@@ -98,7 +97,7 @@ def estimate_intrinsics(
 def _gated(stack: CornerStack, fit: BundleFit) -> tuple[BundleFit, dict[int, str]]:
     """Refits without outlier corners and views; reasons by view."""
     reasons: dict[int, str] = {}
-    for _ in range(_ROUNDS):
+    for _ in range(3):
         gated = gate(stack, fit.residuals)
         if gated.is_open:
             break

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances
-from visioncal.calibration.guess.joints import FEWEST_JOINT_ROWS, JointGuess, guess_joints
+from visioncal.calibration.guess.joints import JointGuess, guess_joints
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray
@@ -22,8 +23,6 @@ from visioncal.session.table import reported_matrices
 _AGREE, _CALIBRATED = (1e-3, 2e-3), (1e-2, 2e-2)
 # Half a turn of the base about its z.
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-# Ratio of the model's own base's residuals to those of another base that is preferred.
-_BETTER_BASE = 3.0
 # Outlier rows have residuals beyond this many medians.
 _OUTLIER = 7.0
 
@@ -74,7 +73,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
         return matched
     views, poses = tuple(by_view), np.array(list(by_view.values()))
     q = np.array([joints[view] for view in views])
-    if len(q) >= FEWEST_JOINT_ROWS:
+    if len(q) >= FEWEST_COMPARED:
         guess = guess_joints(robot, q, poses)
         # A user's model may be an arm as it was built, whose controller computes with the nominal
         # one.
@@ -144,7 +143,7 @@ def _base_and_flange(model: FloatArray, poses: FloatArray, guess: JointGuess | N
     if guess is None or np.all(_typical(own) <= _AGREE):
         return own
     ratios = _typical(own) / np.maximum(_typical(guess.best.fit), np.finfo(float).tiny)
-    return guess.best.fit if ratios.max() > _BETTER_BASE and ratios.min() >= 1.0 else own
+    return guess.best.fit if ratios.max() > CLEAR_RATIO and ratios.min() >= 1.0 else own
 
 
 def _with_base(matched: MatchedJoints, base: FloatArray) -> MatchedJoints:

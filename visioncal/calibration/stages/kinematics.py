@@ -8,11 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.arm import FEWEST_STOPS, SIGNIFICANT, ArmErrors, rows_of, stops_of
+from visioncal.estimation.arm import SIGNIFICANT, ArmErrors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
 from visioncal.estimation.armmodel import (
     BACKLASH,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.stages.pnp import ViewPoses, distances_m
-from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.transforms import compose, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
@@ -17,7 +17,7 @@ from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import NULL_RATIO, covariance_from, eigenvalue_shares
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
+from visioncal.estimation.robust import ROUNDS, nearest, trimmed_start, trimmed_sum
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
@@ -28,9 +28,6 @@ WORST_M = 0.1
 AGREE_M = 0.02
 # Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
 _NOISE, _CAMERA_SIGMA = Noise(np.full((1, 2), 5e-4), np.zeros(0)), 1e-6
-# Rounds in which each view's candidate follows both edges; between two arms, fewest views, and
-# rounds in which the three transforms follow each other.
-_ROUNDS, _FEWEST_BETWEEN, _ALTERNATIONS = 10, 5, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +98,7 @@ def settled_distances(robot: FloatArray, candidates: Candidates, picks: IntArray
         (m, k) distances of the candidates from the predictions [m].
     """
     rows = np.arange(len(robot))
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         edges = _solve_edges(robot, candidates, rows, picks, SOLVERS["park"])
         if np.array_equal(edges.picks, picks):
             break
@@ -198,12 +195,12 @@ def between_arms(
     Wu, Wang, Qi and Ren 2016 iterate), from starts with v in 24 orientations. `first` and `second`
     are (m, 4, 4). None where no start converges, or with too few views.
     """
-    if len(first) < _FEWEST_BETWEEN or candidates.turns.any():
+    if len(first) < FEWEST_COMPARED or candidates.turns.any():
         return None
     middle = compose(Rotation.create_group("O").as_matrix(), np.zeros(3))[:, None]
     seen, park = candidates.poses[None, :, 0].repeat(len(middle), axis=0), SOLVERS["park"]
     before, after = (invert(arm)[None].repeat(len(middle), axis=0) for arm in (first, second))
-    for _ in range(_ALTERNATIONS):
+    for _ in range(40):
         # u and w for given v; then v and w for given u; then u and v for given w.
         u_inverse = park(after @ invert(middle) @ before, seen).x[:, None]
         w = park(after, before @ u_inverse @ seen).z[:, None]

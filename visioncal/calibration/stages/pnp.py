@@ -29,7 +29,6 @@ _RIVAL_RATIO = 2.0
 _RIVAL_CHI2 = 36.0
 # Smaller differences of rotation [rad] are one pose that was reached from both starts.
 _SAME_RAD = 1e-5
-_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ def estimate_poses(
     with one_blas_thread():
         stack, starts = _with_starts(CornerStack.of(corners, positions), camera, reasons)
         fit = fit_poses(stack, camera, starts[0])
-        for _ in range(_ROUNDS):
+        for _ in range(3):
             gated = gate(stack, fit.residuals)
             if gated.is_open:
                 break

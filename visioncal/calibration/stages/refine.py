@@ -28,8 +28,8 @@ from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
 from visioncal.estimation.problem_parts import State
 
-# Size of a board's scale error at the start: prints are scaled to fit a page.
-_WIDE = 0.03
+# Prior sigma of a printed board's scale, as a share: prints are scaled to fit a page.
+PRINTED_SCALE = 0.03
 # Largest error of a board's size, as a share.
 _FARTHEST = 0.2
 
@@ -75,7 +75,9 @@ def refine_jointly(
         stated = None
         if not is_sized:
             # Sizes are estimated from above: near a wrong size, lines of sight restrain another.
-            wide = tuple(replace(item, scale=max(item.scale, _WIDE)) for item in optics.board_sizes)
+            wide = tuple(
+                replace(item, scale=max(item.scale, PRINTED_SCALE)) for item in optics.board_sizes
+            )
             stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
         if stated is None or _is_shrunk(stated):
             stated = fit_jointly(optics, model, frames)

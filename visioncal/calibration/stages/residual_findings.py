@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.suspects.ranking import NO_JOINTS
 from visioncal.core.finding_kinds import BOARD_CHANGED, MOVED_FRAME
+from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.types import FloatArray
@@ -30,8 +31,8 @@ from visioncal.estimation.steps import (
     sizes_of,
 )
 
-# Fewest stops whose residuals can be tested, and most steps that are fitted.
-_FEWEST_STOPS, _MOST_FITTED = 6, 6
+# Most steps that are fitted.
+_MOST_FITTED = 6
 # Largest ratio of the residuals beside a step to others.
 _ALIKE = 3.0
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
@@ -56,7 +57,7 @@ def likely_steps(
         errors: Errors of arms whose joints are not known, by robot.
         offsets: (s, 6, n) Jacobian of the flange by joint offsets, for the other robots.
     """
-    robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= _FEWEST_STOPS]
+    robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= FEWEST_STOPS]
     if not robots:
         return ()
     candidates = frames_of(problem, tuple(problem.unknown)) + sizes_of(problem, fit)

@@ -8,7 +8,6 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import distances
 from visioncal.calibration.guess.joints import (
-    FEWEST_JOINT_ROWS,
     JointGuess,
     guess_joints,
 )
@@ -18,6 +17,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy, remarks
@@ -190,7 +190,7 @@ def _guessed(
     `seen` has `base_from_flange` by view, up to the two unknown edges.
     """
     views = [view for view in seen if view not in excluded]
-    if len(views) < FEWEST_JOINT_ROWS:
+    if len(views) < FEWEST_COMPARED:
         return None
     q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, seen))
     return guess_joints(matched.robot, q, poses)

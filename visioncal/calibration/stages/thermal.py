@@ -53,8 +53,8 @@ _RISE_K, _GAIN_SIGMA = 20.0, 0.8
 _LEAST_RISE_K, _LEAST_SHARE = 3.0, 0.15
 # A parameter counts as determined where its sigma is at most this share of its prior's.
 _UNDETERMINED = 0.8
-# Linearisations, largest step of one, and step at convergence [prior sigmas].
-_ROUNDS, _LONGEST, _SETTLED = 20, 1.0, 1e-3
+# Step at convergence [prior sigmas].
+_SETTLED = 1e-3
 # Largest difference of joints in one posture [rad], and points of the reported course.
 _SAME_RAD, _COURSE_POINTS = 1e-3, 200
 
@@ -304,13 +304,13 @@ def find_drift(
         cold = fit = fit_problem(problem, start)
         drift = ThermalFit.expected(model.robot, nominal, inputs)
         size = len(drift.values)
-        for _ in range(_ROUNDS):
+        for _ in range(20):
             warm = drift.applied_to(problem, robot, stops, mine)
             values = np.append(fit.state.values[: len(cold.state.values)], drift.values)
             fit = fit_problem(warm, State(fit.state.edges, values), fit.noise)
             step = fit.state.values[-size:] - drift.values
             largest = float(np.abs(step).max())
-            drift = drift.moved(step * min(1.0, _LONGEST / max(largest, _SETTLED)))
+            drift = drift.moved(step * min(1.0, 1.0 / max(largest, _SETTLED)))
             if largest < _SETTLED:
                 break
         warm = drift.applied_to(problem, robot, stops, mine)

@@ -12,10 +12,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.vision.camera import project
 
-# Up to this number, every stop is held out by itself; with more, ten groups are sufficient.
-_MOST_FOLDS_OF_ONE = 30
-_FOLDS = 10
-
 
 @dataclass(frozen=True, eq=False)
 class HeldOutResiduals:
@@ -50,7 +46,8 @@ def cross_validate(
     stops = np.unique(problem.observations.stops, return_inverse=True)[1]
     needed = _needed_frames(problem)
     count = int(stops.max()) + 1
-    folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
+    # Few stops are held out one by one; with more, ten groups suffice.
+    folds = count if count <= 30 else 10
     # Strides, so that a group's stops are not neighbours.
     fold = stops % folds
     away_m, away_rad, rms_px = (np.full(len(problem), np.nan) for _ in range(3))
