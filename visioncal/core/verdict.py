@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeAlias
@@ -256,23 +256,6 @@ def with_paths(
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
     words = {name: shlex.quote(path) for name, path in paths.items()}
-    # Only then: shlex would take an apostrophe in a sentence for a quotation mark.
-    if AGAIN in command:
-        words[AGAIN] = shlex.join([*_without_options(again, shlex.split(command))])
+    # Of an option that is typed twice, the last one counts.
+    words[AGAIN] = shlex.join(again)
     return _PATH.sub(lambda found: words[found[0]], command)
-
-
-def _without_options(typed: Sequence[str], options: Sequence[str]) -> Iterator[str]:
-    """Words of a command line without the options, and their values, that will be added."""
-    has_value = {
-        name: not value.startswith("--")
-        for name, value in zip(options, [*options, "--"][1:], strict=True)
-        if name.startswith("--")
-    }
-    words = iter(typed)
-    for word in words:
-        name, _, value = word.partition("=")
-        if name not in has_value:
-            yield word
-        elif has_value[name] and not value:
-            next(words, None)

@@ -108,8 +108,13 @@ def parse_corners(text: str) -> CornerTable:
     Raises:
         DataError: A column is missing or a cell is wrong.
     """
-    step = "Take fewer views, or fewer points of each."
-    table = parse_table(text, FILE, _MOST_CORNERS, next_step=step)
+    table = parse_table(text, FILE)
+    if len(table.rows) > _MOST_CORNERS:
+        raise DataError(
+            f"{FILE} has more than {_MOST_CORNERS:,} rows.",
+            culprits=[FILE],
+            next_step="Take fewer views, or fewer points of each.",
+        )
     columns = table.columns
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]

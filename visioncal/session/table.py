@@ -14,8 +14,8 @@ from visioncal.robot import Loads
 from visioncal.session import columns as cols
 from visioncal.session.images import image_path
 
-# Largest numbers of rows and columns: two days of a stop every ten seconds.
-_MOST_VIEWS, _MOST_COLUMNS = 20_000, 1_000
+# Largest number of rows: two days of a stop every ten seconds.
+_MOST_VIEWS = 20_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
 _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
@@ -122,14 +122,14 @@ def parse_csv(text: str, label: str) -> TextTable:
     Raises:
         DataError: It is empty, has no rows or too many, or its quotes do not close.
     """
-    table = parse_table(
-        text,
-        label,
-        _MOST_VIEWS,
-        _MOST_COLUMNS,
-        "A row is one observation at a stop. Samples of a running motion belong into "
-        "streams/NAME.csv; write the stops alone here.",
-    )
+    table = parse_table(text, label)
+    if len(table.rows) > _MOST_VIEWS:
+        raise DataError(
+            f"{label} has more than {_MOST_VIEWS:,} rows.",
+            culprits=[label],
+            next_step="A row is one observation at a stop. Samples of a running motion belong into "
+            "streams/NAME.csv; write the stops alone here.",
+        )
     if not table.columns:
         raise DataError(
             f"{label} is empty; a header row (view,image,...) and a row for each view are needed.",

@@ -18,14 +18,10 @@ from visioncal.core.verdict import READ_AGAIN
 # Tolerance of a quaternion's norm, for four digits.
 _NORM_TOLERANCE = 1e-3
 # Smallest number of rows with wrong norms, and largest norm of them, from which they are taken for
-# another form of rotation; norms beyond the last are of angles in degrees.
-_FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
+# another form of rotation.
+_FEWEST_ALIKE, _FAR_FROM_UNIT = 3, 1.5
 _SHOWN_PROBLEMS = 10
-_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
-# Quoted values and numbers, which differ between problems of one kind.
-_VALUES = re.compile(r"'[^']*'|[0-9.]+")
-_LINE = re.compile(r", line ([0-9]+)")
 
 _T = TypeVar("_T")
 
@@ -217,12 +213,7 @@ def as_number(cell: str) -> float:
     # float() alone also accepts 1_000 and digits of other scripts.
     value = float(cell) if is_number(cell) else math.nan
     if not math.isfinite(value):
-        why = " (the decimal sign is a point)" if "," in cell else ""
-        if _THOUSANDS.fullmatch(cell):
-            why = " (write it without commas between thousands)"
-        elif "\u2212" in cell:
-            why = " (its minus sign is a typographic one; write -)"
-        raise DataError(f"{cell[:60]!r} is no finite number{why}")
+        raise DataError(f"{cell[:60]!r} is no finite number, such as -1234.5 or 1e-3")
     return value
 
 
@@ -239,51 +230,34 @@ def as_whole(cell: str) -> int:
 
 
 def problems_error(problems: Sequence[TableProblem], next_step: str = "") -> DataError:
-    """Error that lists the first ten problems of a table, or kinds of them."""
+    """Error that lists ten problems of a table, or more by their columns."""
     norms = [problem.norm for problem in problems if problem.norm is not None]
     if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
-        degrees = max(norms) > _ANGLES_RAD
         return DataError(
             f"{problems[0].place} and {len(norms) - 1} more: these are no quaternions but, as it "
-            f"seems, {'Euler angles in degrees' if degrees else 'rotation vectors or Euler angles'}"
-            f": their norms are {min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
+            "seems, rotation vectors or Euler angles: their norms are "
+            f"{min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
             culprits=[problems[0].place],
             next_step=f"The images show which. {READ_AGAIN}",
         )
+    by_column: dict[str, list[TableProblem]] = defaultdict(list)
+    for problem in problems:
+        by_column[problem.place.partition(", column ")[2]].append(problem)
     where = problems[0].place.partition(", column ")[0]
     step = f"Correct it, or delete {where}."
     if len(problems) > 1:
-        columns = dict.fromkeys(problem.place.partition(", column ")[2] for problem in problems)
-        step = ""
-        if len(columns) == 1 and "" not in columns:
-            step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
+        name = next(iter(by_column)) if len(by_column) == 1 else ""
+        step = f"Correct column {name} of {where.partition(',')[0]}." if name else ""
     steps = {problem.step for problem in problems}
     if len(steps) == 1:
         step = steps.pop() or next_step or step
-    if len(problems) <= _SHOWN_PROBLEMS:
-        lines = [f"{problem.place}: {problem.words}." for problem in problems]
-        return DataError(
-            "\n".join(lines), culprits=[problem.place for problem in problems], next_step=step
-        )
-    kinds: dict[tuple[str, str], list[TableProblem]] = defaultdict(list)
-    for problem in problems:
-        column = problem.place.partition(", column ")[2]
-        kinds[column, _VALUES.sub("", problem.words)].append(problem)
-    shown = list(kinds.values())[:_SHOWN_PROBLEMS]
-    lines = []
-    for alike in shown:
-        last = alike[-1].place.partition(", column ")[0]
-        more = f" And {len(alike) - 1} more alike, up to {last}." if len(alike) > 1 else ""
-        lines.append(f"{alike[0].place}: {alike[0].words}.{more}")
-    if len(kinds) > len(shown):
-        lines.append(f"And {len(kinds) - len(shown)} more of other kinds.")
-    named = [alike[0] for alike in shown] if all(map(_are_consecutive, shown)) else problems
-    culprits = [problem.place for problem in named[:_SHOWN_PROBLEMS]]
+    groups = [[problem] for problem in problems]
+    if len(problems) > _SHOWN_PROBLEMS:
+        groups = list(by_column.values())[:_SHOWN_PROBLEMS]
+    lines = [
+        f"{alike[0].place}: {alike[0].words}."
+        + (f" And {len(alike) - 1} more, up to {alike[-1].place}." if len(alike) > 1 else "")
+        for alike in groups
+    ]
+    culprits = [alike[0].place for alike in groups]
     return DataError("\n".join(lines), culprits=culprits, next_step=step)
-
-
-def _are_consecutive(alike: Sequence[TableProblem]) -> bool:
-    """Whether problems are in all lines from the first to the last."""
-    lines = [match for problem in alike if (match := _LINE.search(problem.place))]
-    numbers = [int(match[1]) for match in lines]
-    return len(numbers) == len(alike) and numbers[-1] - numbers[0] == len(alike) - 1

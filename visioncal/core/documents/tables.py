@@ -7,10 +7,9 @@ reads and checks their cells.
 import csv
 import io
 import re
-import sys
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 from visioncal.core.documents.values import DECIMAL, read_plain_text
@@ -19,18 +18,13 @@ from visioncal.core.files import MAX_VALUES, too_many
 
 _NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
-# Other separators of str.splitlines may be inside a cell.
-_LINE_END = re.compile(r"\r\n|\r|\n")
 # Excel's declaration of the separator in the first line.
-_SEPARATOR = re.compile(r"sep=([;\t,])", re.I)
+_SEPARATOR = re.compile(r"sep=([;\t,])\s*", re.I)
 # Characters of an empty row.
-_EMPTY = "; ,\t\r"
+_EMPTY = "; ,\t\r\n"
 _COMMENTS = ("#", "%", "//")
 # A row printed as a list, possibly with a name: `pose: [1.0, 2.0]`, `array([1, 2]),`.
-_LISTED = re.compile(
-    r"(?:[^\W\d][\w .-]*+[:=]\s*+)?(?:[^\W\d][\w.]*+\s*+)?"
-    r"(?:\[([^][(){}]*+)\]|\(([^][(){}]*+)\)|\(\[([^][(){}]*+)\]\)|\{([^][(){}]*+)\})\s*+[,;]?"
-)
+_LISTED = re.compile(r"[^\[\](){}]*+[\[({]++([^\[\](){}]*+)[\])}]++\s*+[,;]?\s*+")
 
 
 @dataclass(frozen=True)
@@ -49,13 +43,7 @@ class TextTable:
         return f"{self.label}, line {line}" if self.label else f"row {line}"
 
 
-def parse_table(
-    text: str,
-    label: str,
-    most_rows: int = sys.maxsize,
-    most_columns: int = sys.maxsize,
-    next_step: str = "",
-) -> TextTable:
+def parse_table(text: str, label: str) -> TextTable:
     """Splits a table with a header row; blank lines are skipped.
 
     Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
@@ -65,45 +53,42 @@ def parse_table(
     Args:
         text: The text.
         label: Its name, for messages.
-        most_rows: Largest number of rows.
-        most_columns: Largest number of columns.
-        next_step: Remedy for a larger table.
 
     Raises:
-        DataError: It is too large, or its quotes do not close.
+        DataError: Its quotes do not close.
     """
     header = text.lstrip().partition("\n")[0]
     separator = next((name for name in ";\t" if name in header and "," not in header), ",")
-    rows: list[tuple[str, ...]] = []
-    lines: list[int] = []
-    for line, cells in _split(text, label, separator):
-        if any(cell.strip() for cell in cells):
-            rows.append(tuple(cells) if separator == "," else _with_points(cells))
-            lines.append(line)
-            if len(rows) > most_rows + 1 or len(rows[0]) > most_columns:
-                raise DataError(
-                    f"{label} has more than {most_rows:,} rows"
-                    + (f" or {most_columns:,} columns." if most_columns < sys.maxsize else "."),
-                    culprits=[label],
-                    next_step=next_step,
-                )
-    names, *filled = _without_margin(rows) if rows else [()]
+    rows = list(_split(enumerate(io.StringIO(text, newline=""), 1), label, separator))
+    names, *filled = _without_margin([cells for _, cells in rows]) if rows else [()]
     columns = tuple(name.strip() for name in names)
-    return TextTable(label, columns, tuple(filled), lines[1:])
+    return TextTable(label, columns, tuple(filled), [line for line, _ in rows[1:]])
 
 
-def _split(text: str, label: str, separator: str) -> Iterator[tuple[int, list[str]]]:
-    """The line in which each row begins, and its cells."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
-    line = 1
+def _split(
+    lines: Iterable[tuple[int, str]], label: str, separator: str, *, stripped: bool = False
+) -> Iterator[tuple[int, tuple[str, ...]]]:
+    """The line in which each filled row begins, and its cells, with decimal points."""
+    at: list[int] = []
+
+    def texts() -> Iterator[str]:
+        for line, text in lines:
+            at.append(line)
+            yield text
+
     try:
-        for cells in reader:
-            yield line, cells
-            line = reader.line_num + 1
+        for cells in csv.reader(
+            texts(), strict=not stripped, delimiter=separator, skipinitialspace=stripped
+        ):
+            if any(cell.strip() for cell in cells):
+                row = tuple(cell.strip() for cell in cells) if stripped else tuple(cells)
+                yield at[0], row if separator == "," else _with_points(row)
+            at.clear()
     except csv.Error as error:
+        place = f"{label}, line {at[0]}"
         raise DataError(
-            f"{label}, line {line}: {error}.",
-            culprits=[f"{label}, line {line}"],
+            f"{place}: {error}.",
+            culprits=[place],
             next_step='A field that holds a comma or a "quote" is put in quotes, "" inside.',
         ) from error
 
@@ -126,30 +111,30 @@ def read_table(path: Path) -> TextTable:
             columns have the same name.
     """
     text, where = read_plain_text(path), str(path)
-    if text.count("\n") + text.count("\r") > MAX_VALUES:
+    if sum(map(text.count, ";\t,\n\r ")) > MAX_VALUES:
         raise too_many(where)
-    all_lines = _LINE_END.split(text)
-    declared = _SEPARATOR.fullmatch(all_lines[0])
-    if declared:
-        all_lines[0] = ""
-    lines = _without_brackets(
-        [
-            (at, line)
-            for at, line in enumerate(all_lines, start=1)
-            if line.strip(_EMPTY) and not line.strip().startswith(_COMMENTS)
-        ]
-    )
+    all_lines = [*io.StringIO(text, newline="")]
+    declared = _SEPARATOR.fullmatch("".join(all_lines[:1]))
+    lines = [
+        (at, line)
+        for at, line in enumerate(all_lines, start=1)
+        if line.strip(_EMPTY) and not line.strip().startswith(_COMMENTS)
+    ][1 if declared else 0 :]
     if not lines:
         raise DataError(f"{where} has no rows.", culprits=[where])
+    listed = [_LISTED.fullmatch(line) for _, line in lines]
+    if all(listed):
+        inside = (match[1] for match in listed if match)
+        lines = list(zip((at for at, _ in lines), inside, strict=True))
     separator = (
         declared[1] if declared else next((name for name in ";\t," if name in lines[0][1]), " ")
     )
-    if sum(line.count(separator) + 1 for _, line in lines) > MAX_VALUES:
-        raise too_many(where)
-    numbers = [at for at, _ in lines]
-    cells = [_cells(line, separator, f"{where}, line {at}") for at, line in lines]
+    split = [(at, tuple(line.split())) for at, line in lines]
+    if separator != " ":
+        split = list(_split(lines, where, separator, stripped=True))
+    numbers, cells = [at for at, _ in split], [cells for _, cells in split]
     rows = _without_margin(cells)
-    columns = rows[0] if not any(is_number(row) for row in rows[0]) else None
+    columns = rows[0] if not any(is_number(cell) for cell in rows[0]) else None
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
     else:
@@ -164,26 +149,24 @@ def read_table(path: Path) -> TextTable:
                 culprits=[f"{where}, line {at}"],
                 next_step="Where commas are decimal, separate the columns by semicolons or tabs.",
             )
-    named = tuple(columns or (str(at) for at in range(1, width + 1)))
-    return TextTable(path.name, _unique(named, where), tuple(rows), numbers, columns is not None)
+    return TextTable(
+        path.name, _named(columns, width, where), tuple(rows), numbers, columns is not None
+    )
 
 
-def _without_brackets(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
-    """The content of the brackets, if all lines are lists in brackets; else the lines."""
-    listed = [_LISTED.fullmatch(line.strip()) for _, line in lines]
-    inside = [next(filter(None, match.groups()), "") for match in listed if match]
-    return list(zip((at for at, _ in lines), inside, strict=True)) if all(listed) else lines
-
-
-def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
-    if separator == " ":
-        return tuple(line.split())
-    try:
-        (cells,) = csv.reader(io.StringIO(line), delimiter=separator, skipinitialspace=True)
-    except (csv.Error, ValueError) as error:
-        raise DataError(f"{where}: {error}.", culprits=[where]) from error
-    stripped = tuple(cell.strip() for cell in cells)
-    return _with_points(stripped) if separator in ";\t" else stripped
+def _named(columns: Sequence[str] | None, width: int, where: str) -> tuple[str, ...]:
+    """Names of all columns: those of the header, or their numbers without one."""
+    if columns is None:
+        return tuple(str(at) for at in range(1, width + 1))
+    named = tuple(name or f"column_{at}" for at, name in enumerate(columns, start=1))
+    twice, count = Counter(named).most_common(1)[0]
+    if count > 1:
+        raise DataError(
+            f"{where}: two columns are named {twice[:60]!r}.",
+            culprits=[where],
+            next_step="Give every column a name of its own.",
+        )
+    return named
 
 
 def _without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
@@ -217,15 +200,3 @@ def _header_in_comments(
     words = names.replace(separator, " ").replace(",", " ").split()
     fits = len(words) == width and not any(is_number(word) for word in words)
     return tuple(words) if fits else None
-
-
-def _unique(columns: tuple[str, ...], where: str) -> tuple[str, ...]:
-    named = tuple(name or f"column_{at}" for at, name in enumerate(columns, start=1))
-    twice = [a for a, b in pairwise(sorted(named)) if a == b]
-    if twice:
-        raise DataError(
-            f"{where}: two columns are named {twice[0][:60]!r}.",
-            culprits=[where],
-            next_step="Give every column a name of its own.",
-        )
-    return named
