@@ -21,8 +21,6 @@ from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import progress
 from visioncal.cli.app import app
 from visioncal.core.choices import (
-    EXPORT_NAMES,
-    FOREIGN_NAMES,
     SIMULATED_ARMS,
     SIMULATED_CELLS,
     Convention,
@@ -31,8 +29,6 @@ from visioncal.core.choices import (
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
-from visioncal.interchange.exports import EXPORT_FORMATS
-from visioncal.interchange.formats import FOREIGN_FORMATS
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -278,14 +274,8 @@ CHOICES = {
     "plan": {"purpose": PURPOSES, "mount": get_args(Mount)},
     "record": {"pose_form": ("ours", *POSE_FORMS)},
     "simulate": {"robot": SIMULATED_ARMS},
-    "export": {
-        "to": [export_format.name for export_format in EXPORT_FORMATS],
-        "convention": get_args(Convention),
-    },
-    "convert": {
-        "form": [foreign_format.name for foreign_format in FOREIGN_FORMATS],
-        "robot_unit": UNITS_M,
-    },
+    "export": {"convention": get_args(Convention)},
+    "convert": {"robot_unit": UNITS_M},
     "fixture": {"cad_unit": UNITS_M},
 }
 
@@ -300,9 +290,7 @@ def test_help_lists_what_can_be_chosen(name):
         assert set(choices) <= words, option
 
 
-def test_names_that_help_lists_are_those_of_the_registries():
-    assert tuple(foreign_format.name for foreign_format in FOREIGN_FORMATS) == FOREIGN_NAMES
-    assert tuple(export_format.name for export_format in EXPORT_FORMATS) == EXPORT_NAMES
+def test_names_that_help_lists_are_those_of_the_files():
     assert cell_names() == SIMULATED_CELLS
 
 

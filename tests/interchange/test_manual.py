@@ -69,45 +69,6 @@ def test_a_line_means_what_its_maker_says(line):
     assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
 
 
-# Two taught poses each; the others are of tools, bases, joints and loads.
-PROGRAMS = {
-    "look.dat": (
-        "kuka",
-        "&REL 12\nDEFDAT  LOOK\n;FOLD\nDECL FDAT FP1={TOOL_NO 1,BASE_NO 0}\n"
-        "DECL E6POS XP1={X 400.0,Y -100.0,Z 300.0,A 10.0,B -20.0,C 170.0,S 2,T 10,E1 0.0}\n"
-        "DECL E6POS XP2={X 410.0,Y -100.0,Z 300.0,A 20.0,B -20.0,C 170.0,S 2,T 10,E1 0.0}\n"
-        "DECL E6AXIS XHOME={A1 0.0,A2 -90.0,A3 90.0,A4 0.0,A5 0.0,A6 0.0}\n"
-        "DECL FRAME F1={X 0.0,Y 0.0,Z 100.0,A 0.0,B 0.0,C 0.0}\nENDDAT\n",
-    ),
-    "look.mod": (
-        "abb",
-        "MODULE Look\n  PERS tooldata t:=[TRUE,[[0,0,9],[1,0,0,0]],[1,[0,0,5],[1,0,0,0],0,0,0]];\n"
-        "  CONST robtarget p10:=[[400,-100,300],[0,0.6,0.8,0],[0,-1,0,1],[9E9,9E9,9E9,9E9]];\n"
-        "  CONST robtarget p20:=[[410,-100,300],[0,0.8,0.6,0],[0,-1,0,1],[9E9,9E9,9E9,9E9]];\n"
-        "  ! MoveL [[0,0,0],[1,0,0,0]]\n  MoveL Offs(p10,0,0,5),v100,fine,t;\nENDMODULE\n",
-    ),
-    "look.script": (
-        "ur",
-        "def look():\n  set_tcp(p[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])\n  set_payload(1.2, [0,0,0.05])\n"
-        "  global one=p[.4, -.1, .3, 2.2, -2.2, .01]\n  global one_q=[-1.5, -1.6, 1.7, 0, 0, 0]\n"
-        "  movej(get_inverse_kin(p[.41,-.1,.3,2.1,-2.3,.1]), a=1.4, v=1.0)\nend\n",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_the_taught_poses_of_a_program_are_its_rows(tmp_path, name):
-    form, text = PROGRAMS[name]
-    (tmp_path / name).write_text(text)
-    fields = read_fields(tmp_path / name)
-    assert fields.form == form
-    unit = 1.0 if form == "ur" else 1e3
-    np.testing.assert_allclose(fields.numbers["x"], np.array([0.4, 0.41]) * unit)
-    (tmp_path / name).write_text("nothing\n")
-    with pytest.raises(DataError, match="no taught poses"):
-        read_fields(tmp_path / name)
-
-
 @pytest.mark.parametrize(
     ("form", "rotation"),
     [

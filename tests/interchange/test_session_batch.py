@@ -160,17 +160,6 @@ def test_a_scheduler_needs_the_extra(fleet, tmp_path, monkeypatch):
     assert "visioncal[cluster]" in done.err
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("here")
-def test_the_page_shows_a_picture_of_each_session(tmp_path):
-    session = write_session(simulate(CellOptions(views=6, seed=1)), tmp_path / "sessions" / "seen")
-    (row,) = batch(session, tmp_path / "out", workers=1, without=BARE).rows
-    assert row.has_picture
-    assert (tmp_path / "out" / "seen" / "picture.jpg").read_bytes()[:2] == b"\xff\xd8"
-    assert 'src="seen/picture.jpg"' in (tmp_path / "out" / "index.html").read_text()
-    assert row.camera == "1280 x 800"
-
-
 @contextmanager
 def cluster(workers):
     """A Dask cluster of programs of their own, with the process ids of scheduler and workers."""

@@ -25,7 +25,6 @@ def row(robot, week, rng, **changes):
         noise_px=0.1 * levels[2],
         residual_mm=0.06 * levels[3],
         focal_px=914.0 * float(np.exp(rng.normal(0.0, 0.003))),
-        has_picture=True,
     )
     return replace(made, **changes)
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 
@@ -211,14 +210,6 @@ def plain_table(folder: Path) -> Recording:
     return Recording(folder / "poses.txt", ImportOptions(mount="eye-in-hand"))
 
 
-def rows_by_turns(folder: Path) -> Recording:
-    """The robot's pose in a row and the camera's in the next, each with its name."""
-    pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
-    both = [row for pair in pairs for row in zip(("hand", "eye"), pair, strict=True)]
-    text = "".join(f"{name}, {', '.join(map(repr, value.tolist()))}\n" for name, value in both)
-    return Recording(_write(folder / "log.csv", text), ImportOptions(mount="eye-in-hand"))
-
-
 def _matrices_in_files(folder: Path, join: Callable[[np.ndarray], np.ndarray]) -> Recording:
     folder.mkdir(parents=True, exist_ok=True)
     for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
@@ -238,36 +229,6 @@ def matrices_below(folder: Path) -> Recording:
 def matrices_in_rows(folder: Path) -> Recording:
     """The upper three rows of a matrix a line."""
     return _matrices_in_files(folder, lambda poses: poses[:, :3].reshape(-1, 12))
-
-
-def rotations_first(folder: Path) -> Recording:
-    """Six numbers a row, of which the last three are a position in millimetres."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
-        rows = np.roll(vectors(poses) * ([1e3] * 3 + [1.0] * 3), 3, axis=1)
-        np.savetxt(folder / f"{name}.txt", rows, "%.17g")
-    requested = ImportOptions(
-        mount="eye-in-hand",
-        camera_file=folder / "camera.txt",
-        robot=PoseImportOptions(unit="mm"),
-        camera=PoseImportOptions(unit="mm"),
-    )
-    return Recording(folder / "robot.txt", requested)
-
-
-def echoed(folder: Path) -> Recording:
-    """What ROS's tf_echo and tf2_echo print."""
-    for name, poses, order in (
-        ("robot", BASE_FROM_FLANGE, ""),
-        ("camera", CAM_FROM_TARGET, " (xyzw)"),
-    ):
-        text = ""
-        for at, row in enumerate(quaternions(poses).tolist()):
-            text += f"At time {at}.25\n- Translation: {row[:3]}\n"
-            text += f"- Rotation: in Quaternion{order} {row[3:]}\n    in RPY (radian) [0, 0, 0]\n"
-        _write(folder / f"{name}.txt", text)
-    requested = ImportOptions(mount="eye-in-hand", camera_file=folder / "camera.txt")
-    return Recording(folder / "robot.txt", requested)
 
 
 def numbered_yaml(folder: Path) -> Recording:
@@ -295,29 +256,6 @@ def lettered_quaternions(folder: Path) -> Recording:
     ]
     document = json.dumps({"samples": rows})
     return Recording(_write(folder / "log.json", document), ImportOptions(mount="eye-in-hand"))
-
-
-def fanuc_program(folder: Path) -> Recording:
-    """A listing of taught positions, each in several lines, beside the images of the stops."""
-    text = '/PROG  LOOK\n/ATTR\nCOMMENT = "";\n/MN\n   1:J P[1] 100% FINE ;\n/POS\n'
-    for at, pose in enumerate(BASE_FROM_FLANGE, start=1):
-        x, y, z, w, p, r = write_pose(pose, POSE_FORMS["fanuc"]).tolist()
-        text += f"P[{at}]{{\n   GP1:\n\tUF : 0, UT : 1,\tCONFIG : 'N U T, 0, 0, 0',\n"
-        text += f"\tX = {x!r}  mm,\tY = {y!r}  mm,\tZ = {z!r}  mm,\n"
-        text += f"\tW = {w!r} deg,\tP = {p!r} deg,\tR = {r!r} deg\n}};\n"
-        picture(folder / f"{at}.png")
-    requested = ImportOptions(mount="eye-in-hand", target=CHARUCO)
-    return Recording(_write(folder / "look.ls", text + "/END\n").parent, requested)
-
-
-def printed_matrices(folder: Path) -> Recording:
-    """A log of a program, with matrices under what they are."""
-    text = "server 1.17.3 listens\n"
-    for at, poses in enumerate(zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True)):
-        for name, pose in zip(("Flange in base", "Board in camera"), poses, strict=True):
-            text += f">>> {name}, pose {at}:\n{str(pose.tolist()).replace('], ', '],' + chr(10))}\n"
-        text += "4 frames were dropped\n"
-    return Recording(_write(folder / "server.log", text), ImportOptions(mount="eye-in-hand"))
 
 
 def printed_lists(folder: Path) -> Recording:
@@ -495,17 +433,12 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         stacked_npz,
         keyed_json,
         images_and_table,
-        rows_by_turns,
         matrices_beside,
         matrices_below,
         matrices_in_rows,
-        rotations_first,
-        echoed,
         numbered_yaml,
         lettered_quaternions,
         printed_lists,
-        printed_matrices,
-        fanuc_program,
         headed_units,
         ros_poses,
         numbers_first,

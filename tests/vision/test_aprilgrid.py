@@ -161,15 +161,6 @@ def test_a_grid_without_squares_is_to_be_described_as_free_tags(tmp_path):
     )
 
 
-def test_kalibrs_files_are_read(tmp_path):
-    path = tmp_path / "april.yaml"
-    path.write_text(
-        "target_type: 'aprilgrid' #gridtype\ntagCols: 6\ntagRows: 5\n"
-        "tagSize: 0.088\ntagSpacing: 0.3\n"
-    )
+def test_the_grid_of_a_kalibr_target_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
-    assert read_target_description(str(path)) == expected
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected
-    path.write_text("target_type: circlegrid\n")
-    with pytest.raises(DataError, match='"aprilgrid" or "checkerboard" is needed'):
-        read_target_description(str(path))

@@ -36,7 +36,6 @@ def convert_command(options: ConvertOptions) -> None:
         target=written.target,
         intrinsics=written.intrinsics,
         images=written.images,
-        corners=written.corners,
         resolution=written.resolution,
         tip=written.tip,
     )

@@ -31,7 +31,7 @@ from visioncal.cli.options import (
 )
 from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
-from visioncal.core.choices import EXPORT_NAMES, UNITS_M, WIDEST_RAD, Convention, SolverName
+from visioncal.core.choices import UNITS_M, WIDEST_RAD, Convention, SolverName
 from visioncal.interchange.outputs import REPORT, VERIFY
 
 
@@ -201,7 +201,9 @@ class ExportOptions:
         "a file of frames."
     )
     to: str = option(
-        f"{', '.join(EXPORT_NAMES)}; --list says what each is.", default=REQUIRED, metavar="FORMAT"
+        "A format by its name, as ros, urdf, ur or easy-handeye; --list has all of them.",
+        default=REQUIRED,
+        metavar="FORMAT",
     )
     part: PartOptions
     out: Path | None = out_file()
@@ -223,11 +225,6 @@ class ExportOptions:
     )
     calibration_hash: str | None = option(
         "ur-kinematics: the hash that ur_calibration extracts.", "--hash"
-    )
-    lens: Path | None = option(
-        "The receiving program's own lens, as convert --intrinsics reads it: the "
-        "camera's transform is written for that.",
-        metavar="FILE",
     )
     force: bool = force_both()
     _list: bool = flag("List the formats.", "--list", callback=_show_formats, is_eager=True)

@@ -22,7 +22,6 @@ from visioncal.cli.options import (
 )
 from visioncal.cli.parsing import names_in, pair_in
 from visioncal.core.choices import (
-    FOREIGN_NAMES,
     PLAN_SPEED,
     POSE_FORMS,
     SIMULATED_ARMS,
@@ -482,7 +481,7 @@ class RobotPoseOptions:
 class ForeignOptions(RobotPoseOptions):
     """Options for a foreign recording."""
 
-    form: str | None = _recording(f"Its format, by name: {', '.join(FOREIGN_NAMES)}.", "--from")
+    form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
     mount: CameraMount | None = _recording("Where the camera is.")
     target: str | None = _recording(
         "A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
@@ -507,9 +506,6 @@ class ForeignOptions(RobotPoseOptions):
     )
     image_column: str | None = _camera(
         "The column or key that names each row's image.", "--image-column", "--image-key"
-    )
-    corners: Path | None = _camera(
-        "A table with the corners that another program found: mrcal's .vnl or another one."
     )
     intrinsics: str | None = _camera(
         "A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "

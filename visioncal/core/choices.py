@@ -19,18 +19,6 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # Mount of the observing device: a camera on the flange, a fixed camera, or a fixed measuring
 # instrument that observes a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
-# Formats that `convert` reads and `export` writes, in the order of their registries.
-FOREIGN_NAMES = (
-    *("industrial-calibration", "industrial-kinematics", "visp", "zivid", "easy-handeye2"),
-    *("moveit", "views", "table"),
-)
-EXPORT_NAMES = (
-    *("ros", "ros-launch", "easy-handeye", "easy-handeye2", "urdf", "camera-info"),
-    *("kalibr", "opencv", "zivid", "text", "ur", "kuka", "fanuc", "abb", "staubli"),
-    *("yaskawa", "doosan", "ur-tcp", "ur-feature", "abb-tooldata", "abb-wobjdata"),
-    *("kuka-tool", "kuka-base", "robot-urdf", "robot-dh"),
-    *("ur-kinematics", "robot-json"),
-)
 # Simulated arms, and built-in descriptions of whole cells.
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")

@@ -58,7 +58,6 @@ class FleetRow:
     drift_mm: float | None = None  # Largest thermal drift of the arm [mm].
     focal_px: float | None = None  # Mean focal length [px].
     seconds: float | None = None  # Duration of the calibration [s].
-    has_picture: bool = False  # Whether its folder has a picture.
     has_report: bool = False  # Whether its folder has a report.
     score: float = 0.0  # Largest robust standard score among its fleet; 0 within the limit.
     stands_out: str = ""  # What the score is of, in words.

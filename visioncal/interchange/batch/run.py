@@ -36,7 +36,7 @@ from visioncal.results import Calibration
 from visioncal.results.fleet import FleetRow, row_of, with_outliers
 from visioncal.session import Session
 
-ROW, PICTURE = "row.json", "picture.jpg"
+ROW = "row.json"
 _SESSION = "session.toml"
 
 
@@ -129,10 +129,7 @@ def work(job: Job) -> FleetRow:
             session = _session(job)
             calibration, written = _calibrated(job, session)
             row = row_of(job.name, str(job.session), calibration, __version__)
-            has_report = job.folder / REPORT in written.files
-            row = replace(
-                row, has_picture=_draw(job.folder, session, calibration), has_report=has_report
-            )
+            row = replace(row, has_report=job.folder / REPORT in written.files)
             # Written last: it marks the session as done.
             document = {**_made_by(job, session), "row": asdict(row)}
             write_atomically(job.folder / ROW, json.dumps(document, indent=1))
@@ -202,21 +199,6 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     result = result.with_paths(job.session, job.folder)
     written = write_outputs(job.folder, session, result, without=job.options.without)
     return result.calibration, written
-
-
-def _draw(folder: Path, session: Session, calibration: Calibration) -> bool:
-    """Writes a small picture of the first view that was used; returns whether there is one."""
-    from visioncal.present.report.thumbnails import small_picture
-
-    used = {view.view for view in calibration.views if view.used}
-    for view in session.views:
-        if view.number in used and view.image and session.images.exists(view.image):
-            picture = small_picture(session.images.read(view.image))
-            if picture is not None:
-                write_atomically(folder / PICTURE, picture)
-            return picture is not None
-    (folder / PICTURE).unlink(missing_ok=True)
-    return False
 
 
 TABLE, PAGE = "batch.parquet", "index.html"

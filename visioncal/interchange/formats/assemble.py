@@ -15,7 +15,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
-from visioncal.interchange.formats.corner_lists import with_corners
 from visioncal.interchange.formats.foreign import (
     ForeignRecording,
     ImportOptions,
@@ -29,7 +28,6 @@ from visioncal.interchange.formats.intrinsics import (
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
 from visioncal.session import columns as session_columns
-from visioncal.session.corners import CornerTable
 from visioncal.vision.boards.imaging import decode_image, looks_like_image
 
 
@@ -60,8 +58,6 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
         foreign = replace(foreign, mount=requested.mount)
     if requested.target is not None:
         foreign = replace(foreign, target=read_target_description(requested.target))
-    if requested.corners is not None:
-        foreign = with_corners(foreign, requested.corners)
     if requested.tip is not None and requested.robot_model is None:
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
     if requested.robot_model is not None:
@@ -104,17 +100,14 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     paths = _image_paths(foreign.images, foreign.name, notes)
     files = {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
     rows = _view_rows(foreign, paths)
-    has_images = bool(files or foreign.corners)
-    if has_images:
+    if files:
         document["camera"] = _camera(foreign, list(files.values()))
-    target = foreign.target if has_images else None
+    target = foreign.target if files else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[row.get(name, "") for name in names] for row in rows]
-    numbered = zip(foreign.views or range(len(rows)), foreign.corners, strict=False)
-    found = [(view, item.ids, item.px) for view, item in numbered if item is not None]
     session = Session.assemble(
         document,
         names,
@@ -122,7 +115,6 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         FileImages(files) if files else MemoryImages({}),
         target_document=target,
         robot_document=robot,
-        corners=CornerTable.of_lists(found) if foreign.corners else None,
     )
     stream = foreign.stream
     if stream is not None:
@@ -150,7 +142,7 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     foreign = _images_or_poses(foreign, notes)
     points = foreign.columns.get("point", ())
     saw = np.zeros(len(foreign.robot), dtype=bool)
-    for cells in (foreign.images, foreign.corners, points):
+    for cells in (foreign.images, points):
         saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.present
@@ -173,24 +165,23 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
 
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
     """Chooses between images and stored target poses where there are both."""
-    if not (foreign.images or foreign.corners):
+    if not foreign.images:
         return foreign
-    what = "corners" if foreign.corners else "images"
     if foreign.target is not None:
         if foreign.camera is not None:
             notes.append(
-                f"The stored poses of the target are left aside: the {what} determine them better."
+                "The stored poses of the target are left aside: the images determine them better."
             )
         return replace(foreign, camera=None)
     if foreign.camera is None:
         raise DataError(
-            f"{foreign.name} has {what}, but what target they show is not known.",
+            f"{foreign.name} has images, but what target they show is not known.",
             culprits=["target"],
             next_step="Say --target with a name in targets/, a .toml, or a description such as "
             "checkerboard_9x6_23.6mm.",
         )
-    notes.append(f"The {what} are left aside: no --target says what they show.")
-    return replace(foreign, images=(), corners=())
+    notes.append("The images are left aside: no --target says what they show.")
+    return replace(foreign, images=())
 
 
 def _view_rows(foreign: ForeignRecording, paths: Sequence[str]) -> list[dict[str, str]]:
@@ -288,12 +279,10 @@ def _camera(foreign: ForeignRecording, files: Sequence[Path]) -> dict[str, Any]:
         size = next((pair for file in files if (pair := _image_size(file)) is not None), None)
         if size is not None:
             lens["resolution"] = list(size)
-        elif "matrix" in lens or foreign.corners:
-            problem = "how large the images are is not known"
-            if "matrix" in lens:
-                problem = "the intrinsics do not say for which size of image they hold"
+        elif "matrix" in lens:
             raise DataError(
-                f"{foreign.name}: {problem}, and no image can be read.",
+                f"{foreign.name}: the intrinsics do not say for which size of image they hold, and "
+                "no image can be read.",
                 culprits=["resolution"],
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside, natural
-from visioncal.core.number_format import some_of
 from visioncal.session.images import IMAGE_ENDINGS
 
 # Length that suffices to recognise a text file.
@@ -132,26 +131,15 @@ def images_beside(
         (n,) paths, None in a row whose number no image has; and a note where order decides.
 
     Raises:
-        DataError: `chosen` has no images, several a pose, or not as many as there are rows.
+        DataError: `chosen` has no images, or not as many as there are rows.
     """
     if chosen is None and not any(is_image_name(path.name) for path in files_in(folder)):
         return (), ()
     folder = chosen or folder
     images = _images_in(folder)
-    by_number = _unique_numbers(images)
-    kinds = Counter(series_name(path) for path in images if number_in(path.name) in set(views))
-    if numbered and kinds and len(by_number) < len(images):
-        usual = [name for name, count in kinds.items() if count == max(kinds.values())]
-        if len(usual) > 1:
-            raise DataError(
-                f"{folder} has several images a pose ({some_of(usual)}, with numbers); one is "
-                "needed.",
-                culprits=usual,
-                next_step="Put those of one kind into a folder, and name it with --images.",
-            )
-        images = tuple(path for path in images if series_name(path) in usual)
-        by_number = _unique_numbers(images)
-    if numbered and len(by_number) == len(images) and by_number.keys() & set(views):
+    of_views = [image for image in images if number_in(image.name) in set(views)]
+    by_number = _unique_numbers(of_views)
+    if numbered and 0 < len(by_number) == len(of_views):
         return tuple(by_number.get(view) for view in views), ()
     first, last = images[0].name, images[-1].name
     if len(images) != len(views):

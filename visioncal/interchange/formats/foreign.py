@@ -82,7 +82,6 @@ class ImportOptions:
     target: str | None = None  # A shipped name, the path of a `.toml`, or a one-word description.
     intrinsics: str | None = None  # The path of a file with intrinsics, or `estimate`.
     images: Path | None = None
-    corners: Path | None = None  # A file with corners that another program found in the images.
     resolution: tuple[int, int] | None = None  # (width, height) [px].
     robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
     tip: str | None = None  # The frame that the poses are of.
@@ -101,14 +100,6 @@ class ForeignStream:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundCorners:
-    """Corners found by another program in one image: (k,) ids on the target, (k, 2) pixels [px]."""
-
-    ids: IntArray
-    px: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class ForeignRecording:
     """A recording in a foreign format: n rows, each an observation at one robot pose."""
 
@@ -118,9 +109,6 @@ class ForeignRecording:
     camera: PoseNumbers | None = None
     # (n,) the image of each row; None in a row without one, empty where there are none.
     images: tuple[Path | None, ...] = ()
-    # (n,) corners found by another program in each row's image; None in a row without, empty where
-    # there are none.
-    corners: tuple[FoundCorners | None, ...] = ()
     # (n, j) joint angles [rad], NaN in a row without; None where they were not recorded.
     joints_rad: FloatArray | None = None
     stamps_s: FloatArray | None = None  # (n,) times [s]; None where they were not recorded.
@@ -147,7 +135,6 @@ def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
         images=tuple(foreign.images[index] for index in rows) if foreign.images else (),
-        corners=tuple(foreign.corners[index] for index in rows) if foreign.corners else (),
         joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
         stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],
         views=tuple((foreign.views or tuple(range(count)))[index] for index in rows),

@@ -10,9 +10,8 @@ import numpy as np
 
 from visioncal.core.documents import as_numbers, is_number, mapping, number
 from visioncal.core.documents.jsons import read_arrays
-from visioncal.core.documents.structured import read_opencv, read_xml, read_yaml
+from visioncal.core.documents.structured import read_opencv, read_xml
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.boards.kind import metres
 from visioncal.vision.targets import read_target, target_from_document, target_names
@@ -49,8 +48,7 @@ def read_target_description(words: str) -> Mapping[str, Any]:
     """Reads the description of a target.
 
     Args:
-        words: A shipped name, the path of a `.toml` or of a Kalibr `.yaml`, or a one-word
-            description as in `FORMS`.
+        words: A shipped name, the path of a `.toml`, or a one-word description as in `FORMS`.
 
     Returns:
         The content of its `.toml`.
@@ -58,9 +56,8 @@ def read_target_description(words: str) -> Mapping[str, Any]:
     Raises:
         DataError: It is none of these, or describes no target.
     """
-    kalibrs = words.lower().endswith((".yaml", ".yml"))
     matches = {kind: re.fullmatch(f"{kind}_{form}", words) for kind, form in _KINDS.items()}
-    document = _of_kalibr(Path(words)) if kalibrs else None
+    document: dict[str, Any] | None = None
     for kind, match in matches.items():
         if match is not None:
             groups = match.groupdict().items()
@@ -69,7 +66,7 @@ def read_target_description(words: str) -> Mapping[str, Any]:
         if not words.lower().endswith(".toml") and words not in target_names():
             raise DataError(
                 f"There is no target {words[:80]!r}; a name is needed "
-                f"({', '.join(target_names())}), the path of a .toml or of Kalibr's .yaml, or a "
+                f"({', '.join(target_names())}), the path of a .toml, or a "
                 f"description: {FORMS}.",
                 culprits=[words[:80]],
             )
@@ -81,27 +78,6 @@ def read_target_description(words: str) -> Mapping[str, Any]:
 def target_named(words: str, name: str = "") -> Target:
     """The target of `read_target_description`; its words are its name unless another is given."""
     return target_from_document(read_target_description(words), name or words)
-
-
-def _of_kalibr(path: Path) -> dict[str, Any]:
-    """Reads a target file of Kalibr: an AprilGrid, or a checkerboard of squares."""
-    content = read_yaml(path)
-    table = DocumentTable(content if isinstance(content, dict) else {}, path.name)
-    if table.choice("target_type", ("aprilgrid", "checkerboard")) == "aprilgrid":
-        names = {"columns": "tagCols", "rows": "tagRows", "size_m": "tagSize"}
-        names["spacing"] = "tagSpacing"
-        document: dict[str, Any] = {"kind": "aprilgrid"}
-    else:
-        names = {"columns": "targetCols", "rows": "targetRows", "square_m": "rowSpacingMeters"}
-        across, down = (table.number(f"{name}SpacingMeters") for name in ("col", "row"))
-        if across != down:
-            raise table.refuse("colSpacingMeters", across, f"rowSpacingMeters, {down!r},")
-        document = {"kind": "checkerboard"}
-    return (
-        document
-        | {ours: table.number(theirs) for ours, theirs in names.items()}
-        | {ours: table.integer(names[ours], 1, 100) for ours in ("columns", "rows")}
-    )
 
 
 def target_name(document: Mapping[str, Any]) -> str | None:
@@ -122,21 +98,15 @@ _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 # Largest skew relative to the focal length; more is another camera model.
 _MOST_SKEW = 1e-6
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
-# Numbers of coefficients of OpenCV's: those beyond eight are of thin prisms and tilted sensors.
-_BROWN_COUNTS = (5, 8, 12, 14)
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
 
 
-def read_intrinsics(path: Path, most: int = 8) -> tuple[dict[str, Any], tuple[str, ...]]:
+def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics of a camera.
 
     Supports ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
     ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
     the usual names.
-
-    Args:
-        path: The file.
-        most: Most coefficients of Brown's model: 8 of the camera model here, up to 14 of OpenCV's.
 
     Returns:
         model, matrix, distortion, and resolution where the file has it; and notes on assumptions.
@@ -145,16 +115,16 @@ def read_intrinsics(path: Path, most: int = 8) -> tuple[dict[str, Any], tuple[st
         DataError: It is none of these, or has an unknown lens model.
     """
     if path.suffix.lower() == ".npz":
-        return intrinsics_from(read_arrays(path), str(path), most)
+        return intrinsics_from(read_arrays(path), str(path))
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
         if root.find("camera") is not None:
             return _visp(root, str(path)), ()
-    return intrinsics_from(read_opencv(path), str(path), most)
+    return intrinsics_from(read_opencv(path), str(path))
 
 
 def intrinsics_from(
-    content: Mapping[str, Any], where: str, most: int = 8
+    content: Mapping[str, Any], where: str
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics from a document, as `read_intrinsics` does from a file.
 
@@ -165,7 +135,7 @@ def intrinsics_from(
         return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
     inner = content.get("intrinsics")
     if isinstance(inner, Mapping):
-        return intrinsics_from(inner, f"{where}: intrinsics", most)
+        return intrinsics_from(inner, f"{where}: intrinsics")
     if {"fx", "fy", "cx", "cy"} <= content.keys():
         values = [number(content[name], f"{where}: {name}") for name in ("fx", "fy", "cx", "cy")]
         return _lens("brown", values, [], content, where), ()
@@ -187,7 +157,7 @@ def intrinsics_from(
         )
     model = _model(str(content.get("distortion_model", "plumb_bob")), where)
     matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
-    lens = _lens(model, matrix, list(flat), content, where, most)
+    lens = _lens(model, matrix, list(flat), content, where)
     return lens, notes
 
 
@@ -278,7 +248,6 @@ def _lens(
     coefficients: list[float],
     content: Mapping[str, Any],
     where: str,
-    most: int = 8,
 ) -> dict[str, Any]:
     if not (matrix[0] > 0 and matrix[1] > 0):
         raise DataError(
@@ -286,8 +255,7 @@ def _lens(
             "above 0.",
             culprits=[where],
         )
-    counts = (4,) if model == "fisheye" else tuple(n for n in _BROWN_COUNTS if n <= most)
-    count = next((n for n in counts if len(coefficients) <= n), counts[-1])
+    count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
     beyond = [coefficient for coefficient in coefficients[count:] if coefficient]
     values = np.array([*matrix, *coefficients])
     if not np.isfinite(values).all() or beyond:

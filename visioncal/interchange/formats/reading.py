@@ -1,10 +1,4 @@
-"""Reads files as rows of named values, not yet interpreted: tables, documents, arrays, and texts.
-
-Poses in texts are printed by programs, shown by pendants, or taught in robot programs.
-
-Printed poses are matrices of four lines each, below a heading; or ROS's translation [m] and
-quaternion x, y, z, w (tf_echo, tf2_echo).
-"""
+"""Reads files as rows of named values, not yet interpreted: tables, documents, arrays, lines."""
 
 import re
 from collections import Counter, defaultdict
@@ -33,14 +27,8 @@ _LAYOUTS = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16,
 _LAYOUTS |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
 _MOST_LISTED = 40
 _NORM_TOLERANCE = 0.01
-_MOST_DEG = 360.5
 # Row counts are whole and below this; seconds of an epoch are not.
 _LARGEST_COUNT = 1e6
-# Labels of alternating rows of robot and camera poses.
-_LABELS = {
-    "robot_pose": ("robot", "hand", "gripper", "flange", "tcp", "tool", "ee", "arm", "base"),
-    "camera_pose": ("camera", "cam", "eye", "target", "board", "marker", "tag", "object"),
-}
 # A pose with its covariance has fewer numbers; lists of corners and images have more.
 _MOST_NUMBERS = 200
 
@@ -137,10 +125,9 @@ class Fields:
 def fields_of_table(table: TextTable, path: Path) -> Fields:
     """Reads the columns of a table; a column of numbers in all filled cells becomes numeric.
 
-    Stacked or adjacent 4 x 4 matrices give a row each, and so do alternating rows of robot and
-    camera poses.
+    Stacked or adjacent 4 x 4 matrices give a row each.
     """
-    if matrices := _stacked_matrices(table, path) or _alternating_rows(table, path):
+    if matrices := _stacked_matrices(table, path):
         return matrices
     columns = list(zip(*table.rows, strict=True))
     texts = dict(zip(table.columns, columns, strict=True))
@@ -170,25 +157,6 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     places = tuple(f"{table.label}, matrix {at}" for at in range(1, count + 1))
     rows = {"matrix": matrices.reshape(count, 16)}
     return Fields(path.stem, path.parent, places, rows)
-
-
-def _alternating_rows(table: TextTable, path: Path) -> Fields | None:
-    """Reads alternating rows whose first cell labels them as robot or camera."""
-    labels = [row[0] for row in table.rows]
-    cells = [row[1:] for row in table.rows]
-    pair = labels[:2]
-    if len(set(pair)) < 2 or len(labels) < 4 or labels != pair * (len(labels) // 2):
-        return None
-    if is_number(pair[0]) or not all(is_number(name) for row in cells for name in row):
-        return None
-    arrays = np.array(cells, dtype=float)
-    offsets = {
-        next((name for name, words in _LABELS.items() if label.lower() in words), label): at
-        for at, label in enumerate(pair)
-    }
-    poses = {name: arrays[at::2] for name, at in offsets.items()}
-    places = tuple(table.place(at) for at in range(0, len(labels), 2))
-    return Fields(path.stem, path.parent, places, poses)
 
 
 def fields_of_records(
@@ -323,11 +291,6 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
             # A number or a time, and a position with three angles.
             time, robot = 1, 6
     pose = names[time : time + robot]
-    if robot == 6 and set(pose) <= set(fields.numbers):
-        first, last = np.abs([fields.numbers[name] for name in pose]).reshape(2, -1)
-        if np.nanmax(first) <= _MOST_DEG < np.nanmax(last):
-            # The last three are too large for angles, and the first three are not.
-            pose = pose[3:] + pose[:3]
     return {
         "time": tuple(names[:time]),
         "robot": tuple(pose),
@@ -352,24 +315,12 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     return next(named, "")
 
 
-_SEPARATORS = re.compile(r"[\s,;\[\]()]+")
-_POSE = re.compile(
-    r"- Translation: \[([^\[\]]*)\]\s+- Rotation: in Quaternion(?: \(xyzw\))? \[([^\[\]]*)\]"
-)
-_POSE_NAMES = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
-
-# Programs of FANUC, KUKA, ABB and Universal Robots.
-_PROGRAMS = (".ls", ".dat", ".src", ".mod", ".modx", ".script", ".urscript")
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *_PROGRAMS)
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".dat", ".npz", ".npy", *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
-_PROGRAM_COMMENTS = ("#", "!", ";", "&")
-_STATEMENT = re.compile(r"(?:[^\n{}]++|\{[^{}]*+\})++")
-# Poses other than of the flange or the tool at a stop.
-_NOT_A_STOP = re.compile(r"tooldata|wobjdata|set_tcp|TOOL_DATA|BASE_DATA|\bFRAME\b|offs\s*\(", re.I)
 
 
 def read_fields(path: Path) -> Fields:
@@ -383,10 +334,7 @@ def read_fields(path: Path) -> Fields:
         return fields_of_arrays(read_arrays(path), path)
     if suffix in DOCUMENTS:
         return fields_of_document(read_document(path), path)
-    if suffix in _PROGRAMS:
-        return _program(path)
-    lines = _pendant(path) or _echoed(path) or _printed(path)
-    if lines is not None:
+    if lines := _pendant(path):
         return lines
     table = read_table(path)
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
@@ -461,66 +409,6 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     return dict(sorted(rows.items()))
 
 
-def _printed(path: Path) -> Fields | None:
-    """Reads the 4 x 4 matrices of a text, a field for each heading.
-
-    None where the text has fewer than two matrices, or no heading.
-    """
-    by_heading: dict[str, list[tuple[int, list[list[float]]]]] = defaultdict(list)
-    heading, first_line = "", 0
-    rows: list[list[float]] = []
-    for at, line in enumerate(read_plain_text(path).splitlines(), start=1):
-        words = [part for part in _SEPARATORS.split(line) if part]
-        if len(words) == 4 and all(map(is_number, words)):
-            first_line = first_line if rows else at
-            rows.append([float(word) for word in words])
-        elif words:
-            # A heading without its numbering: `Pose 3:` is `Pose`.
-            named = re.findall(r"[^\W\d_]+(?:[^\W_]*[^\W\d_])?", line)
-            heading, rows = " ".join(named)[:80], []
-        if len(rows) == 4:
-            if rows[3] == [0.0, 0.0, 0.0, 1.0]:
-                by_heading[heading].append((first_line, rows))
-            rows = []
-    if sum(map(len, by_heading.values())) < 2 or not any(by_heading):
-        return None
-    counts = {name: len(matrices) for name, matrices in by_heading.items()}
-    if len(set(counts.values())) > 1:
-        listed = some_of([f"{count} under {name!r}" for name, count in counts.items()])
-        raise DataError(
-            f"{path}: matrices cannot be paired: {listed}; as many of each are needed.",
-            culprits=[*counts],
-            next_step="Remove those of views of which another is missing.",
-        )
-    first = next(iter(by_heading.values()))
-    places = tuple(f"{path.name}, line {at}" for at, _ in first)
-    numbers = {
-        name or "matrix": np.array([matrix for _, matrix in matrices]).reshape(-1, 16)
-        for name, matrices in by_heading.items()
-    }
-    return Fields(path.stem, path.parent, places, numbers)
-
-
-def _echoed(path: Path) -> Fields | None:
-    """Reads every pose printed by tf_echo; their times, once a second, are ignored."""
-    text = read_plain_text(path)
-    places, rows = list[str](), list[list[float]]()
-    for match in _POSE.finditer(text):
-        at = text.count("\n", 0, match.start()) + 1
-        places.append(f"{path.name}, line {at}")
-        numbers = re.findall(r"[^\s,]+", f"{match[1]},{match[2]}")
-        if len(numbers) != len(_POSE_NAMES) or not all(map(is_number, numbers)):
-            raise DataError(
-                f"{places[-1]}: a translation of 3 numbers and a quaternion of 4 are needed.",
-                culprits=[places[-1]],
-            )
-        rows.append([float(number) for number in numbers])
-    if not rows:
-        return None
-    columns = dict(zip(_POSE_NAMES, np.array(rows).T, strict=True))
-    return Fields(path.stem, path.parent, tuple(places), columns)
-
-
 def _pendant(path: Path) -> Fields | None:
     """Reads lines with poses in a maker's notation, each with the name of its image if it has one.
 
@@ -534,22 +422,6 @@ def _pendant(path: Path) -> Fields | None:
     # The first line may be a header.
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
     return None if first is None else _fields_of_lines(path, lines[first:])
-
-
-def _program(path: Path) -> Fields:
-    """Reads the taught poses of a robot program; its tools, bases and joint targets are skipped."""
-    text = read_plain_text(path)
-    # FANUC writes a position in several lines, between braces.
-    lines = [
-        (text.count("\n", 0, match.start()) + 1, match[0].replace("\n", " "))
-        for match in _STATEMENT.finditer(text)
-        if not match[0].lstrip().startswith(_PROGRAM_COMMENTS)
-        and _NOT_A_STOP.search(match[0]) is None
-    ]
-    poses = [line for line in lines if is_marked_pose(line[1])]
-    if not poses:
-        raise DataError(f"{path} has no taught poses that are known.", culprits=[str(path)])
-    return _fields_of_lines(path, poses)
 
 
 def _fields_of_lines(path: Path, lines: Sequence[tuple[int, str]]) -> Fields:

@@ -8,9 +8,8 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image
 from visioncal.results.evidence import ViewEvidence
-from visioncal.vision.boards.imaging import decode_image
 
-_WIDTH_PX, _SMALL_PX = 720, 240
+_WIDTH_PX = 720
 _JPEG_QUALITY, _JPEG_SIDE_PX = 78, 65_500
 # Size of a crop: factor on the corners' extent, plus a share of the image.
 _ROOM, _LEAST_SHARE = 1.25, 0.05
@@ -85,12 +84,6 @@ def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int
 def _jpeg_uri(image: Image) -> str:
     encoded = _jpeg(image, min(1.0, _WIDTH_PX / image.shape[1]))
     return "data:image/jpeg;base64," + base64.b64encode(encoded).decode("ascii")
-
-
-def small_picture(image_bytes: bytes) -> bytes | None:
-    """A small JPEG of an image for a listing; None if the bytes cannot be decoded."""
-    pixels = decode_image(image_bytes, colour=True)
-    return None if isinstance(pixels, str) else _jpeg(pixels, _SMALL_PX / pixels.shape[1])
 
 
 def _jpeg(image: Image, scale: float) -> bytes:
