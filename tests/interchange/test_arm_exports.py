@@ -106,9 +106,6 @@ def test_a_table_is_the_calibrated_arm(tmp_path, convention):
     assert off(read_back(tmp_path, "arm.toml", found.text), result) < EXACT
     # A UR's parallel axes get Hayati's form where nothing was said.
     assert tomllib.loads(found.text)["convention"] == (convention or "hayati")
-    far = [warning for warning in found.warnings if "--convention hayati" in warning]
-    # Some mrad apart, arms of 0.4 m have their common normal a hundred metres away.
-    assert bool(far) == (convention in ("standard", "modified"))
 
 
 def test_a_table_of_an_arm_without_parallel_axes_stays_in_its_form():
@@ -252,18 +249,13 @@ def test_the_file_says_where_it_comes_from(name):
 
 @pytest.mark.parametrize("name", ARM_FORMATS)
 @pytest.mark.parametrize(
-    ("source", "words"),
-    [
-        (SAMPLE, "Record q1_rad"),
-        (replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), "kept the nominal one"),
-        (alone(tool()), "Name the calibration"),
-    ],
+    "source",
+    [SAMPLE, replace(SAMPLE, arm=ArmResult(level="nominal", levels=())), alone(tool())],
     ids=["none", "nominal", "frames"],
 )
-def test_without_a_calibrated_arm_the_next_step_is_told(name, source, words):
-    with pytest.raises(DataError) as caught:
+def test_without_a_calibrated_arm_the_next_step_is_told(name, source):
+    with pytest.raises(DataError, match=r"and there is none\. .*q1_rad"):
         export(source, name)
-    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -293,7 +285,6 @@ def test_the_command_writes_the_arm_and_warns(tmp_path):
     )
     assert (done.status, done.out) == (0, ""), done.err
     assert "has no place in it" in done.err
-    assert "--convention hayati" in done.err
     # Of the session's ranges nothing is known here: what is left is that of the workspace.
     said_mm = float(done.err.replace("\n", " ").partition("least of that: ")[2].split()[0])
     q, expected = poses(load_result_or_frames(tmp_path))

@@ -115,7 +115,7 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
 @pytest.mark.parametrize(
     ("to", "selection", "words"),
     [
-        ("ros", Selection(), r"which is meant is not said.*--edge \w+_from_cam_\w+; or all"),
+        ("ros", Selection(), r"and one is written.*--edge \w+_from_cam_\w+"),
         ("ros", Selection("base_a_from_target_plate"), "its pose is needed"),
         ("ros", Selection("base_a_from_cam_tpo"), "Did you mean cam_top"),
         ("ros", Selection("all", inverse=True), "--inverse, --parent and --child are of one"),
@@ -135,7 +135,7 @@ def test_what_cannot_be_written_is_refused(to, selection, words):
 def test_the_transform_that_is_proposed_can_be_written():
     with pytest.raises(DataError) as caught:
         export(CELL, "text")
-    (edge,) = re.findall(r"--edge (\w+);", caught.value.next_step)
+    (edge,) = re.findall(r"--edge (\w+)", caught.value.next_step)
     assert export(CELL, "text", Selection(edge))
 
 

@@ -411,7 +411,7 @@ def test_what_is_wrong_alike_in_many_rows_is_said_once(folder):
     lines = error.message.splitlines()
     assert len(lines) == len(error.culprits) == 2
     assert "line 2, column image: the image 'images/0.gif'" in lines[0]
-    assert lines[0].endswith("And 11 more alike, up to views.csv, line 13.")
+    assert lines[0].endswith("And 11 more, up to views.csv, line 13, column image.")
     assert "line 14, column view: 'x' is no whole number" in lines[1]
 
 

@@ -35,7 +35,6 @@ def export_command(options: ExportOptions) -> None:
         options.part.camera,
         options.part.robot,
         options.part.target,
-        options.lens,
     )
     written = document(load_exportable(options.source), options.to, selection)
     bad = check_usable(written.verdict, "what is exported", force=options.force)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
-from visioncal.core.choices import DYNAMICS_FILE, PoseForm
+from visioncal.core.choices import PoseForm
 from visioncal.core.codec import entries, reading
 from visioncal.core.conventions import controller_form
 from visioncal.core.documents import parse_stored
@@ -405,13 +405,6 @@ class Calibration(CalibrationSections):
         file = Path(path)
         if file.is_dir():
             file = file / "calibration.json"
-            if not file.exists() and (file.parent / DYNAMICS_FILE).is_file():
-                raise DataError(
-                    f"{path} is a result of visioncal dynamics identify, and has no calibration.",
-                    culprits=[str(path)],
-                    next_step="Its report is the report.html there; name an output folder of "
-                    "visioncal calibrate here.",
-                )
         if file.suffix.lower() == ".rrd":
             raise DataError(
                 f"{path} is a recording; a calibration.json, or the folder with one, is needed.",

@@ -3,6 +3,7 @@
 What a format cannot hold of the arm is said in its comments and warnings.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,12 +100,7 @@ class ArmContent:
     @property
     def all_notes(self) -> list[str]:
         """Comment lines, with what links and offsets leave out."""
-        return [*self.notes, *([self.left_out] if self.left_out else [])]
-
-    @property
-    def left_out_warnings(self) -> tuple[str, ...]:
-        """What links and offsets leave out, as a warning."""
-        return (f"{self.left_out}.",) if self.left_out else ()
+        return [*self.notes, *filter(None, [self.left_out])]
 
     @property
     def nominal_table(self) -> DHTable:
@@ -124,19 +120,15 @@ class ArmContent:
     @property
     def left_out(self) -> str:
         """What links and offsets alone leave out, with the resulting error; empty for nothing."""
-        sag = (
-            ("its joints bend under its own weight, and under a load",)
-            if _sag_mm(self.calibration)
-            else ()
-        )
-        missing = (*unexportable_functions(self.robot), *sag)
-        if not missing:
+        if self.links is None:
             return ""
-        text = (
+        missing = [*unexportable_functions(self.robot)]
+        if _sag_mm(self.calibration):
+            missing.append("its joints bend under its own weight, and under a load")
+        return (
             f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. Its "
-            "links and offsets are those that leave the least of that"
+            f"links and offsets are those that leave the least of that: {self.links[1]}"
         )
-        return text if self.links is None else f"{text}: {self.links[1]}"
 
 
 @dataclass(frozen=True)
@@ -153,27 +145,14 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         DataError: The source has no calibrated arm, or an option does not apply to the format.
     """
     form.check(selection)
-    if not isinstance(source, Calibration):
-        why, step = "a file of frames has none", "Name the calibration instead"
-    elif source.arm is not None:
-        why = "this calibration kept the nominal one: no level of the arm's errors explained more"
-        step = (
-            "The nominal arm is what its own file says. For more than that, add stops all over the "
-            "workspace and calibrate again"
-        )
-    else:
-        why = "this calibration has none"
-        step = (
-            "Record q1_rad ... in views.csv, name [robot] model in session.toml, and run "
-            "visioncal calibrate SESSION"
-        )
-    nominal = source.robot if isinstance(source, Calibration) else None
     arm = source.arm if isinstance(source, Calibration) else None
+    nominal = source.robot if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise DataError(
-            f"{form.name} writes the calibrated arm, and {why}.",
+            f"{form.name} writes the calibrated arm, and there is none.",
             culprits=[form.name],
-            next_step=f"{step}.",
+            next_step="A calibration has one if its session has q1_rad ... and [robot] model, and "
+            "stops all over the workspace show errors of the arm.",
         )
     if selection.convention is not None and selection.convention not in CONVENTIONS:
         raise DataError(
@@ -218,9 +197,6 @@ def _sag_mm(calibration: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
 
 
-# A longer offset along an axis is an artefact of nearly parallel axes, whose common normal is far
-# away [m].
-_FAR_M = 10.0
 # Tolerance of the flange's pose, below which no note is needed [mm, deg].
 _TOLERANCE = 1e-4
 # Placeholder for an unknown hash, which no controller has.
@@ -234,49 +210,31 @@ def _write_urdf(content: ArmContent) -> str:
     return small_urdf(without_functions(content.written), content.all_notes)
 
 
-def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
-    warnings = content.left_out_warnings
-    if "urdf" not in content.nominal.document:
-        return warnings
-    tip = corrected_tip(content.nominal, content.written)
-    if tip != content.robot.tip:
-        warnings += (
-            f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link of "
-            f"its own in the file: {tip}. Poses are of that.",
-        )
-    return warnings
+def _warn_urdf(content: ArmContent) -> Iterator[str]:
+    if "urdf" in content.nominal.document:
+        tip = corrected_tip(content.nominal, content.written)
+        if tip != content.robot.tip:
+            yield (
+                f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link "
+                f"of its own in the file: {tip}. Poses are of that."
+            )
 
 
-def _warn_dh(content: ArmContent) -> tuple[str, ...]:
-    table = content.table
-    far = int(np.argmax(np.abs(table.d_m)))
-    if abs(table.d_m[far]) < _FAR_M:
-        return content.left_out_warnings
-    return (
-        *content.left_out_warnings,
-        f"d_m of {table.joint_names[far]} is {table.d_m[far]:.0f} m: its axis and a neighbour are "
-        f"nearly parallel, and the {table.convention} convention goes to their common normal. "
-        "--convention hayati does not.",
-    )
-
-
-def _warn_ur(content: ArmContent) -> tuple[str, ...]:
-    warnings = content.left_out_warnings
+def _warn_ur(content: ArmContent) -> Iterator[str]:
     difference = log(ur_flange(content.written, content.nominal_table))
     turned = np.rad2deg(np.linalg.norm(difference[:3]))
     moved = 1e3 * np.linalg.norm(difference[3:])
     if max(turned, moved) > _TOLERANCE:
-        warnings += (
+        yield (
             f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
-            "for that: a comment in the file has its pose. What sits on the flange goes behind it.",
+            "for that: a comment in the file has its pose. What sits on the flange goes behind it."
         )
     if content.calibration_hash is None:
-        warnings += (
+        yield (
             f"its hash is {_NO_HASH!r}, which no controller has: the driver will report that the "
             "calibration does not match, and go on. Give the one that ur_calibration extracts with "
-            "--hash.",
+            "--hash."
         )
-    return warnings
 
 
 ARMS = (
@@ -293,7 +251,6 @@ ARMS = (
         "[m, rad]",
         lambda content: table_toml(content.table, "visioncal", content.all_notes),
         takes=frozenset({"convention"}),
-        warn=_warn_dh,
     ),
     ArmFormat(
         "ur-kinematics",
@@ -305,7 +262,7 @@ ARMS = (
             like=content.nominal_table,
             notes=content.all_notes,
         ),
-        takes=frozenset({"hash"}),
+        takes=frozenset({"calibration_hash"}),
         warn=_warn_ur,
     ),
     ArmFormat(

@@ -3,36 +3,19 @@
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
-import cv2
-import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.number_format import did_you_mean, figure
-from visioncal.core.transforms import adjoint, invert
-from visioncal.core.types import Camera, FloatArray, Mount
-from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.core.types import FloatArray, Mount
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
-from visioncal.results.lens import image_grid, to_ray
-from visioncal.vision.camera import normalise
 
-# Coefficients of OpenCV's largest model, whose last two tilt the sensor.
-_MOST_COEFFICIENTS = 14
-# Share of the image about its centre in which both lenses are compared: at the rim neither is known
-# well where no view looked.
-_INNER = 0.5
 # Smallest rms of a lens's field that a note names [px].
 _NOTICED_PX = 0.01
-# Largest error of an inverted distortion [px]: far less than any lens is known to.
-_SAME_PX = 1e-3
-# Iterations of OpenCV's fixed point, and where it ends [plane at unit depth].
-_INVERSE = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
 Source: TypeAlias = Calibration | FrameFile
@@ -44,13 +27,8 @@ HAND_EYE: Mapping[Mount, str] = {
     "eye-to-hand": "base_from_cam",
     "instrument": "base_from_instrument",
 }
-# Parent frames by our names: flange, flange_2, ...
-_PARENTS: Mapping[Kind, re.Pattern[str]] = {
-    "tool": re.compile(r"flange(_\w+)?", re.ASCII),
-    "fixture": re.compile(r"base(_\w+)?", re.ASCII),
-}
 WORST_FIRST = ("bad", "check", "good")
-_COMMANDS: Mapping[Kind, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
+_COMMANDS: Mapping[str, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,53 +77,32 @@ class Placements:
             next_step=hint,
         )
 
-    def default(self) -> str:
-        """Name of the default transform.
-
-        Raises:
-            DataError: The source is a file of several frames, or a cell.
-        """
-        if self.mount is not None:
-            return HAND_EYE[self.mount]
-        if len(self.frames) == 1 and self.cell is None:
-            return self.frames[0]
-        if self.cell is not None:
-            frames = list(self.cell.tree.parents)
-            # Transforms of the cell itself never depend on a robot's pose.
-            example = next((name for name in self.by_name if "_from_cam" in name), "")
-            example = example or list(self.by_name)[-1]
-            raise DataError(
-                f"{self.words.capitalize()} has {', '.join(frames)}: which is meant is not said.",
-                culprits=["--edge"],
-                next_step=f"Name two of them, as --edge {example}; or all: --edge all.",
-            )
-        raise DataError(
-            f"{self.words.capitalize()} has {', '.join(self.frames) or 'no frames'}: which one is "
-            "meant is not said.",
-            culprits=self.frames,
-            next_step="Name one with --edge." if self.frames else "",
-        )
-
-    def only(self, kind: Kind) -> str:
-        """Name of the only tool or fixture.
+    def chosen(self, holds: "Holds") -> str:
+        """Name of the transform of a format, where none is stated: the only one that fits.
 
         Raises:
             DataError: There is none, or there are several.
         """
-        names = [frame for frame in self.frames if is_kind(frame, kind)]
+        wanted, names = "transform", self.frames
+        if holds == "tool" or holds == "fixture":
+            wanted, names = holds, tuple(name for name in names if is_kind(name, holds))
+        elif self.mount is not None:
+            return HAND_EYE[self.mount]
+        elif self.cell is not None:
+            # Transforms of the cell itself never depend on a robot's pose.
+            names = tuple(sorted(self.by_name, key=lambda name: "_from_cam" not in name))
         if len(names) == 1:
             return names[0]
-        if names:
-            raise DataError(
-                f"{self.words.capitalize()} has {len(names)} {kind}s: {', '.join(names)}.",
-                culprits=names,
-                next_step="Name one with --edge.",
-            )
-        others = [name for name in self.by_name if is_kind(name, kind)]
-        choose = f", or name another transform: --edge {others[0]}" if others else ""
+        has = f"it has {', '.join(names or self.by_name) or 'no frames'}"
         raise DataError(
-            f"{self.words.capitalize()} has no {kind}; it has {', '.join(self.by_name)}.",
-            next_step=f"Find one with {_COMMANDS[kind]}{choose}.",
+            f"{self.words.capitalize()} has {len(names) or 'no'} {wanted}s, and one is written: "
+            f"{has}.",
+            culprits=names or ["--edge"],
+            next_step=f"Name it, as --edge {names[0]}."
+            if names
+            else f"Find one with {_COMMANDS[holds]}, or name another transform with --edge."
+            if holds in _COMMANDS
+            else "",
         )
 
 
@@ -157,7 +114,9 @@ def ends_of(name: str) -> tuple[str, str]:
 
 def is_kind(name: str, kind: Kind) -> bool:
     """Whether a transform is a pose on the flange, or in the base."""
-    return _PARENTS[kind].fullmatch(ends_of(name)[0]) is not None
+    # The parent by our names: flange, flange_2, ...
+    wanted = "flange" if kind == "tool" else "base"
+    return ends_of(name)[0].partition("_")[0] == wanted
 
 
 def placements(source: Source, camera: str | None = None) -> Placements:
@@ -230,99 +189,13 @@ def _of_frame(frame: Frame) -> Placement:
     return Placement(frame.edge, origin, frame.verdict, frame.oriented)
 
 
-def with_lens(source: Source, available: Placements, name: str, path: Path) -> Placements:
-    """The transforms, with the camera's for another lens model of the same camera.
-
-    The ray of the image's centre is the same for any lens model (`Calibration.ray_frame`), and so
-    is, for the roll about it, what the rays around it point at.
-
-    Args:
-        source: The calibration.
-        available: Its transforms.
-        name: The one that is exported.
-        path: The other lens, in any form of `read_intrinsics`, with up to 14 coefficients.
-
-    Raises:
-        DataError: The transform is not that of the only camera, or the lens is not of that camera.
-    """
-    frame = source.ray_frame if isinstance(source, Calibration) and source.cell is None else None
-    lens, mount = available.lens, available.mount
-    if frame is None or lens is None or mount is None or name != HAND_EYE[mount]:
-        raise DataError(
-            "--lens is of the transform of one calibrated camera on its robot, or in its base, and "
-            f"{name} of {available.words} is none.",
-            culprits=["--lens"],
-            next_step="Leave it out; of a whole cell, name --robot, --camera and --target.",
-        )
-    stated, _ = read_intrinsics(path, _MOST_COEFFICIENTS)
-    resolution = tuple(stated.get("resolution", lens.camera.resolution))
-    if resolution != lens.camera.resolution:
-        raise DataError(
-            f"{path} is of images of {resolution[0]} x {resolution[1]} px; the calibrated camera "
-            "has {} x {} px.".format(*lens.camera.resolution),
-            culprits=["--lens"],
-            next_step="Name the lens of the same camera, with the same binning and region.",
-        )
-    px = np.concatenate([frame.px[None], image_grid(lens.camera, _INNER)])
-    own, other = normalise(lens.camera, lens.in_model(px)), _rays(stated, lens.camera, px)
-    if not np.isfinite([own, other]).all():
-        raise DataError(
-            f"{path}: its distortion cannot be inverted in the middle of the image.",
-            culprits=["--lens"],
-            next_step="Name the lens of this camera.",
-        )
-    turns = [np.eye(4), np.eye(4)]
-    around = []
-    for turn, rays in zip(turns, (own, other), strict=True):
-        turn[:3, :3] = to_ray(rays[0])
-        seen = np.column_stack([rays, np.ones(len(rays))]) @ turn[:3, :3]
-        around.append((seen[:, 0] + 1j * seen[:, 1]) / seen[:, 2])
-    roll = np.eye(4)
-    angle = np.angle(np.vdot(around[1], around[0]))
-    roll[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
-    remaining = np.abs(around[0] - np.exp(1j * angle) * around[1])
-    remaining_px = lens.camera.matrix[0] * np.sqrt(np.mean(remaining**2) / 2.0)
-    back = roll @ invert(turns[1])
-    carried = adjoint(invert(back))
-    edge = Edge(
-        frame.transform.matrix @ back, np.asarray(carried @ frame.transform.covariance @ carried.T)
-    )
-    placement = available.by_name[name]
-    own_lens = Condition(
-        "own-lens",
-        f"The transform is for the lens of {path.name}, which differs from the calibration's own "
-        f"by {figure(remaining_px)} px rms in the inner half of the image.",
-        "Use it with that lens only.",
-    )
-    others = (condition for condition in placement.conditions if condition.kind != "own-lens")
-    placed = replace(placement, edge=edge, conditions=(own_lens, *others))
-    # The calibration's own lens does not go with it.
-    return replace(available, by_name={**available.by_name, name: placed}, lens=None)
-
-
-def _rays(stated: dict[str, object], camera: Camera, px: FloatArray) -> FloatArray:
-    """(n, 2) rays of a stated lens, at unit depth; NaN where it has none."""
-    matrix, distortion = (np.array(stated[name], dtype=float) for name in ("matrix", "distortion"))
-    if stated["model"] == "fisheye":
-        return normalise(Camera("fisheye", camera.resolution, matrix, distortion), px)
-    fx, fy, cx, cy = matrix
-    square = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    plane = np.eye(3)
-    rays = cv2.undistortPointsIter(px[:, None], square, distortion, plane, plane, _INVERSE)[:, 0]
-    points = np.column_stack([rays, np.ones(len(rays))])
-    shown = cv2.projectPoints(points, np.zeros(3), np.zeros(3), square, distortion)[0][:, 0]
-    found = np.linalg.norm(shown - px, axis=1) < _SAME_PX
-    return np.where(found[:, None], rays, np.nan)
-
-
-_OF_LENS = "it goes with the lens of that calibration: for other intrinsics, export it with --lens"
+_OF_LENS = "it goes with the lens of that calibration, and with no other"
 # Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the
 # base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
-# Options that apply to formats: to all of transforms, and to some formats.
-OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child", "lens"]
-Takes: TypeAlias = OfTransforms | Literal["number", "load", "convention", "hash"]
-_OPTIONS: Mapping[Takes, str] = {"load": "--mass-kg and --cog-mm"}
+# Fields of a selection that say which part of a cell is meant, and those of any transform.
+_PARTS, OF_TRANSFORMS = ("camera", "robot", "target"), ("edge", "inverse", "parent", "child")
+_OPTIONS = {"load": "--mass-kg and --cog-mm", "calibration_hash": "--hash"}
 _T = TypeVar("_T")
 
 
@@ -353,9 +226,6 @@ class Selection:
     # Which robot of a cell: its part is exported as of one camera and robot.
     robot: str | None = None
     target: str | None = None  # Which target of a cell; likewise.
-    # A file with the lens of the receiving program, for which the camera's transform is written;
-    # None for the calibration's own.
-    lens: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,7 +291,7 @@ class Format(Generic[_T]):
     name: str  # Its name on the command line.
     words: str  # Its description with its reader and units, in one line.
     write: Callable[[_T], str]  # Builds the document.
-    takes: frozenset[Takes] = frozenset()  # Options that apply to it; see `check`.
+    takes: frozenset[str] = frozenset()  # Fields of the selection that apply to it; see `check`.
     # What its user should know or do before using the document, in sentences.
     warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
 
@@ -435,19 +305,8 @@ class Format(Generic[_T]):
         Raises:
             DataError: An option does not apply.
         """
-        options: Mapping[Takes, object] = {
-            "edge": selection.edge,
-            "inverse": selection.inverse,
-            "parent": selection.parent,
-            "child": selection.child,
-            "number": selection.number,
-            "load": selection.load,
-            "convention": selection.convention,
-            "hash": selection.calibration_hash,
-            "lens": selection.lens,
-        }
-        given = [name for name, option in options.items() if option not in (None, False)]
-        unused = [name for name in given if name not in (*self.takes, *also)]
+        given = [name for name, option in vars(selection).items() if option not in (None, False)]
+        unused = [name for name in given if name not in (*self.takes, *also, *_PARTS)]
         if unused:
             raise DataError(
                 f"{self.name} has no place for "
@@ -464,10 +323,8 @@ class ExportFormat(Format[Content]):
     holds: Holds = "any edge"
     # Its names of our frames; a frame that is missing keeps our name.
     frames: Mapping[str, str] = field(default_factory=dict)
-    counterpart: str = ""  # The maker's format of fixtures, for one of tools; and vice versa.
     # Builds the document of all transforms of a cell; None where it holds one.
     write_all: Callable[[Sequence[Content]], str] | None = None
-    carries_lens: bool = False  # Whether the camera's own lens is written with its transform.
 
 
 def numbers(values: FloatArray) -> list[float]:
@@ -484,6 +341,12 @@ def rows(matrix: FloatArray) -> list[list[float]]:
 def comments(mark: str, lines: Iterable[str]) -> str:
     """Writes lines as comments, each behind `mark`; no text can end its comment early."""
     return "".join(f"{mark} {one_line(line)}\n" for line in lines)
+
+
+def xml_comments(indent: str, lines: Iterable[str]) -> str:
+    """Writes lines as comments of XML, which end at two hyphens."""
+    plain = (re.sub("-(?=-)", "- ", one_line(line)) for line in lines)
+    return "".join(f"{indent}<!-- {line} -->\n" for line in plain)
 
 
 def yaml_text(document: dict[str, Any], *, short_lists: bool = False) -> str:

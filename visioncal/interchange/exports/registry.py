@@ -1,9 +1,7 @@
 """All export formats, and the selection of content for them."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import numpy as np
 
@@ -15,18 +13,15 @@ from visioncal.dynamics import Identified, judge
 from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
 from visioncal.interchange.exports.content import (
     HAND_EYE,
+    OF_TRANSFORMS,
     WORST_FIRST,
     Content,
     ExportFormat,
-    Kind,
-    OfTransforms,
     Placements,
     Selection,
     Source,
-    ends_of,
     is_kind,
     placements,
-    with_lens,
 )
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
@@ -83,11 +78,10 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     """
     by_name = {form.name: form for form in EXPORT_FORMATS}
     if to not in by_name:
-        hint = did_you_mean(to, by_name)
         raise DataError(
             f"There is no format named {to!r}; the names are {', '.join(by_name)}.",
             culprits=[to],
-            next_step=f"{hint} visioncal export --list says what each is.".strip(),
+            next_step=did_you_mean(to, by_name) or "visioncal export --list says what each is.",
         )
     form = by_name[to]
     if isinstance(source, Identified):
@@ -95,7 +89,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     source, selection = _robot_part(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
-        omitted = tuple(f"{name}." for name in arm.omitted)
+        omitted = (f"{words}." for words in (arm.left_out, *arm.omitted) if words)
         return Document(form.write(arm), arm.calibration.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
         available = placements(source, selection.camera)
@@ -105,8 +99,6 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
             why = f"{form.name} holds one transform"
         elif selection.inverse or selection.parent is not None or selection.child is not None:
             why = "--inverse, --parent and --child are of one transform"
-        elif selection.lens is not None:
-            why = "--lens is of one camera's transform"
         elif available.cell is None:
             why = f"{available.words} is of no whole cell"
         if why:
@@ -158,20 +150,33 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """
     available = placements(source, selection.camera)
     _check_takes(form, selection)
-    for words, step in _unheld(form, selection, available):
-        raise DataError(f"{form.name} {words}.", culprits=[form.name], next_step=step)
     name = selection.edge
+    if form.holds in ("lens", "hand-eye"):
+        _check_camera(form, selection, available)
     if form.holds == "tool" or form.holds == "fixture":
-        name = available.only(form.holds) if name is None else name
+        name = available.chosen(form.holds) if name is None else name
         available.find(name)
-        _check_kind(form, form.holds, name, inverse=selection.inverse)
+        if selection.inverse or not is_kind(name, form.holds):
+            maker = form.name.partition("-")[0]
+            others = (
+                other.name
+                for other in ROBOTS
+                if other.holds not in ("any edge", form.holds) and other.name.startswith(maker)
+            )
+            what = f"the inverse of {name}" if selection.inverse else name
+            parent = "flange" if form.holds == "tool" else "base"
+            raise DataError(
+                f"{form.name} writes a {form.holds}, {parent}_from_*, and {what} is none.",
+                culprits=[name],
+                next_step="Leave --inverse out."
+                if selection.inverse
+                else f"Choose another format, as --to ros or --to {next(others)}.",
+            )
     elif name is None and form.holds == "lens" and available.cell is not None:
         frame = next(name for name, lens in available.lenses.items() if lens is available.lens)
         name = f"{available.cell.tree.parents[frame]}_from_{frame}"
     elif name is None:
-        name = available.default()
-    if selection.lens is not None:
-        available = with_lens(source, available, name, selection.lens)
+        name = available.chosen(form.holds)
     return _content(form, selection, available, name)
 
 
@@ -184,15 +189,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         turned = adjoint(edge.matrix)
         edge = Edge(invert(edge.matrix), np.asarray(turned @ edge.covariance @ turned.T))
         name, frames = f"inverse of {name}", (frames[1], frames[0])
-    # The poses of tools, fixtures and targets depend on no convention of a lens.
-    by_lens = any(frame.startswith("cam") for frame in frames) and not (
-        form.carries_lens and available.lens is not None
-    )
-    conditions = tuple(
-        condition
-        for condition in placement.conditions
-        if form.holds != "lens" and (by_lens or condition.kind != "own-lens")
-    )
+    conditions = () if form.holds == "lens" else placement.conditions
     given = (selection.parent, selection.child)
     parent, child = (
         form.frames.get(frame, frame) if stated is None else stated
@@ -231,24 +228,8 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     )
 
 
-def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> None:
-    """Refuses a tool as a fixture, a fixture as a tool, and the inverse of either."""
-    if is_kind(name, kind) and not inverse:
-        return
-    wanted = "a tool, flange_from_*" if kind == "tool" else "a fixture, base_from_*"
-    other: Kind = "fixture" if kind == "tool" else "tool"
-    if inverse:
-        what, step = f"the inverse of {name} is none", "Leave --inverse out"
-    elif is_kind(name, other):
-        what, step = f"{name} is a {other}", f"Write it with --to {form.counterpart}"
-    else:
-        what = f"{name} has its parent in {ends_of(name)[0]}"
-        step = "Choose a format of any poses for it, as --to ros"
-    raise DataError(f"{form.name} writes {wanted}; {what}.", culprits=[name], next_step=f"{step}.")
-
-
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
-    form.check(selection, get_args(OfTransforms))
+    form.check(selection, OF_TRANSFORMS)
     if selection.number is not None and selection.number < 1:
         raise DataError(
             f"The number is {selection.number}; controllers count tools and bases from 1.",
@@ -264,30 +245,21 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
         )
 
 
-def _unheld(
-    form: ExportFormat, selection: Selection, available: Placements
-) -> Iterator[tuple[str, str]]:
-    """Why a format of the camera cannot hold a selection, and what to do."""
-    of_lens = form.holds == "lens"
-    if not of_lens and form.holds != "hand-eye":
-        return
-    in_cell = of_lens and available.cell is not None
-    if not in_cell and (available.mount is None or available.mount == "instrument"):
+def _check_camera(form: ExportFormat, selection: Selection, available: Placements) -> None:
+    """Refuses what a format of the camera, or of its transform, cannot hold."""
+    of_lens, cell = form.holds == "lens", available.cell
+    why, step = "", ""
+    if not (of_lens and cell is not None) and available.mount in (None, "instrument"):
+        why = f"holds the camera, and {available.words} has none"
         step = "Name the calibration instead, or choose a format of poses: --to ros."
-        yield f"holds the camera, and {available.words} has none", step
-    of_transform = (selection.edge, selection.parent, selection.lens)
-    if of_lens and (selection.inverse or any(option is not None for option in of_transform)):
-        yield (
-            "holds the lens and no transform: --edge, --inverse, --parent and --lens do not go "
-            "with it",
-            "Leave them out; --child names the camera.",
-        )
-    if in_cell and available.lens is None:
-        names = ", ".join(available.lenses) or "none"
-        step = "Name one with --camera." if available.lenses else ""
-        yield f"holds one camera; this cell has {names}", step
-    if not of_lens and (selection.inverse or selection.edge not in (None, *HAND_EYE.values())):
-        yield (
-            "holds the camera's pose on the flange or in the base, and nothing else",
-            "Leave --edge and --inverse out, or choose --to ros.",
-        )
+    elif of_lens and (selection.inverse or selection.edge or selection.parent):
+        why = "holds the lens and no transform: --edge, --inverse and --parent do not go with it"
+        step = "Leave them out; --child names the camera."
+    elif of_lens and cell is not None and available.lens is None:
+        why = f"holds one camera; this cell has {', '.join(available.lenses) or 'none'}"
+        step = "Name one with --camera."
+    elif not of_lens and (selection.inverse or selection.edge not in (None, *HAND_EYE.values())):
+        why = "holds the camera's pose on the flange or in the base, and nothing else"
+        step = "Leave --edge and --inverse out, or choose --to ros."
+    if why:
+        raise DataError(f"{form.name} {why}.", culprits=[form.name], next_step=step)

@@ -7,13 +7,12 @@ not every language reads an exponent.
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import fixed
-from visioncal.interchange.exports.content import Content, ExportFormat, comments
+from visioncal.interchange.exports.content import Content, ExportFormat, Holds, comments
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
@@ -35,31 +34,6 @@ _LANGUAGES: Mapping[str, tuple[str, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class _Identifiers:
-    """Rules of a language for variable names."""
-
-    language: str
-    shape: re.Pattern[str]  # Pattern of a valid name.
-    needed: str  # The same in words.
-    taken: frozenset[str]  # Reserved words; lower case where the language ignores case.
-    cased: bool  # Whether it distinguishes upper and lower case.
-
-    def check(self, name: str) -> str:
-        """Returns a name after checking that it is valid for a variable."""
-        if not self.shape.fullmatch(name):
-            wrong = f"{self.needed}, are needed"
-        elif (name if self.cased else name.lower()) in self.taken:
-            wrong = "it is the language's own"
-        else:
-            return name
-        raise DataError(
-            f"{name!r} cannot be a name in {self.language}: {wrong}.",
-            culprits=[name],
-            next_step="Choose another with --child.",
-        )
-
-
 _RAPID_WORDS = """
     tool0 wobj0 load0
     alias and backward case connect const default div do else elseif endfor endfunc endif endmodule
@@ -71,30 +45,39 @@ _URSCRIPT_WORDS = """
     and break continue def elif else end enter_critical exit_critical False global halt if in join
     kill local not or pause return run sec struct thread True while xor
 """
-_IDENTIFIERS: Mapping[str, _Identifiers] = {
-    # ABB, "RAPID kernel", lexical elements: identifiers of up to 32 characters, case ignored, and
-    # the reserved words. tool0, wobj0 and load0 are the system's own and cannot be changed.
-    "abb": _Identifiers(
+# By language: its name, the pattern of a variable's name and the same in words, and the words that
+# it reserves. ABB, "RAPID kernel", lexical elements: case is ignored, and tool0, wobj0 and load0
+# are the system's own. Universal Robots, script manual: the keywords.
+_IDENTIFIERS: Mapping[str, tuple[str, re.Pattern[str], str, frozenset[str]]] = {
+    "abb": (
         "RAPID",
         re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}", re.ASCII),
         "a letter first, then letters, digits and _, 32 in all",
         frozenset(_RAPID_WORDS.split()),
-        cased=False,
     ),
-    # Universal Robots, script manual, "Numbers, Variables, and Types", "Flow of Control", "Threads"
-    # and "Secondary Programs": the keywords.
-    "ur": _Identifiers(
+    "ur": (
         "URScript",
         re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII),
         "a letter or _ first, then letters, digits and _",
         frozenset(_URSCRIPT_WORDS.split()),
-        cased=True,
     ),
 }
 
 
+def _identifier(language: str, name: str) -> str:
+    """Returns a name after checking that a variable can have it; raises DataError."""
+    title, shape, needed, taken = _IDENTIFIERS[language]
+    if shape.fullmatch(name) and not {name, name.lower() if language == "abb" else name} & taken:
+        return name
+    raise DataError(
+        f"{name!r} cannot be a name in {title}: {needed}, are needed, and no word of its own.",
+        culprits=[name],
+        next_step="Choose another with --child.",
+    )
+
+
 def _write(language: str, statement: str, content: Content) -> str:
-    """Writes a statement: {pose}, {child}, {load}, {active} and {index} are filled in."""
+    """Writes a statement: {pose}, {child}, {load}, {active} and {number} are filled in."""
     form, (mark, shape) = POSE_FORMS[language], _LANGUAGES[language]
     pose = write_pose(content.matrix, form)
     decimals = _ROTATION_DECIMALS.get(form.rotation, _DEGREE_DECIMALS)
@@ -107,12 +90,12 @@ def _write(language: str, statement: str, content: Content) -> str:
         centre = ",".join(fixed(value, 6) for value in content.load.centre_mm)
     text = statement.format(
         pose=shape.format(*numbers),
-        child=_IDENTIFIERS[language].check(content.child) if "{child}" in statement else "",
+        child=_identifier(language, content.child) if "{child}" in statement else "",
         # `loaddata`: the centre of mass is in the flange's frame [mm]; its axes and moments of
         # inertia are those of a point mass.
         load=f"[{mass},[{centre}],[1,0,0,0],0,0,0]",
         active="$" if content.number is None else "",
-        index="" if content.number is None else f"_DATA[{content.number}]",
+        number="" if content.number is None else f"_DATA[{content.number}]",
     )
     return f"{comments(mark, content.notes) if mark else ''}{text}\n"
 
@@ -126,6 +109,13 @@ def _warn_of_load(content: Content) -> Iterable[str]:
         )
 
 
+# Formats of poses; and those of tools and fixtures: name, beginning with the language, what it
+# holds, statement, and description. A tool for Universal Robots (script manual, `set_tcp`) is
+# without the name argument of newer controllers, so that older ones read it, too; programs can use
+# a variable of type pose like one of PolyScope's features. RAPID reference, data types: `tooldata`
+# has robhold, tframe and tload; `wobjdata` robhold, ufprog, ufmec, uframe and oframe: a fixed user
+# frame, with the object frame at its origin. KUKA, system variables: an entry of $CONFIG.DAT, or
+# the active frame.
 _POSES = {
     "ur": "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]",
     "kuka": "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]",
@@ -135,65 +125,55 @@ _POSES = {
     "yaskawa": "Yaskawa: X,Y,Z,Rx,Ry,Rz as in a job [mm, deg]",
     "doosan": "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
 }
+_FRAMES: tuple[tuple[str, Holds, str, str], ...] = (
+    (
+        "ur-tcp",
+        "tool",
+        "set_tcp({pose})",
+        "a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]",
+    ),
+    (
+        "ur-feature",
+        "fixture",
+        "global {child} = {pose}",
+        "a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]",
+    ),
+    (
+        "abb-tooldata",
+        "tool",
+        "PERS tooldata {child}:=[TRUE,{pose},{load}];",
+        "a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]",
+    ),
+    (
+        "abb-wobjdata",
+        "fixture",
+        'PERS wobjdata {child}:=[FALSE,TRUE,"",{pose},[[0,0,0],[1,0,0,0]]];',
+        "a fixture for ABB: PERS wobjdata [mm, quaternion w first]",
+    ),
+    (
+        "kuka-tool",
+        "tool",
+        "{active}TOOL{number}={pose}",
+        "a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]",
+    ),
+    (
+        "kuka-base",
+        "fixture",
+        "{active}BASE{number}={pose}",
+        "a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]",
+    ),
+)
 ROBOTS = (
     *(ExportFormat(name, words, partial(_write, name, "{pose}")) for name, words in _POSES.items()),
-    ExportFormat(
-        "ur-tcp",
-        "a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]",
-        # Script manual, module internals, `set_tcp`; without the name argument of newer
-        # controllers, so that older ones read it, too.
-        partial(_write, "ur", "set_tcp({pose})"),
-        holds="tool",
-        counterpart="ur-feature",
-    ),
-    ExportFormat(
-        "ur-feature",
-        "a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]",
-        # PolyScope's features are entered by hand; programs can use a variable of type pose like a
-        # feature, as in pose_trans (script manual, "Numbers, Variables, and Types" and "Scoping
-        # rules").
-        partial(_write, "ur", "global {child} = {pose}"),
-        holds="fixture",
-        counterpart="ur-tcp",
-    ),
-    ExportFormat(
-        "abb-tooldata",
-        "a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]",
-        # robhold, tframe, tload (RAPID reference, data types, `tooldata`).
-        partial(_write, "abb", "PERS tooldata {child}:=[TRUE,{pose},{load}];"),
-        holds="tool",
-        takes=frozenset({"load"}),
-        warn=_warn_of_load,
-        counterpart="abb-wobjdata",
-    ),
-    ExportFormat(
-        "abb-wobjdata",
-        "a fixture for ABB: PERS wobjdata [mm, quaternion w first]",
-        # robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed
-        # user frame, with the object frame at its origin.
-        partial(
-            _write,
-            "abb",
-            'PERS wobjdata {child}:=[FALSE,TRUE,"",{pose},[[0,0,0],[1,0,0,0]]];',
-        ),
-        holds="fixture",
-        counterpart="abb-tooldata",
-    ),
-    # An entry of $CONFIG.DAT, or the active frame (KUKA, system variables).
-    ExportFormat(
-        "kuka-tool",
-        "a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]",
-        partial(_write, "kuka", "{active}TOOL{index}={pose}"),
-        holds="tool",
-        takes=frozenset({"number"}),
-        counterpart="kuka-base",
-    ),
-    ExportFormat(
-        "kuka-base",
-        "a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]",
-        partial(_write, "kuka", "{active}BASE{index}={pose}"),
-        holds="fixture",
-        takes=frozenset({"number"}),
-        counterpart="kuka-tool",
+    *(
+        ExportFormat(
+            name,
+            words,
+            partial(_write, name.partition("-")[0], statement),
+            takes=frozenset(mark for mark in ("number", "load") if f"{{{mark}}}" in statement),
+            warn=_warn_of_load if "{load}" in statement else lambda _: (),
+            holds=holds,
+        )
+        for name, holds, statement, words in _FRAMES
     ),
 )

@@ -7,7 +7,6 @@ UR's `base_link` by 180 degrees about z. Our camera frame, z forward and x right
 optical frame.
 """
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -25,6 +24,7 @@ from visioncal.interchange.exports.content import (
     comments,
     numbers,
     rows,
+    xml_comments,
     yaml_text,
 )
 from visioncal.vision.camera import matrix_3x3
@@ -176,7 +176,6 @@ FILES = (
         "OpenCV's FileStorage: transform, R, t and any lens [m]",
         _write_opencv,
         warn=_warn_of_field,
-        carries_lens=True,
     ),
     ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid),
     ExportFormat(
@@ -216,14 +215,10 @@ def _write_urdf_all(contents: Sequence[Content]) -> str:
 
 
 def _urdf_joint(content: Content) -> str:
-    # XML ends a comment at two hyphens.
-    notes = "".join(
-        f"  <!-- {re.sub('-(?=-)', '- ', one_line(note))} -->\n" for note in _ros_notes(content)
-    )
     pose = [repr(number) for number in numbers(write_pose(content.matrix, POSE_FORMS["rpy"]))]
     joint = f"{content.parent}-{content.child}".replace("/", "_")
     return (
-        f"{notes}"
+        f"{xml_comments('  ', _ros_notes(content))}"
         f'  <link name="{content.child}"/>\n'
         f'  <joint name="{joint}" type="fixed">\n'
         f'    <parent link="{content.parent}"/>\n'
