@@ -253,6 +253,15 @@ def kuka_base(text):
     return pose
 
 
+def mujoco(text):
+    """The camera's or the second site's place on the body; a camera of MuJoCo looks along -z."""
+    *_, element = ET.fromstring(text).find("worldbody/body")
+    w, *vector = map(float, element.get("quat").split())
+    turned = np.diag([1.0, -1.0, -1.0]) if element.tag == "camera" else np.eye(3)
+    position = [float(word) for word in element.get("pos").split()]
+    return transform(of_quaternion(*vector, w) @ turned, position)
+
+
 # By the format's name: every format that holds a tool, and every one that holds a fixture.
 TOOL_READERS = {
     "ur-tcp": ur_tcp,
@@ -278,6 +287,7 @@ READERS = {
     "opencv": opencv,
     "zivid": zivid,
     "text": plain,
+    "mujoco": mujoco,
     "ur": ur,
     "kuka": kuka,
     "fanuc": fanuc,

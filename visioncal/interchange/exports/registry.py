@@ -23,6 +23,7 @@ from visioncal.interchange.exports.content import (
     is_kind,
     placements,
 )
+from visioncal.interchange.exports.mujoco import MUJOCO
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
 from visioncal.results import Calibration, Edge, Verdict
@@ -31,6 +32,7 @@ from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ROS_FORMATS,
     *FILES,
+    MUJOCO,
     *ROBOTS,
     *ARMS,
 )
