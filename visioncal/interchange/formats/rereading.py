@@ -10,6 +10,7 @@ import numpy as np
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.guess.readings import Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
+    chain_poses,
     guess_from_camera_poses,
     numbers_in,
     with_camera_poses,
@@ -17,9 +18,9 @@ from visioncal.calibration.pipeline.guess_inputs import (
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
-from visioncal.core.types import MOUNTS, Progress
+from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
 from visioncal.interchange.formats.foreign import ForeignRecording
 from visioncal.session import Session, Stream
@@ -38,11 +39,15 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
+# Least number and correlation of pose steps by which joints and poses are of one log.
+_FEWEST_STEPS, _LEAST_CORRELATION = 4, 0.9
 # Largest size of a printed square.
 _LARGEST_MM = 1e3 * LARGEST_M
 # Rotations with larger numbers are in degrees [rad].
 _LARGEST_RAD = 7.0
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
+# Units of a board's size that is too large for metres, the most likely first.
+_BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -86,8 +91,8 @@ class DoubtfulSession:
 def load_for_rereading(path: Path) -> DoubtfulSession:
     """Loads a session for rereading, even where its poses or its board's size are invalid.
 
-    A board too large for metres is read in millimetres; positions and rotations may be in columns
-    or forms that sessions do not have.
+    A board too large for metres is read in the unit with which the chain closes, else in
+    millimetres; positions and rotations may be in columns or forms that sessions do not have.
 
     Raises:
         DataError: It is no session.
@@ -103,10 +108,25 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
     side = next((number for number in numbers if LARGEST_M < number < _LARGEST_MM), None)
     if side is None:
         return DoubtfulSession(Session.load(path, table=plain), robot)
-    target = _scaled(stated_target, UNITS_M["mm"])
-    session = Session.load(path, target_document=target, table=plain)
-    note = f"{name} cannot be in metres: {side:g} is read as {side:g} mm."
-    return DoubtfulSession(replace(session, warnings=(note, *session.warnings)), robot)
+    by_unit = {}
+    for unit in _BOARD_UNITS:
+        if UNITS_M[unit] * side <= LARGEST_M:
+            target = _scaled(stated_target, UNITS_M[unit])
+            by_unit[unit] = Session.load(path, target_document=target, table=plain)
+    scores = {unit: _closing_score(session, robot) for unit, session in by_unit.items()}
+    unit = min(scores, key=lambda index: scores[index])
+    note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
+    return DoubtfulSession(replace(by_unit[unit], warnings=(note, *by_unit[unit].warnings)), robot)
+
+
+def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
+    """Score of the chain's closure as declared; infinite where it does not close."""
+    try:
+        declared = DoubtfulSession(session, robot).guess().declared
+    except VisioncalError:
+        # The candidate reading that is then tried reports the error.
+        return np.inf
+    return declared.fit.score if declared.fit.closes else np.inf
 
 
 def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
@@ -181,10 +201,11 @@ def reread(
     robot = doubtful.robot or numbers_in(session, POSE)
     reading = candidate.hypothesis
     _check_applies(candidate, session, robot)
-    # Joints and poses of a row are of one log.
-    names, order = joint_columns(session.columns), reading.rows(len(cells))
-    joints = [{name: cells[at][name] if at >= 0 else "" for name in names} for at in order]
-    _replace_cells(cells, joints, names)
+    if _is_one_log(chain_poses(session), robot):
+        names = joint_columns(session.columns)
+        order = reading.rows(len(cells))
+        joints = [{name: cells[at][name] if at >= 0 else "" for name in names} for at in order]
+        _replace_cells(cells, joints, names)
     if robot.present.any():
         _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
     if camera.present.any():
@@ -254,6 +275,22 @@ def _check_applies(candidate: Candidate, session: Session, robot: PoseNumbers) -
             culprits=[candidate.words],
             next_step="Check the robot's model, its tip, and the camera's poses.",
         )
+
+
+def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:
+    """Whether joint angles and poses of a row belong together, and are reordered together."""
+    # Without a robot model this cannot be checked, and one log is more likely.
+    if chain is None or not robot.present.any():
+        return True
+    # Other units or frames change all rows alike, so the steps between rows are compared.
+    steps = [
+        np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        for positions in (chain[:, :3, 3], robot.positions)
+    ]
+    finite = np.isfinite(steps).all(axis=0)
+    if finite.sum() < _FEWEST_STEPS:
+        return True
+    return bool(np.corrcoef(steps[0][finite], steps[1][finite])[0, 1] > _LEAST_CORRELATION)
 
 
 def _replace_cells(
