@@ -146,8 +146,8 @@ def test_of_a_fixture(place):
         done = visioncal(*words)
         assert done.status == 0
         (again,) = printed_commands(done.said)
-        # The advice's value stands in the place of what was typed.
-        assert again.count("--touch-noise-mm") == ("--touch-noise" in words[-1] + words[-2])
+        # The advice's value stands behind what was typed, and counts.
+        assert ("--touch-noise-mm" in again) == ("--touch-noise" in words[-1] + words[-2])
         # That of a value as one word is that of two.
         if "bin" not in words:
             assert list(failures(done.said)) == []
