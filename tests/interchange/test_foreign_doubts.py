@@ -1,7 +1,6 @@
 """What recordings of others leave open or get wrong: found, told, or refused with a next step."""
 
 import json
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from support.foreign_samples import (
     CAM_FROM_TARGET,
     CHARUCO,
     COUNT,
-    halcon,
     industrial,
     picture,
     quaternions,
@@ -309,13 +307,3 @@ def test_an_encoding_without_its_mark_is_refused_with_what_to_do(tmp_path):
     (tmp_path / "log.csv").write_bytes("Größe,x\n1,2\n".encode("utf-16-le"))
     with pytest.raises(DataError, match=r"CSV UTF-8.*iconv -f"):
         read_foreign(tmp_path / "log.csv", SEEN)
-
-
-@pytest.mark.parametrize(("line", "words"), [("f 9", "is of type 9"), ("r 1 2", "hold 1, 3 and 3")])
-def test_poses_of_halcon_in_other_representations_are_refused(tmp_path, line, words):
-    folder = halcon(tmp_path / "in").source
-    file = folder / "movingcam_robot_pose_03.dat"
-    text = re.sub(rf"(?m)^{line[0]} .*$", line, file.read_text())
-    file.write_text(text)
-    with pytest.raises(DataError, match=rf"pose_03\.dat.*{words}"):
-        read_foreign(folder, SEEN)

@@ -311,24 +311,6 @@ def numbers_first(folder: Path) -> Recording:
     return Recording(folder, ImportOptions(mount="eye-in-hand", target=CHARUCO))
 
 
-def halcon(folder: Path) -> Recording:
-    """Poses as HALCON's write_pose has them, in each of its ways to write a rotation."""
-    for at, pose in enumerate(BASE_FROM_FLANGE):
-        turned = Rotation.from_matrix(pose[:3, :3])
-        vector = turned.as_rotvec()
-        code, turns = (
-            (0, turned.as_euler("XYZ", degrees=True)),
-            (2, turned.as_euler("xyz", degrees=True)),
-            (4, vector / np.linalg.norm(vector) * np.tan(np.linalg.norm(vector) / 2)),
-        )[at % 3]
-        text = f"# 3D POSE PARAMETERS: rotation and translation\n\nf {code}\n\n"
-        for name, numbers in (("r", turns), ("t", pose[:3, 3])):
-            text += f"# {name}:\n{name} {' '.join(map(repr, numbers.tolist()))}\n\n"
-        _write(folder / f"movingcam_robot_pose_{at:02d}.dat", text)
-        picture(folder / f"movingcam_calib_{at:02d}.png")
-    return Recording(folder, ImportOptions(mount="eye-in-hand", target=CHARUCO))
-
-
 def visp_seen(folder: Path) -> Recording:
     """ViSP's poses of the object in the camera, without images."""
     for name, poses in (("fPe", BASE_FROM_FLANGE), ("cPo", CAM_FROM_TARGET)):
@@ -443,7 +425,6 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         ros_poses,
         numbers_first,
         visp_seen,
-        halcon,
     )
 }
 

@@ -316,7 +316,7 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
 
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".dat", ".npz", ".npy", *DOCUMENTS)
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)

@@ -1,7 +1,6 @@
 """Folders with one file a view, or several kinds of file a view.
 
-Among them HALCON's poses: `f 0`, `r` with a rotation, `t` with a translation [m]; ViSP's YAML with
-a camera XML; and Zivid's YAML with 4 x 4 matrices [mm].
+Among them ViSP's YAML with a camera XML, and Zivid's YAML with 4 x 4 matrices [mm].
 """
 
 import re
@@ -11,16 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from visioncal.core.documents import as_numbers, is_number, mapping, read_table
 from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
-from visioncal.core.types import MOUNTS, FloatArray
+from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.file_search import (
     files_in,
@@ -165,13 +161,6 @@ VISP = ForeignFormat(
 )
 
 
-_LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
-# Rotation forms by the code of the representation (create_pose): angles about x, y, z in the
-# letters' order, or the Rodrigues vector of length tan(angle / 2).
-_EULER = {0: "XYZ", 2: "xyz"}
-_RODRIGUES = 4
-
-
 def _families(folder: Path) -> list[tuple[str, dict[int, Path]]]:
     """Groups a folder's data files by their names without the number, the largest group first.
 
@@ -224,12 +213,11 @@ def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
 def _record(path: Path) -> dict[str, object]:
     """Reads one view's file; numbers without a name are its matrix or pose."""
     suffix = path.suffix.lower()
-    document: object = _halcon_pose(path) if suffix == ".dat" else None
     if suffix in (".npz", ".npy"):
-        document = read_arrays(path)
+        document: object = read_arrays(path)
     elif suffix in DOCUMENTS:
         document = read_document(path)
-    elif document is None:
+    else:
         table = read_table(path)
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
         document = rows[0] if len(rows) == 1 else rows
@@ -244,30 +232,3 @@ VIEWS = ForeignFormat(
     lambda path: _view_folder(path) is not None,
     _read_views,
 )
-
-
-def _halcon_pose(path: Path) -> FloatArray | None:
-    """Reads one file's (4, 4) pose [m]."""
-    lines = {match[1]: match[2].split() for match in _LINE.finditer(read_plain_text(path))}
-    if lines.keys() != {"f", "r", "t"}:
-        return None
-    counts = {name: len(words) for name, words in lines.items()}
-    if counts != {"f": 1, "r": 3, "t": 3} or not all(
-        is_number(name) for values in lines.values() for name in values
-    ):
-        raise DataError(f"{path}: f, r and t hold 1, 3 and 3 numbers.", culprits=[str(path)])
-    (code,), turns, position = (np.array(lines[name], dtype=float) for name in "frt")
-    if code == _RODRIGUES:
-        half = np.arctan(np.linalg.norm(turns))
-        rotation = Rotation.from_rotvec(2.0 * half * turns / max(float(np.tan(half)), 1e-300))
-    elif code in _EULER:
-        rotation = Rotation.from_euler(_EULER[int(code)], turns, degrees=True)
-    else:
-        raise DataError(
-            f"{path}: the pose is of type {code:g}; {_RODRIGUES} and {[*_EULER]} are read.",
-            culprits=[str(path)],
-            next_step="Write it with convert_pose_type as 'Rp+T', 'gba', 'point'.",
-        )
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
-    return pose
