@@ -228,23 +228,16 @@ class Selection:
     target: str | None = None  # Which target of a cell; likewise.
 
 
-@dataclass(frozen=True, eq=False)
-class Content:
-    """Content for a format of transforms or lenses."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Content(Placement):
+    """Content for a format of transforms or lenses: `parent_from_child`."""
 
     name: str  # Name of the transform in the result.
-    # `parent_from_child`: its translation and rotation are the child's pose in the parent.
-    edge: Edge
     parent: str  # Exported name of the parent frame.
-    child: str  # Exported name of the child frame.
+    child: str  # Exported name of the child frame, whose pose in the parent it is.
     frames: tuple[str, str]  # Our own names of parent and child.
     mount: Mount | None
     lens: CameraResult | None  # The camera, where there is one.
-    origin: str  # Where the result comes from, in one line.
-    verdict: Verdict
-    conditions: tuple[Condition, ...] = ()  # Under which the transform holds.
-    # Our name of the frame whose rotation was copied; None where it was measured.
-    rotation_of: str | None = None
     number: int | None = None  # Of the controller's tool or base.
     load: Load | None = None
 
@@ -269,7 +262,7 @@ class Content:
     def notes(self) -> list[str]:
         """Comment lines: origin, quality, meaning of the transform, and its conditions."""
         sigma = f"sigma {self.edge.sigma_mm:.2g} mm"
-        if self.rotation_of is None:
+        if self.oriented:
             sigma += f" and {self.edge.sigma_deg:.2g} deg"
         else:
             of = self.rotation_of if "_" in self.rotation_of else f"the {self.rotation_of}"

@@ -184,14 +184,13 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
 
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
     placement, frames = available.find(name)
-    rotation_of = None if placement.oriented else placement.rotation_of or frames[0]
+    rotation_of = placement.rotation_of or frames[0]
     edge, lens = placement.edge, available.lens
     if selection.inverse:
         # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
         turned = adjoint(edge.matrix)
         edge = Edge(invert(edge.matrix), np.asarray(turned @ edge.covariance @ turned.T))
         name, frames = f"inverse of {name}", (frames[1], frames[0])
-    conditions = () if form.holds == "lens" else placement.conditions
     given = (selection.parent, selection.child)
     parent, child = (
         form.frames.get(frame, frame) if stated is None else stated
@@ -214,19 +213,20 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     if available.cell is not None:
         lens = available.lenses.get(frames[1], lens)
     return Content(
-        name,
-        edge,
-        parent,
-        child,
-        frames,
-        available.mount,
-        lens,
-        placement.origin,
-        placement.verdict,
-        conditions,
-        rotation_of,
-        selection.number,
-        selection.load,
+        edge=edge,
+        origin=placement.origin,
+        verdict=placement.verdict,
+        oriented=placement.oriented,
+        rotation_of=rotation_of,
+        conditions=() if form.holds == "lens" else placement.conditions,
+        name=name,
+        parent=parent,
+        child=child,
+        frames=frames,
+        mount=available.mount,
+        lens=lens,
+        number=selection.number,
+        load=selection.load,
     )
 
 

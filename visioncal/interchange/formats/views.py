@@ -117,7 +117,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     mount = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
     if mount is not None:
         notes.append(f"The mount is taken from the folder's name: {mount}.")
-    target = None if requested.target else _target(path, notes)
+    target = None if requested.target else _target(path)
     return replace(
         foreign,
         # Poses of the object in the camera are used only where there are no images.
@@ -129,27 +129,16 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     )
 
 
-def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
-    """Reads the target from a note beside the images, where that is complete."""
+def _target(path: Path) -> dict[str, Any] | None:
+    """Reads a checkerboard from a note beside the images, where that is complete."""
     for file in files_in(path):
-        if not file.name.endswith("-data.txt"):
-            continue
-        text = read_plain_text(file)
+        text = read_plain_text(file) if file.name.endswith("-data.txt") else ""
         size = re.search(r"size:\s*([0-9]{1,6}(?:\.[0-9]{1,9})?)\s*m\b", text)
         board = re.search(r"([0-9]{1,3})\s*x\s*([0-9]{1,3})", text)
-        family = re.search(r"(16h5|25h9|36h10|36h11)", text)
         if size and board and "chess" in text.lower():
-            return {
-                "kind": "checkerboard",
-                "columns": int(board[1]),
-                "rows": int(board[2]),
-                "square_m": float(size[1]),
-            }
-        if size and family:
-            notes.append(
-                f"{file.name} names no id of the tag: give "
-                f"--target marker_DICT_APRILTAG_{family[1]}_ID_{1e3 * float(size[1]):g}mm."
-            )
+            columns, rows = int(board[1]), int(board[2])
+            square = {"square_m": float(size[1])}
+            return {"kind": "checkerboard", "columns": columns, "rows": rows, **square}
     return None
 
 
