@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.refusals import raised
 
-from visioncal.core.documents import as_numbers, parse_stored, read_json, read_table
-from visioncal.core.documents.jsons import parse_json, read_arrays
+from visioncal.core.documents.jsons import parse_json, parse_stored, read_arrays, read_json
 from visioncal.core.documents.structured import parse_yaml, read_opencv, read_xml, read_yaml
+from visioncal.core.documents.tables import read_table
+from visioncal.core.documents.values import as_numbers
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 

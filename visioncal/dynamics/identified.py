@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.codec import KEPT, Key, Vector, read, reading, write
-from visioncal.core.documents import parse_stored
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
 from visioncal.core.finding_kinds import NOTE

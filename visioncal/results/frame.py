@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 from visioncal.core.codec import INLINE, KEPT, read, reading, write
-from visioncal.core.documents import parse_stored
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.files import read_bytes, write_json
 from visioncal.core.version import __version__
 from visioncal.results.edge import StoredEdge

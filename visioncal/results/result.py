@@ -14,7 +14,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import PoseForm
 from visioncal.core.codec import entries, reading
 from visioncal.core.conventions import controller_form
-from visioncal.core.documents import parse_stored
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.number_format import figure

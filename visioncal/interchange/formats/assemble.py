@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.documents import is_number
+from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of

@@ -11,8 +11,8 @@ from typing import Any
 
 import cv2
 
-from visioncal.core.documents import mapping, number
 from visioncal.core.documents.structured import read_yaml
+from visioncal.core.documents.values import mapping, number
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.columns import foreign_from

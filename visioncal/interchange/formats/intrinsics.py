@@ -8,9 +8,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from visioncal.core.documents import as_numbers, is_number, mapping, number
 from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_opencv, read_xml
+from visioncal.core.documents.tables import is_number
+from visioncal.core.documents.values import as_numbers, mapping, number
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.boards.kind import metres

@@ -10,10 +10,10 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.conventions import write_pose
-from visioncal.core.documents import TextTable, is_number, read_json, read_table
-from visioncal.core.documents.jsons import Array, read_arrays
+from visioncal.core.documents.jsons import Array, read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.structured import read_opencv, read_yaml
+from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of

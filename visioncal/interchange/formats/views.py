@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from visioncal.core.documents import as_numbers, is_number, mapping, read_table
 from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_yaml
-from visioncal.core.documents.values import read_plain_text
+from visioncal.core.documents.tables import is_number, read_table
+from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
 from visioncal.core.types import MOUNTS

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.documents import TextTable, read_table
 from visioncal.core.documents.columns import Column, TableReader
+from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
