@@ -1,5 +1,6 @@
 """What a result is valid for: `conditions` in calibration.json, which every output carries."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -7,16 +8,23 @@ from typing import TYPE_CHECKING, Literal
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.verdict import Verdict
 from visioncal.results.arm import ArmSections
+from visioncal.results.lens import CameraResult, sensor_tilt
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration
+
+# Tilt up to which a sensor counts as parallel to its lens [deg]: makers of industrial cameras state
+# 0.2 to 0.6 about each axis (Basler, pilot user's manual, 1.5.2.2), which is 0.8 about both.
+_PARALLEL_DEG = 0.8
+# Sigmas by which a tilt differs from none.
+_SIGNIFICANT = 3.0
 
 
 @dataclass(frozen=True)
 class Condition:
     """A condition under which a result holds."""
 
-    kind: Literal["calibrated-arm", "load", "temperature"]  # Its kind.
+    kind: Literal["calibrated-arm", "own-lens", "load", "temperature"]  # Its kind.
     sentence: str  # What it is, with its figure.
     do: str  # What follows for whoever uses the result.
 
@@ -42,8 +50,30 @@ def uncorrected_words(verdict: Verdict) -> str:
 
 def conditions_of(calibration: "Calibration") -> Iterator[Condition]:
     """The conditions of a calibration, those of a whole cell with the name of their part."""
-    for name, arm in calibration.by_name.robots.items():
+    cell = calibration.by_name
+    for name, arm in cell.robots.items():
         yield from _of_arm(arm, calibration.verdict, name)
+    for name, lens in cell.cameras.items():
+        yield from _of_lens(lens, name)
+
+
+def _of_lens(lens: CameraResult, camera: str) -> Iterator[Condition]:
+    tilt = sensor_tilt(lens)
+    if tilt is None or math.degrees(tilt.rad) < _PARALLEL_DEG:
+        return
+    if tilt.rad < _SIGNIFICANT * tilt.sigma_rad:
+        return
+    of, deg = f"{camera}: " if camera else "", math.degrees(tilt.rad)
+    sigma = f" (sigma {figure(math.degrees(tilt.sigma_rad))})" if tilt.sigma_rad else ""
+    yield Condition(
+        "own-lens",
+        f"{of}The camera's transform holds only with its own lens (matrix and distortion): p1 and "
+        f"p2 are those of a sensor tilted by {figure(deg)} deg{sigma}, and by a lens model with "
+        f"that tilt the camera looks elsewhere by so much, {figure(1e3 * math.tan(tilt.rad))} mm "
+        "at 1 m.",
+        "Where the receiving program has a lens of its own, state that one in session.toml, with "
+        'intrinsics = "hold", and calibrate again.',
+    )
 
 
 def _of_arm(arm: ArmSections, verdict: Verdict, robot: str) -> Iterator[Condition]:

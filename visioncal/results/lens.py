@@ -18,14 +18,22 @@ from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
 from visioncal.vision.camera import (
+    intrinsics,
     normalise,
     project_with_jacobian,
+    with_intrinsics,
 )
 
 # Numbers of pixels of a grid along the image's width and height.
 _GRID = (40, 32)
 # Share of the prior variance by which the field must be determined to count as observed.
 _SEEN = 0.5
+# Relative singular value below which a combination of coefficients is undetermined.
+_DETERMINED = 1e-8
+
+# Places of p1 and p2 among Brown's intrinsics.
+_DECENTRING = (6, 7)
+
 # Steps of central differences [rad], whose truncation is their square.
 _STEP = 1e-5
 
@@ -204,6 +212,63 @@ def image_grid(camera: Camera) -> FloatArray:
     sides = zip(camera.resolution, _GRID, strict=True)
     axes = (np.linspace(0.0, side - 1.0, count) for side, count in sides)
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class SensorTilt:
+    """Tilt of the sensor that a lens's decentring stands for."""
+
+    rad: float  # Angle between the optical axes of the lens model and of one with a tilted sensor.
+    sigma_rad: float  # Its standard deviation by that of the decentring; 0 for a given lens.
+
+
+def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
+    """The tilted sensor that would explain the decentring p1, p2 of a lens.
+
+    A pinhole camera whose sensor is tilted is one that is turned, with another principal point.
+    Only the centre of the radial distortion remains on the lens's axis. Seen from there, it is
+    displaced; its derivative by that displacement is Brown's decentring (Brown 1966). The tilt, and
+    the changes of all other intrinsics, are those that come nearest to the decentring over the
+    image.
+
+    Returns:
+        The tilt; None where the model has no decentring, or no tilt explains it.
+    """
+    if lens.camera.model != "brown":
+        return None
+    values = intrinsics(lens.camera)
+    decentring = values[[*_DECENTRING]]
+    values[[*_DECENTRING]] = 0.0
+    camera = with_intrinsics(lens.camera, values)
+    rays = normalise(camera, image_grid(camera))
+    points = np.column_stack([rays, np.ones(len(rays))])[np.isfinite(rays).all(axis=1)]
+    projected = project_with_jacobian(camera, points)
+    focal, centre = camera.matrix[:2], camera.matrix[2:]
+    shown = np.column_stack([(projected.px - centre) / focal, np.ones(len(points))])
+    # The camera is turned about x and y before the distortion, and turned back behind it.
+    turned = np.cross(np.eye(3)[:2], points[:, None])
+    back = np.cross(np.eye(3)[:2], shown[:, None])
+    by_tilt = np.swapaxes(
+        turned @ np.swapaxes(projected.jacobian_point, 1, 2)
+        - focal * (back[:, :, :2] - shown[:, None, :2] * back[:, :, 2:]),
+        1,
+        2,
+    )
+    others = np.delete(projected.jacobian_intrinsics, _DECENTRING, axis=2)
+    columns = np.concatenate([by_tilt, others], axis=2).reshape(-1, 2 + others.shape[2])
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    decentred = projected.jacobian_intrinsics[:, :, _DECENTRING].reshape(-1, 2)
+    fitted = np.linalg.lstsq(columns / scale, decentred, rcond=_DETERMINED)[0] / scale[:, None]
+    tilt = fitted[:2] @ decentring
+    rad = float(np.linalg.norm(tilt))
+    # An axis beside the image is no lens's: decentring with hardly any radial distortion.
+    if rad > np.hypot(*camera.resolution) / 2.0 / focal.min():
+        return None
+    if lens.covariance is None or rad == 0.0:
+        return SensorTilt(rad, 0.0)
+    along = tilt @ fitted[:2] / rad
+    return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
