@@ -63,6 +63,8 @@ def test_yaml_values(text, value):
         ("[" * 100_000, "no YAML"),
         ("- " * 200 + "1", "nested deeper"),
         ("a: [1, 2", "no YAML"),
+        ("a: !!opencv-matrix [1, 2]", "no YAML"),
+        ("a: !!int x", "no YAML"),
         ("a: b: c", "line 1 is no YAML"),
         ("? [1]\n: 2", "line 1: a list of 1 is no key"),
         (

@@ -64,7 +64,8 @@ def parse_yaml(text: str, where: str) -> object:
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise DataError(f"{where}{line} is no YAML: {error.problem}.", culprits=[where]) from error
-    except yaml.YAMLError as error:
+    # Tags on values of another kind give the others.
+    except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{where} is no YAML: {reason}.", culprits=[where]) from error
     except RecursionError as error:
@@ -113,7 +114,7 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
 _Loader.yaml_implicit_resolvers = {}
 _Loader.yaml_constructors = {
     None: _Loader.refuse,
-    f"{_STANDARD}str": lambda _, node: node.value,
+    f"{_STANDARD}str": _BASE.construct_scalar,
     f"{_STANDARD}int": lambda _, node: int(node.value),
     f"{_STANDARD}float": lambda _, node: float(node.value),
     f"{_STANDARD}bool": lambda _, node: _CONSTANTS[node.value.lower()],

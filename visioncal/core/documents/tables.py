@@ -120,18 +120,17 @@ def read_table(path: Path) -> TextTable:
         for at, line in enumerate(all_lines, start=1)
         if line.strip(_EMPTY) and not line.strip().startswith(_COMMENTS)
     ][1 if declared else 0 :]
-    if not lines:
-        raise DataError(f"{where} has no rows.", culprits=[where])
     listed = [_LISTED.fullmatch(line) for _, line in lines]
     if all(listed):
         inside = (match[1] for match in listed if match)
         lines = list(zip((at for at, _ in lines), inside, strict=True))
-    separator = (
-        declared[1] if declared else next((name for name in ";\t," if name in lines[0][1]), " ")
-    )
+    first = lines[0][1] if lines else ""
+    separator = declared[1] if declared else next((mark for mark in ";\t," if mark in first), " ")
     split = [(at, tuple(line.split())) for at, line in lines]
     if separator != " ":
         split = list(_split(lines, where, separator, stripped=True))
+    if not split or not all(cells for _, cells in split):
+        raise DataError(f"{where} has no rows.", culprits=[where])
     numbers, cells = [at for at, _ in split], [cells for _, cells in split]
     rows = _without_margin(cells)
     columns = rows[0] if not any(is_number(cell) for cell in rows[0]) else None
