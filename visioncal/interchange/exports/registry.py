@@ -185,6 +185,8 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
     placement, frames = available.find(name)
     rotation_of = placement.rotation_of or frames[0]
+    # The poses of tools, fixtures and targets depend on no convention of a lens.
+    of_camera = any(frame.startswith("cam") for frame in frames)
     edge, lens = placement.edge, available.lens
     if selection.inverse:
         # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
@@ -218,7 +220,11 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         verdict=placement.verdict,
         oriented=placement.oriented,
         rotation_of=rotation_of,
-        conditions=() if form.holds == "lens" else placement.conditions,
+        conditions=tuple(
+            condition
+            for condition in placement.conditions
+            if form.holds != "lens" and (of_camera or condition.kind != "own-lens")
+        ),
         name=name,
         parent=parent,
         child=child,
