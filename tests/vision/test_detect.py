@@ -18,7 +18,7 @@ from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board
-from visioncal.vision.boards.imaging import blur_at_corners, claimed_size, decode_image
+from visioncal.vision.boards.imaging import blur_at_corners, decode_image
 from visioncal.vision.targets import corner_positions
 
 
@@ -250,15 +250,16 @@ def test_a_size_that_no_sensor_has_is_refused_before_it_is_decoded(charuco, monk
     files = {"a.png": encoded(images[0]), "b.png": bomb}
     found = detect(session_of(files, cell.options.target))
     assert list(found.corners) == [0]
-    assert "30000 x 30000 px" in found.rejections[0].reason
+    assert "too large" in found.rejections[0].reason
     assert len(decoded) == 1
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp", ".webp"])
 @pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
-def test_the_size_stands_in_the_header(ending, shape):
-    assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)) == (64, 48)
-    assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)[:20]) is None
+def test_images_of_all_endings_are_decoded_or_named(ending, shape):
+    data = encoded(np.zeros(shape, np.uint8), ending)
+    assert decode_image(data).shape == (48, 64)
+    assert "unreadable" in decode_image(data[:20])
 
 
 @pytest.mark.parametrize("quality", [50, 101])
@@ -268,7 +269,6 @@ def test_every_kind_of_webp_is_decoded(quality, alpha):
     shape = (48, 64, 4) if alpha else (48, 64)
     pixels = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
     data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
-    assert claimed_size(data) == (64, 48)
     assert decode_image(data).shape == (48, 64)
 
 

@@ -7,13 +7,14 @@ import typer
 
 from visioncal.cli.console import answer, print_json, say
 from visioncal.cli.session_options import (
-    BoardKind,
     BoardOptions,
     TargetCheckOptions,
     TargetMakeOptions,
 )
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
+from visioncal.core.number_format import did_you_mean
+from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.identify import describe, identify, to_document, to_toml
 from visioncal.vision.boards.imaging import read_image
 from visioncal.vision.boards.kind import BoardRequest, side_metres
@@ -27,14 +28,6 @@ from visioncal.vision.targets import (
     target_names,
 )
 
-# The options that describe a board, by its kind.
-_USED: dict[BoardKind, str] = {
-    "charuco": "--columns --rows --square-mm --marker-mm --dictionary --legacy --name",
-    "checkerboard": "--columns --rows --square-mm --name",
-    "aprilgrid": "--columns --rows --size-mm --spacing --border --dictionary --id --name",
-    "circles": "--columns --rows --square-mm --diameter-mm --asymmetric --name",
-    "marker": "--id --size-mm --dictionary --name",
-}
 # Page sizes to try in order where none is named.
 _PAGES = ("A4", "A3", "A2", "A1", "A0")
 
@@ -68,9 +61,16 @@ def target_make_command(options: TargetMakeOptions) -> None:
     say(f"Print it on {sheet.page} at 100 %, and check both rulers.")
 
 
-def _refuse_unused(kind: BoardKind | None, board: Mapping[str, object]) -> None:
+def _refuse_unused(kind: str | None, board: Mapping[str, object]) -> None:
     """Refuses options that have no effect."""
-    used = _USED[kind].split() if kind is not None else []
+    made = [name for name, board_kind in KINDS.items() if board_kind.options]
+    if kind is not None and kind not in made:
+        raise DataError(
+            f"--kind is {kind[:40]!r}; {', '.join(made)} are made.",
+            culprits=["--kind"],
+            next_step=did_you_mean(kind, made),
+        )
+    used = KINDS[kind].options.split() if kind is not None else []
     default = vars(BoardOptions())
     given = [name for name, value in board.items() if value != default[name] and name != "kind"]
     options = ["--id" if name == "marker_id" else f"--{name.replace('_', '-')}" for name in given]
@@ -100,16 +100,16 @@ def target_check_command(options: TargetCheckOptions) -> None:
         # Refuses what no session could load, such as a size in millimetres taken as metres.
         target = identity.target(options.image.stem, square_m)
         target_from_document(target_document(target), target.name)
-    description = to_toml(identity, square_m, options.image.name)
+    description = "" if square_m is None else to_toml(identity, square_m, options.image.name)
     if options.out is not None:
         write_atomically(options.out, description)
     if options.as_json:
         print_json(to_document(identity, square_m))
-    elif options.out is None:
+    elif options.out is None and description:
         typer.echo(description, nl=False)
-    if options.out is not None:
-        if not options.as_json:
-            answer(describe(identity))
+    else:
+        answer(describe(identity))
         for note in identity.notes:
             say(note)
+    if options.out is not None:
         say(f"wrote {options.out}")

@@ -19,9 +19,6 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 Image16: TypeAlias = npt.NDArray[np.uint16]
 
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
-TargetKind: TypeAlias = Literal[
-    "charuco", "checkerboard", "aprilgrid", "circles", "marker", "points"
-]
 
 
 # Called with a stage's name, its steps done, and its steps in all.
@@ -48,8 +45,8 @@ class Target:
     """
 
     name: str  # The name by which sessions refer to it.
-    # Kind of pattern; `points` for a rig, whose points are detected by other programs.
-    kind: TargetKind
+    # Kind of pattern, one of `vision.boards.KINDS`.
+    kind: str
     # Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along x; 1 for a
     # marker, and the points for a rig.
     columns: int
@@ -82,8 +79,8 @@ class Target:
 
     @property
     def is_rig(self) -> bool:
-        """Whether it is a rig of known points, without a size of its own."""
-        return bool(self.points_m)
+        """Whether its points were measured one by one, so that it has no size of its own."""
+        return bool(self.points_m) and not self.square_sigma_m
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from visioncal.frames.target_pose import Sight, TargetPose, needs_robot, place_t
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, select_matching
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice
+from visioncal.vision.boards import kind_of
 
 # Key of the detail that identifies the calibration of a frame's camera.
 SEEN_BY = "camera_calibrated"
@@ -45,12 +46,6 @@ _COUNTED_TWICE = (
 _WILD, _STILL = 10.0, 0.1
 # Largest share of unused views without a finding, and the number of reasons listed.
 _LOST_SHARE, _LISTED = 0.25, 3
-_BOARDS = {
-    "charuco": "ChArUco board",
-    "aprilgrid": "AprilGrid",
-    "circles": "grid of circles",
-    "points": "rig",
-}
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 
@@ -129,7 +124,7 @@ def seen_frame(
     ]
     count, board = int(seen.inliers.sum()), shown.target
     images = "one image" if count == 1 else f"{count} images"
-    method = f"{_BOARDS.get(board.kind, board.kind)} {board.name} seen in {images}"
+    method = f"{kind_of(board).noun} {board.name} seen in {images}"
     details: dict[str, Any] = {"target": board.name}
     if point.any():
         point_mm = 1e3 * point

@@ -18,7 +18,7 @@ from visioncal.session.images import inside_path
 from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import write_stream
 from visioncal.session.table import write_csv
-from visioncal.vision.boards.points import rig_csv
+from visioncal.vision.targets import stored_target
 
 if TYPE_CHECKING:
     from visioncal.session.session import Session
@@ -91,11 +91,8 @@ def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
             continue
         path = _place_inside(stated, f"target_{name}.toml" if name else "target.toml")
         content = target_document[name] if len(declaration.targets) > 1 else target_document
-        points = content.get("points")
-        if content.get("kind") == "points" and isinstance(points, Mapping):
-            table = Path(path).with_suffix(".points.csv")
-            content = {**content, "points": table.name}
-            texts[table.as_posix()] = rig_csv(points)
+        content, tables = stored_target(content, Path(path).stem)
+        texts |= {str(Path(path).with_name(table)): text for table, text in tables.items()}
         texts[path] = tomli_w.dumps(content)
         if name:
             kept = {**entry.model_dump(), "target": path}

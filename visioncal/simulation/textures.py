@@ -111,8 +111,8 @@ def _dark_shares(target: Target, shape: tuple[int, int], texel_m: float) -> Floa
     low, _ = extent_m(target)
     for grid in dark_cells(target):
         _stamp(dark, grid.dark, (grid.corner_m - low) / texel_m, grid.cell_m / texel_m)
-    radius = 0.5 * target.diameter_m / texel_m
-    for centre in (dark_discs(target) - low) / texel_m:
+    for disc in (dark_discs(target) - [*low, 0.0]) / texel_m:
+        centre, radius = disc[:2], float(disc[2])
         # Circles' edges are straight within a texel.
         start, end = (
             np.clip(centre + value, 0, shape[::-1]) for value in (-radius - 1, radius + 2)

@@ -19,7 +19,6 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply, compose
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.vision.boards import KINDS, kind_of
-from visioncal.vision.boards.points import read_rig
 
 # Keys of target descriptions.
 KEYS = {"kind", "points"}.union(*(kind.keys.split() for kind in KINDS.values()))
@@ -67,9 +66,8 @@ def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
         name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
     )
     document = read_toml(path, path.name)
-    rig = document.get("points")
-    if document.get("kind") == "points" and isinstance(rig, str):
-        document["points"] = read_rig(path.parent, rig.replace("\\", "/"))
+    if document.get("kind") in KINDS:
+        document = KINDS[document["kind"]].loaded(document, path.parent)
     return target_from_document(document, path.stem), document
 
 
@@ -98,8 +96,7 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     """
     try:
         table = DocumentTable(document, f"target {name}")
-        chosen = table.choice("kind", tuple(KINDS))
-        return next(kind for kind in KINDS.values() if kind.name == chosen).read(table, name)
+        return KINDS[table.choice("kind", tuple(KINDS))].read(table, name)
     except DataError as error:
         hint = error.next_step or " ".join(misspelt_keys(document))
         raise type(error)(error.message, culprits=error.culprits, next_step=hint) from error
@@ -108,6 +105,13 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
 def target_document(target: Target) -> dict[str, Any]:
     """A target as the content of a `.toml`, which `target_from_document` can read."""
     return {"kind": target.kind, **kind_of(target).document(target)}
+
+
+def stored_target(
+    document: Mapping[str, Any], stem: str
+) -> tuple[Mapping[str, Any], dict[str, str]]:
+    """The content of `STEM.toml` for a `target_document`, and texts of its tables by name."""
+    return KINDS[document["kind"]].stored(document, stem)
 
 
 def board_words(target: Target) -> str:

@@ -106,7 +106,7 @@ def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
             found.append((view, identity))
     if not found:
         return None
-    view, identity = max(found, key=lambda pair: (pair[1].whole, pair[1].corners_seen))
+    view, identity = max(found, key=lambda pair: pair[1].corners_seen)
     board, dictionaries = identity.board, ("", identity.board.dictionary, *identity.larger)
     is_same = all(getattr(board, name) == getattr(declared, name) for name in _COMPARED)
     if is_same and declared.dictionary in dictionaries:
@@ -143,10 +143,11 @@ def _identified(image: Image, declared: Target) -> Identity | None:
         if board is None:
             return None
         corners = board.columns * board.rows
-        return Identity(board, True, corners, corners)
+        return Identity(board, corners, corners)
     dictionaries = (identity.board.dictionary, *identity.larger)
     # A single marker is no evidence against a declared board of several: its finder says what that
     # lacks.
-    if identity.is_single and declared.kind != "marker" and declared.dictionary in dictionaries:
+    several = declared.columns * declared.rows > 1
+    if identity.is_single and several and declared.dictionary in dictionaries:
         return None
     return identity if identity.corners_seen >= _LEAST_CORNERS * identity.corners else None

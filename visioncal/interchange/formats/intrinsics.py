@@ -14,6 +14,7 @@ from visioncal.core.documents.tables import is_number
 from visioncal.core.documents.values import as_numbers, mapping, number
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Target
+from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.kind import metres
 from visioncal.vision.targets import read_target, target_from_document, target_names
 
@@ -22,15 +23,6 @@ def _millimetres(text: str) -> float:
     return metres(float(text))
 
 
-_COUNTS = "(?P<columns>[0-9]{1,3})x(?P<rows>[0-9]{1,3})"
-_MM = r"[0-9]{1,5}(?:\.[0-9]{1,9})?"
-_KINDS = {
-    "charuco": rf"{_COUNTS}_(?P<square_m>{_MM})mm_(?P<marker_m>{_MM})mm_(?P<dictionary>DICT_\w+?)"
-    "(?P<legacy>_legacy)?",
-    "checkerboard": rf"{_COUNTS}_(?P<square_m>{_MM})mm",
-    "aprilgrid": rf"{_COUNTS}_(?P<size_m>{_MM})mm_(?P<spacing>0\.[0-9]{{1,9}}|1)",
-    "marker": rf"(?P<dictionary>DICT_\w+)_(?P<id>[0-9]{{1,5}})_(?P<size_m>{_MM})mm",
-}
 _READ: Mapping[str, Callable[[str], object]] = {
     **dict.fromkeys(("columns", "rows", "id"), int),
     **dict.fromkeys(("square_m", "marker_m", "size_m"), _millimetres),
@@ -57,7 +49,8 @@ def read_target_description(words: str) -> Mapping[str, Any]:
     Raises:
         DataError: It is none of these, or describes no target.
     """
-    matches = {kind: re.fullmatch(f"{kind}_{form}", words) for kind, form in _KINDS.items()}
+    forms = {name: kind.in_a_word for name, kind in KINDS.items() if kind.in_a_word}
+    matches = {name: re.fullmatch(f"{name}_{form}", words) for name, form in forms.items()}
     document: dict[str, Any] | None = None
     for kind, match in matches.items():
         if match is not None:

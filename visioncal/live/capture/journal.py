@@ -30,7 +30,7 @@ from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import Session, View
 from visioncal.session.columns import pose_row
 from visioncal.session.table import write_csv
-from visioncal.vision.targets import load_target, target_document, target_names
+from visioncal.vision.targets import load_target, stored_target, target_document, target_names
 
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
@@ -67,7 +67,8 @@ class CaptureFacts:
         document["target"] = target.name
         if target.name not in target_names() or load_target(target.name) != target:
             document["target"] = _TARGET_FILE
-            texts[_TARGET_FILE] = tomli_w.dumps(target_document(target))
+            content, tables = stored_target(target_document(target), Path(_TARGET_FILE).stem)
+            texts |= {**tables, _TARGET_FILE: tomli_w.dumps(content)}
         camera = {"name": self.camera, "resolution": list(self.resolution)}
         if lens is not None:
             camera |= {"model": lens.model, "matrix": lens.matrix.tolist()}

@@ -85,8 +85,7 @@ def picture(target: Target) -> Image:
         region = page[top : top + rows, left : left + columns]
         resized = cv2.resize(brightness, (columns, rows), interpolation=interpolation)
         np.minimum(region, resized[: region.shape[0], : region.shape[1]], out=region)
-    for centre in scale * (dark_discs(target) - low) - 0.5:
-        x, y = np.rint(16.0 * centre).astype(int).tolist()
-        radius = round(8.0 * scale * target.diameter_m)
+    discs = scale * (dark_discs(target) - [*low, 0.0]) - [0.5, 0.5, 0.0]
+    for x, y, radius in np.rint(16.0 * discs).astype(int).tolist():
         cv2.circle(page, (x, y), radius, 0.0, -1, cv2.LINE_AA, shift=4)
     return page

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
-from visioncal.vision.boards.aprilgrid import APRILGRID
+from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.boards.aprilgrid import AprilGrid
 from visioncal.vision.boards.charuco import CHARUCO
 from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.circles import CircleGrid
@@ -16,9 +16,9 @@ from visioncal.vision.boards.points import Rig
 
 __all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "kind_of"]
 
-KINDS: Mapping[TargetKind, BoardKind] = {
+KINDS: Mapping[str, BoardKind] = {
     kind.name: kind
-    for kind in (CHARUCO, Checkerboard(), APRILGRID, CircleGrid(), MarkerKind(), Rig())
+    for kind in (CHARUCO, Checkerboard(), AprilGrid(), CircleGrid(), MarkerKind(), Rig())
 }
 
 

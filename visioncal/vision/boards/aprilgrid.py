@@ -1,7 +1,7 @@
 """AprilGrids: Kalibr's grids of tags with small dark squares at their corners."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import cv2
@@ -9,11 +9,11 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.board import Board
-from visioncal.vision.boards.identity import LEAST_MARKERS, Identity, Marker
 from visioncal.vision.boards.kind import (
-    DEFAULT_RELATIVE_SIGMA,
+    COUNTS,
+    MM,
     BoardRequest,
     Cells,
     DetectedCorners,
@@ -31,8 +31,6 @@ from visioncal.vision.boards.template import Print
 # One tag's four corners suffice. Kalibr's pages have tags with borders of two modules, and gaps of
 # at most a tag's side, usually this share of it.
 _MIN_TAGS, _MOST_SPACING, _MOST_BORDER, _USUAL_SPACING = 1, 1.0, 2, 0.3
-# Number of columns that are tried for an unknown board.
-_MOST_COLUMNS = 24
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
 # where two dark corners meet: it counts as white if dark has to be darker than its surroundings by
 # this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
@@ -51,17 +49,15 @@ _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
 # Tolerance of the gap between tags [sides]; minimum number of collinear pairs of sides, and largest
 # interquartile range of their gaps.
 _SPACING, _LEAST_SPACINGS, _SCATTER = 0.02, 4, 0.05
-# Positions along a tag's side, and distance inside it, in its dark border [sides].
-_ALONG, _INSIDE = (0.06, 0.35, 0.65, 0.94), 0.06
-# An outer line of tags is missing if this share of positions on its near side is light; number of
-# lines beside it that predict its position.
-_MOST_OF, _NEAR_LINES = 0.8, 2
 
 
 class AprilGrid(Board):
     """An AprilGrid. Its origin is the outer corner of the tag at the upper left."""
 
-    name: ClassVar[TargetKind] = "aprilgrid"
+    name: ClassVar[str] = "aprilgrid"
+    noun = "AprilGrid"
+    options = "--columns --rows --size-mm --spacing --border --dictionary --id --name"
+    in_a_word = rf"{COUNTS}_(?P<size_m>{MM})mm_(?P<spacing>0\.[0-9]{{1,9}}|1)"
     keys = "columns rows size_m square_sigma_m spacing dictionary id border"
     size_key = "size_m"
     side, sides = "side of a tag", "tags"
@@ -165,7 +161,7 @@ class AprilGrid(Board):
         """Corners of the tags in a (h, w) grey image, or why there are none."""
         del quick
         expected = _MANY * target.columns * target.rows
-        ids, px = grid_tags(image, target.dictionary, target.border, expected)
+        ids, px = _grid_tags(image, target.dictionary, target.border, expected)
         border = NotFound(
             f"the tags have a border of {3 - target.border} modules, and the target says border = "
             f"{target.border}",
@@ -180,25 +176,21 @@ class AprilGrid(Board):
         if own.sum() <= 0.5 * len(own):
             others = ", ".join(map(str, ids[~own][:5].tolist()))
             return NotFound(f"most tags seen ({others}) are none of the target's", misfit=True)
-        px, misfit = ordered_tags(target, numbers, px, own)
+        px, misfit = _ordered_tags(target, numbers, px, own)
         if misfit > LAYOUT_MISFIT:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
         size = f"the target's {target.columns} x {target.rows}"
         if not own.all() and layout_misfit(_tag_corners(target, numbers), px) <= LAYOUT_MISFIT:
             return NotFound(f"the grid has tag {ids[~own][0]} besides {size}", misfit=True)
         numbers, px = numbers[own], px[own]
-        if lacks_a_line(image, target, numbers, px):
-            return NotFound(
-                f"the grid ends before {size} tags: an outer line is missing", misfit=True
-            )
         if not _has_squares(image, px, target.spacing):
             return NotFound(
                 "the tags lack the small dark squares at their corners that an AprilGrid has "
                 "(they are a target of kind points)",
                 misfit=True,
             )
-        px = refined_tags(image, px, target.spacing)
-        spacing = measured_spacing(target, numbers, px)
+        px = _refined_tags(image, px, target.spacing)
+        spacing = _measured_spacing(target, numbers, px)
         if abs(spacing - target.spacing) > _SPACING:
             if _has_other_border(image, target, ids):
                 return border
@@ -209,30 +201,8 @@ class AprilGrid(Board):
             )
         return DetectedCorners((4 * numbers[:, None] + np.arange(4)).ravel(), px.reshape(-1, 2))
 
-    def identify(self, image: Image, markers: Sequence[Marker]) -> list[Identity]:
-        """Boards of Kalibr's family with borders of one or two modules."""
-        del markers
-        board = _identified(image)
-        return [] if board is None else [board]
 
-
-APRILGRID = AprilGrid()
-
-
-# A board of unknown size.
-_UNKNOWN = Target(
-    "board",
-    "aprilgrid",
-    1,
-    1,
-    1.0,
-    DEFAULT_RELATIVE_SIGMA,
-    dictionary=APRILGRID_DICTIONARY,
-    spacing=_USUAL_SPACING,
-)
-
-
-def grid_tags(
+def _grid_tags(
     image: Image, dictionary: str, border: int, enough: float
 ) -> tuple[IntArray, FloatArray]:
     """Tags in a (h, w) grey image whose corners touch dark squares, without ids that appear twice.
@@ -280,7 +250,7 @@ def _copies(image: Image) -> Iterator[_Copy]:
     yield _Copy(np.asarray(cv2.dilate(image, np.ones((3, 3), np.uint8)), np.uint8), 1.0, _LITTLE)
 
 
-def ordered_tags(
+def _ordered_tags(
     target: Target, numbers: IntArray, px: FloatArray, own: Mask
 ) -> tuple[FloatArray, float]:
     """Orders the corners of tags as on the page, and measures the layout's misfit.
@@ -306,7 +276,7 @@ def ordered_tags(
 def _has_other_border(image: Image, target: Target, ids: IntArray) -> bool:
     """Whether many more tags are read with the other border; a wrong one reads some."""
     expected = max(_MORE * len(ids), _MANY * target.columns * target.rows)
-    other_ids = grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
+    other_ids = _grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
     return len(other_ids) >= expected
 
 
@@ -335,7 +305,7 @@ def _tag_corners(target: Target, numbers: IntArray) -> FloatArray:
     return np.asarray(first[:, None] + square)
 
 
-def refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
+def _refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     """Refines the (t, 4, 2) corners of tags [px], each a saddle point between two dark squares."""
     sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)
     window = int(np.clip(_WINDOW * spacing * sides.min(), *_WINDOWS_PX))
@@ -346,7 +316,7 @@ def refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     return np.where(strays, start, refined).reshape(px.shape).astype(float)
 
 
-def measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
+def _measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
     """Measured gap between tags [sides]; the stated one if too few tags are adjacent.
 
     Four corners of two collinear tags lie at 0, 1, 1 + s and 2 + s. Their cross-ratio (AC BD) / (BC
@@ -374,130 +344,3 @@ def measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float
     quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
     # Scattered corners, as in blurred images, are inconclusive.
     return target.spacing if last - quarter > _SCATTER else float(middle) - 1.0
-
-
-def lacks_a_line(image: Image, target: Target, numbers: IntArray, px: FloatArray) -> bool:
-    """Whether all tags of an outer row or column are missing, and the image shows paper there.
-
-    Dark areas in their place may hide them.
-    """
-    rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
-    # Rows count from below. A missing tag is checked on the side next to the others.
-    near, far = _INSIDE, 1.0 - _INSIDE
-    lines = (
-        (rows, 0, [(value, near) for value in _ALONG]),
-        (rows, target.rows - 1, [(value, far) for value in _ALONG]),
-        (columns, 0, [(far, value) for value in _ALONG]),
-        (columns, target.columns - 1, [(near, value) for value in _ALONG]),
-    )
-    return any(_lacks_line(image, target, numbers, px, *line) for line in lines)
-
-
-def _lacks_line(
-    image: Image,
-    target: Target,
-    numbers: IntArray,
-    px: FloatArray,
-    across: IntArray,
-    end: int,
-    rim: Sequence[tuple[float, float]],
-) -> bool:
-    """Whether a line is missing: the tags whose number `across` the grid is `end`."""
-    line = np.flatnonzero(across == end)
-    # The nearest tags predict the positions despite lens distortion.
-    nearby = np.abs(across[numbers] - end) <= _NEAR_LINES
-    if np.isin(line, numbers).any() or nearby.sum() < _LEAST_TAGS:
-        return False
-    on_board = _tag_corners(target, numbers[nearby])
-    fit = cv2.findHomography(on_board.reshape(-1, 2), px[nearby].reshape(-1, 2))[0]
-    homography = np.asarray(fit, dtype=float)
-    if homography.shape != (3, 3):
-        return False
-    white = 0.5 + (0.5 + target.spacing / 2) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    dark, light = (
-        float(np.nanmedian(_levels(image, on_board[:, 0], array, homography)))
-        for array in (np.array(rim), white)
-    )
-    missing = _levels(image, _tag_corners(target, line)[:, 0], np.array(rim), homography)
-    # NaN outside the image compares as not missing.
-    return float(np.mean(missing > (dark + light) / 2)) > _MOST_OF
-
-
-def _levels(
-    image: Image, corners: FloatArray, inside: FloatArray, homography: FloatArray
-) -> FloatArray:
-    """(t, k) grey levels at k offsets from the (t, 2) upper left corners of tags [sides].
-
-    NaN outside the image.
-    """
-    places = (corners[:, None] + inside).reshape(1, -1, 2)
-    px = np.rint(cv2.perspectiveTransform(places, homography)[0])
-    shown = ((px >= 0) & (px < image.shape[::-1])).all(axis=1)
-    x, y = np.where(shown[:, None], px, 0).astype(int).T
-    return np.where(shown, image[y, x].astype(float), np.nan).reshape(len(corners), -1)
-
-
-def _identified(image: Image) -> Identity | None:
-    """Identifies an AprilGrid of Kalibr's family with borders of one or two modules, or None.
-
-    Ids count the tags row by row from the lower left. Each number of columns therefore predicts the
-    tags' positions; it is right if a homography maps these to the image.
-    """
-    read = {border: grid_tags(image, APRILGRID_DICTIONARY, border, np.inf) for border in (2, 1)}
-    # With the wrong border a few tags are read at wrong positions.
-    border = max(read, key=lambda index: len(read[index][0]))
-    ids, px = read[border]
-    if len(ids) < LEAST_MARKERS:
-        return None
-    columns, first = _grid_columns(ids, px)
-    if not columns:
-        return None
-    first += columns * int((ids.min() - first) // columns)
-    rows = int((ids.max() - first) // columns) + 1
-    target = replace(_UNKNOWN, columns=columns, rows=rows, marker_id=first, border=border)
-    numbers, all_tags = ids - first, np.ones(len(ids), bool)
-    quads = refined_tags(image, ordered_tags(target, numbers, px, all_tags)[0], _USUAL_SPACING)
-    target = replace(target, spacing=round(measured_spacing(target, numbers, quads), 2))
-    # Rows below the image are included, as ids start with 0.
-    below = replace(target, rows=rows + 1)
-    if first and not lacks_a_line(image, below, numbers + columns, quads):
-        rows, first = rows + first // columns, first % columns
-        target = replace(target, rows=rows, marker_id=first)
-    whole = lacks_a_line(image, replace(target, rows=rows + 1), ids - first, quads)
-    seen = APRILGRID.search(image, target)
-    if not isinstance(seen, DetectedCorners):
-        return None
-    notes = [
-        "The white between its tags is estimated by the image, to a hundredth of their side: "
-        "measure it to be sure."
-    ]
-    if not whole:
-        notes.append(f"The board may go on above row {rows}, counted from below.")
-    return Identity(
-        target,
-        whole,
-        len(seen.ids),
-        4 * columns * rows,
-        marker_ids=tuple(ids.tolist()),
-        notes=tuple(notes),
-    )
-
-
-def _grid_columns(ids: IntArray, px: FloatArray) -> tuple[int, int]:
-    """Number of columns, and an id in the first column; 0 if none fits."""
-    all_tags, tried = np.ones(len(ids), bool), range(1, _MOST_COLUMNS + 1)
-    # Ids start with 0 unless the tags contradict it.
-    for starts in (
-        [(count, 0) for count in tried],
-        [(count, offset) for count in tried for offset in range(1, count)],
-    ):
-        misfits = {}
-        for columns, first in starts:
-            numbers = ids - first + columns * (first > 0)
-            rows = int(numbers.max()) // columns + 1
-            target = replace(_UNKNOWN, columns=columns, rows=rows)
-            misfits[columns, first] = ordered_tags(target, numbers, px, all_tags)[1]
-        best = min(misfits, key=lambda key: misfits[key], default=(0, 0))
-        if misfits.get(best, np.inf) <= LAYOUT_MISFIT:
-            return best
-    return 0, 0

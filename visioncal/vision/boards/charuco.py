@@ -13,12 +13,14 @@ from scipy.spatial import KDTree
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import listed
-from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.checkerboard import measure_squares, square_corners
 from visioncal.vision.boards.identity import LEAST_MARKERS, Identity, Marker, holding
 from visioncal.vision.boards.kind import (
+    COUNTS,
     DEFAULT_RELATIVE_SIGMA,
+    MM,
     BoardRequest,
     Cells,
     DetectedCorners,
@@ -51,10 +53,8 @@ _QUICK_PX = 7
 
 # (4, 2) corners [px] by marker id.
 _Markers: TypeAlias = Mapping[int, FloatArray]
-# Usual range of marker side over square side; ratio at which markers cannot be read; smallest
-# square with such markers [m]; other units [m].
-_MARKERS, _UNREADABLE, _SMALLEST_SQUARE_M = (0.4, 0.95), 0.1, 5e-3
-_UNITS = {"mm": 1e-3, "inches": 0.0254, "cm": 1e-2}
+# Smallest marker side over square side.
+_LEAST_MARKER = 0.1
 # Marker side over square side: at least one module of white on every side; squares from which it is
 # whole millimetres [mm]; usual dictionaries.
 _MARKER_SHARE, _COARSE_MM = 0.75, 10
@@ -66,33 +66,34 @@ _NEAR, _OFF = 2.5, 0.3
 _SHARES, _SHARE_STEPS = (0.25, 0.98), 3
 # A marker's corners around its centre [sides].
 _AROUND = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-# Largest number of rows; share of the squares below a row that are to be seen, and of the contrast
-# above it.
-_MOST_ROWS, _HALF = 100, 0.5
 # Number of markers in place that prove a board without its corners; number of layouts listed.
 _SURE_MARKERS, _MOST_TIED = 8, 4
-# Error of a marker's side over a square's by lens and paper; sum of the shifts of two opposite
-# corners by blur, over-exposure and ink [px].
-_SHARE_SIGMA, _OUTLINE_PX = 0.03, 1.0
 
 
 class Charuco(Board):
     """A ChArUco board. Its origin is the outer corner of square 0."""
 
-    name: ClassVar[TargetKind] = "charuco"
+    name: ClassVar[str] = "charuco"
+    noun = "ChArUco board"
+    options = "--columns --rows --square-mm --marker-mm --dictionary --legacy --name"
+    in_a_word = (
+        rf"{COUNTS}_(?P<square_m>{MM})mm_(?P<marker_m>{MM})mm_(?P<dictionary>DICT_\w+?)"
+        "(?P<legacy>_legacy)?"
+    )
     keys = "columns rows square_m square_sigma_m marker_m dictionary legacy"
     is_seen_in_part = is_dense = has_quick_search = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary and legacy."""
         columns, rows = counts_of(table)
-        _check_one_unit(table)
         square_m = size_of(table, "square_m")
         sigma_m = sigma_of(table, square_m)
         marker_m = table.number("marker_m", positive=True)
         # OpenCV compares the sides in single precision.
-        if marker_m >= square_m or not 0.0 < np.float32(marker_m) < np.float32(square_m):
-            raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
+        low_m = _LEAST_MARKER * square_m
+        if not low_m < marker_m < square_m or np.float32(marker_m) >= np.float32(square_m):
+            allowed = f"less than square_m = {square_m!r}, above {low_m:g}, in the same unit,"
+            raise table.refuse("marker_m", marker_m, allowed)
         dictionary = table.text("dictionary")
         markers, needed = dictionary_size(table, dictionary), columns * rows // 2
         if markers < needed:
@@ -241,28 +242,6 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     return board
 
 
-def _check_one_unit(table: DocumentTable) -> None:
-    """Raises an error if squares and markers have different units, judged by their ratio."""
-    square, marker = (table.number(name, positive=True) for name in ("square_m", "marker_m"))
-    if _UNREADABLE * square < marker < square:
-        return
-    low, high = _MARKERS
-    for unit, size_m in _UNITS.items():
-        for key, marker_m, square_m in (
-            ("square_m", marker, square * size_m),
-            ("marker_m", marker * size_m, square),
-        ):
-            corrected = square_m if key == "square_m" else marker_m
-            if low * square_m < marker_m < high * square_m and square_m > _SMALLEST_SQUARE_M:
-                raise DataError(
-                    f"{table.label}: square_m is {square:g} and marker_m is {marker:g}; one is in "
-                    f"another unit: with {key} in {unit}, and not in metres, a marker is "
-                    f"{marker_m / square_m:.2f} of a square, as usual.",
-                    culprits=[f"{table.label}: {key}"],
-                    next_step=f"In the target's .toml, write {key} = {corrected:.6g}.",
-                )
-
-
 def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:
     """Refines (n, 2) corners [px] in windows that exclude the markers."""
     # OpenCV's windows depend on the distance of a marker's corner only: in small, slanted or bent
@@ -354,7 +333,7 @@ def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
         for rival in (identity.board for identity in rivals)
     )
     note = f"What is seen of it fits {layouts} as well: show more of the board."
-    return replace(found[0], whole=False, notes=(note, *found[0].notes))
+    return replace(found[0], notes=(note, *found[0].notes))
 
 
 def _places(ids: IntArray, columns: int, *, legacy: bool) -> FloatArray:
@@ -394,71 +373,22 @@ def _charuco_of(
         seen_places = cv2.perspectiveTransform(quads, np.linalg.inv(px_from_board))
         areas = [cv2.contourArea(quad.astype(np.float32)) for quad in seen_places]
         share = float(np.sqrt(np.median(areas)))
-    rows, whole = _rows(image, px_from_board, columns, rows, share)
     if legacy and rows % 2:
         # A legacy board with an odd number of rows does not start with a marker.
-        rows, whole = rows + 1, False
+        rows += 1
     names = holding(markers[0].family, max(columns * rows // 2, int(ids.max()) + 1))
     if not _SHARES[0] < share < _SHARES[1] or not names:
         return None
-    notes = []
-    if not whole:
-        notes.append(f"The board may go on below row {rows}: its end there is not in the image.")
+    notes = ["The markers' side is by the image, to about 3 %: measure it to be sure."]
     if len(names) > 1:
         notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this board.")
-    if rows % 2 and whole:
-        notes.append("With an odd number of rows the legacy layout is the same as the present one.")
-    square_px = float(np.median([marker.side_px for marker in markers])) / share
-    board = Target(
-        "board",
-        "charuco",
-        columns,
-        rows,
-        1.0,
-        DEFAULT_RELATIVE_SIGMA,
-        share,
-        names[0],
-        legacy,
-    )
-    identity = Identity(
-        board,
-        whole,
-        0,
-        (columns - 1) * (rows - 1),
-        names[1:],
-        float(np.hypot(_SHARE_SIGMA * share, _OUTLINE_PX / square_px)),
-        tuple(sorted(set(ids.tolist()))),
-        tuple(notes),
-    )
-    seen = CHARUCO.search(image, replace(board, marker_m=round(share, 5)))
-    if isinstance(seen, DetectedCorners):
-        return replace(identity, corners_seen=len(seen.ids))
-    if len(markers) < _SURE_MARKERS:
+    sigma, share = DEFAULT_RELATIVE_SIGMA, round(share, 5)
+    board = Target("board", "charuco", columns, rows, 1.0, sigma, share, names[0], legacy)
+    seen = CHARUCO.search(image, board)
+    found = len(seen.ids) if isinstance(seen, DetectedCorners) else 0
+    if not found and len(markers) < _SURE_MARKERS:
         return None
-    return replace(
-        identity, notes=(f"Its corners are not found in this image: {seen.reason}.", *notes)
-    )
-
-
-def _rows(
-    image: Image, px_from_board: FloatArray, columns: int, least: int, share: float
-) -> tuple[int, bool]:
-    """Counts rows beyond the decoded markers, and whether the image shows the board's end.
-
-    Below the last row the squares do not alternate. Their rims are compared, beside any markers.
-    """
-    squares, rim = np.arange(columns), (1.0 - share) / 4
-    for rows in range(least, _MOST_ROWS):
-        sides = np.array([rows - rim, rows + rim])
-        places = np.stack(np.meshgrid(squares + 0.5, sides), axis=-1)
-        px = cv2.perspectiveTransform(places, px_from_board).astype(np.float32)
-        inside = np.asarray((px > 0) & (px < np.array(image.shape[::-1]) - 1))
-        shown = np.all(inside, axis=(0, 2))
-        if shown[::2].mean() < _HALF or shown[1::2].mean() < _HALF:
-            return rows, False
-        levels = cv2.remap(image, px[:, shown, 0], px[:, shown, 1], cv2.INTER_LINEAR)
-        even = squares[shown] % 2 == 0
-        above, below = np.median(levels[:, even], axis=1) - np.median(levels[:, ~even], axis=1)
-        if -np.sign(above) * below < _HALF * abs(above):
-            return rows, True
-    return _MOST_ROWS, False
+    if isinstance(seen, NotFound):
+        notes.insert(0, f"Its corners are not found in this image: {seen.reason}.")
+    corners, numbers = (columns - 1) * (rows - 1), tuple(sorted(set(ids.tolist())))
+    return Identity(board, found, corners, names[1:], numbers, tuple(notes))

@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 
 from visioncal.core.files import DocumentTable
-from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.kind import (
+    COUNTS,
     FEWEST_SQUARES,
+    MM,
     Cells,
     DetectedCorners,
     NotFound,
@@ -38,7 +40,10 @@ _APART, _CHECKERED = 0.25, 0.5
 class Checkerboard(Board):
     """A checkerboard. Its origin is inner corner 0; it has no markers."""
 
-    name: ClassVar[TargetKind] = "checkerboard"
+    name: ClassVar[str] = "checkerboard"
+    noun = "checkerboard"
+    options = "--columns --rows --square-mm --name"
+    in_a_word = rf"{COUNTS}_(?P<square_m>{MM})mm"
     symmetric: ClassVar[Literal["", "squares", "places"]] = "squares"
     is_dense = True
     # A checkerboard has no markers that get lost in a reduced copy.

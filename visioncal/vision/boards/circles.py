@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from visioncal.core.files import DocumentTable
-from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
@@ -72,7 +72,9 @@ class Circles:
 class CircleGrid(Board):
     """A grid of circles. Its origin is the first one's centre; it has no markers."""
 
-    name: ClassVar[TargetKind] = "circles"
+    name: ClassVar[str] = "circles"
+    noun = "grid of circles"
+    options = "--columns --rows --square-mm --diameter-mm --asymmetric --name"
     keys = f"{Board.keys} diameter_m asymmetric"
     sides, unit = "a distance of rows", "distance"
     symmetric: ClassVar[Literal["", "squares", "places"]] = "places"
@@ -119,8 +121,10 @@ class CircleGrid(Board):
         return ()
 
     def discs(self, target: Target) -> FloatArray:
-        """(n, 2) centres of its circles [m]."""
-        return self.corners(target)[:, :2]
+        """(n, 3) centres and radii of its circles [m]."""
+        places = self.corners(target)
+        places[:, 2] = target.diameter_m / 2
+        return places
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it."""
@@ -154,7 +158,8 @@ class CircleGrid(Board):
         """The print around centres, half way to the next circle."""
         del squares
         half = float(np.sqrt(0.5)) if target.asymmetric else 0.5
-        return Print(np.ones(len(ids)), np.inf, half, target.diameter_m / target.square_m / 2)
+        radii = np.full(len(ids), target.diameter_m / target.square_m / 2)
+        return Print(np.ones(len(ids)), np.inf, half, radii)
 
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected centres [px] with these (n,) ids by the template."""
@@ -221,7 +226,7 @@ def _seen_grids(image: Image) -> tuple[Circles, ...]:
 
     The least rotated order comes first.
     """
-    blobs = _blobs(image)
+    blobs = find_blobs(image)
     if len(blobs.px) < _LEAST:
         return ()
     lattice, members = _lattice(blobs)
@@ -247,7 +252,7 @@ def _seen_grids(image: Image) -> tuple[Circles, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Blobs:
+class Blobs:
     """Dark blobs: centres (n, 2) [px], and second moments (n, 2, 2) [px^2].
 
     `fill` (n,) is the share of the ellipse of its moments that each fills.
@@ -258,6 +263,7 @@ class _Blobs:
     fill: FloatArray
 
     def at(self, chosen: IntArray) -> Self:
+        """Some of the blobs."""
         return replace(
             self, px=self.px[chosen], moments=self.moments[chosen], fill=self.fill[chosen]
         )
@@ -273,7 +279,8 @@ class _Blobs:
         return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(_ALIKE))
 
 
-def _blobs(image: Image) -> _Blobs:
+def find_blobs(image: Image) -> Blobs:
+    """Dark blobs of a (h, w) grey image that look like ellipses, the largest first."""
     block = 2 * int(_SURROUNDINGS * min(image.shape) / 2) + 3
     dark = cv2.adaptiveThreshold(
         image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, _DARKER
@@ -301,7 +308,7 @@ def _blobs(image: Image) -> _Blobs:
         # A contour passes through the outermost dark pixels' centres, half a pixel inside the edge.
         radius = np.sqrt(area / np.pi)
         moments.append(((radius + 0.5) / radius) ** 2 * covariance)
-    blobs = _Blobs(np.reshape(centres, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
+    blobs = Blobs(np.reshape(centres, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
     # Blobs larger than the threshold's window also have an inner edge close to the outer one.
     blobs = blobs.at(np.argsort(-blobs.diameters, kind="stable"))
     pairs = cKDTree(blobs.px).query_pairs(2.0) if len(blobs.px) else set()
@@ -310,7 +317,7 @@ def _blobs(image: Image) -> _Blobs:
     return blobs.at(np.setdiff1d(np.arange(len(blobs.px)), inner))
 
 
-def _lattice(blobs: _Blobs) -> tuple[IntArray, IntArray]:
+def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:
     """Largest set of points on one lattice: (n, 2) lattice coordinates, and point indices (n,)."""
     px, tree = blobs.px, cKDTree(blobs.px)
     best: dict[tuple[int, int], int] = {}
@@ -339,9 +346,7 @@ def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
     return None
 
 
-def _grown(
-    blobs: _Blobs, tree: cKDTree, seed: int, steps: FloatArray
-) -> dict[tuple[int, int], int]:
+def _grown(blobs: Blobs, tree: cKDTree, seed: int, steps: FloatArray) -> dict[tuple[int, int], int]:
     """Points reached by repeated steps, by their lattice coordinates."""
     px = blobs.px
     places, used = {(0, 0): seed}, {seed}

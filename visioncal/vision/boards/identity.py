@@ -31,13 +31,11 @@ _MODULE_PX, _RING = 4, 0.5
 class Identity:
     """An identified target, without its size."""
 
-    board: Target  # The target, with sides of 1 m.
-    whole: bool  # Whether the board's end is visible; otherwise it may be larger.
+    board: Target  # The target, with sides of 1 m; its rows are those that the image shows.
     corners_seen: int  # Number of corners that the detector of this kind finds.
     corners: int  # Number of corners of the target.
     # Other dictionaries that contain the same markers; that of the target is the smallest.
     larger: tuple[str, ...] = ()
-    marker_share_sigma: float = 0.0  # Standard deviation of `marker_share`.
     # Decoded ids, ascending; for single markers, the target's first.
     marker_ids: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()  # Remarks, in sentences.
@@ -47,11 +45,6 @@ class Identity:
         """Whether it is a single marker."""
         return self.board.columns * self.board.rows == 1
 
-    @property
-    def marker_share(self) -> float:
-        """Marker side over square side; 0 except for ChArUco."""
-        return self.board.marker_m
-
     def target(self, name: str, square_m: float) -> Target:
         """The target, with the measured side of a square, or of a single marker [m]."""
         return replace(
@@ -59,7 +52,7 @@ class Identity:
             name=name,
             square_m=square_m,
             square_sigma_m=DEFAULT_RELATIVE_SIGMA * square_m,
-            marker_m=round(self.marker_share * square_m, 5),
+            marker_m=round(self.board.marker_m * square_m, 5),
         )
 
 

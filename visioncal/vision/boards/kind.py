@@ -1,9 +1,10 @@
 """A kind of target: one class in one file, which reads, places, draws, finds and identifies it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.template import Refined, unrefined
 
 if TYPE_CHECKING:
@@ -31,6 +32,9 @@ _SMALLEST_MM = 0.1
 FEWEST_SQUARES, MOST_SQUARES = 3, 100
 # Quiet zone that detectors need around squares; markers need one module [m].
 _QUIET_M = 0.0025
+# Counts and lengths [mm] in a description of one word.
+COUNTS = "(?P<columns>[0-9]{1,3})x(?P<rows>[0-9]{1,3})"
+MM = r"[0-9]{1,5}(?:\.[0-9]{1,9})?"
 # Fields of targets with other names than their keys.
 _FIELDS = {"id": "marker_id", "size_m": "square_m"}
 
@@ -72,7 +76,7 @@ class Cells:
 class BoardRequest:
     """Requirements of a board; None and empty texts are chosen automatically."""
 
-    kind: TargetKind  # Kind of target.
+    kind: str  # Kind of target.
     # Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
     # x.
     columns: int | None = None
@@ -93,13 +97,19 @@ class BoardRequest:
 class BoardKind(ABC):
     """A kind of target. Its instance has no state: everything is in the `Target`."""
 
-    name: ClassVar[TargetKind]
+    name: ClassVar[str]
     # Keys of its description besides `kind`; the one of its size, what that is, and what has it.
     keys: ClassVar[str] = "columns rows square_m square_sigma_m"
     size_key: ClassVar[str] = "square_m"
     side: ClassVar[str] = "side of a square"
     sides: ClassVar[str] = "squares"
     unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
+    noun: ClassVar[str] = "board"  # What it is called before its name.
+    # Options of `target make` that describe it; empty where it cannot be made by options.
+    options: ClassVar[str] = ""
+    # Pattern of its description in one word, after its name and _, with keys as groups; empty
+    # without one.
+    in_a_word: ClassVar[str] = ""
     # Whether some of its corners can be detected without the others.
     is_seen_in_part: ClassVar[bool] = False
     # Whether tags stand alone, and need white around them that is as wide as one module.
@@ -151,15 +161,36 @@ class BoardKind(ABC):
         """The target as the content of a `.toml` that `read` can read."""
         return {key: getattr(target, _FIELDS.get(key, key)) for key in self.keys.split()}
 
+    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The content of its `.toml` with that of the tables that it names, from its folder."""
+        del folder
+        return document
+
+    def stored(
+        self, document: Mapping[str, Any], stem: str
+    ) -> tuple[Mapping[str, Any], dict[str, str]]:
+        """The inverse of `loaded`: the content of `STEM.toml`, and texts of its tables by name."""
+        del stem
+        return document, {}
+
+    def scaled(self, target: Target, factor: float) -> Target:
+        """A board whose printed sizes are larger by a factor."""
+        return replace(
+            target,
+            square_m=factor * target.square_m,
+            marker_m=factor * target.marker_m,
+            diameter_m=factor * target.diameter_m,
+        )
+
     def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
         places = self.corners(target)[:, :2]
         return places.min(axis=0), places.max(axis=0)
 
     def discs(self, target: Target) -> FloatArray:
-        """(n, 2) centres of dark discs [m], of the target's diameter."""
+        """(n, 3) centres and radii of dark discs [m]."""
         del target
-        return np.zeros((0, 2))
+        return np.zeros((0, 3))
 
     def quiet_m(self, cells: Sequence[Cells]) -> float:
         """Width of the white that it needs around its cells [m]."""

@@ -8,11 +8,12 @@ import numpy as np
 
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import listed, some_of
-from visioncal.core.types import FloatArray, Image, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.boards.board import DETECTED_WEIGHT
 from visioncal.vision.boards.identity import Identity, Marker, holding, modules
 from visioncal.vision.boards.kind import (
     DEFAULT_RELATIVE_SIGMA,
+    MM,
     BoardKind,
     BoardRequest,
     Cells,
@@ -44,7 +45,10 @@ _LIKE, _SHORT_LIKE, _SHORT_MODULES = 0.5, 0.83, 6
 class MarkerKind(BoardKind):
     """A single marker. Its origin is its centre."""
 
-    name: ClassVar[TargetKind] = "marker"
+    name: ClassVar[str] = "marker"
+    noun = "marker"
+    options = "--id --size-mm --dictionary --name"
+    in_a_word = rf"(?P<dictionary>DICT_\w+)_(?P<id>[0-9]{{1,5}})_(?P<size_m>{MM})mm"
     keys = "id size_m square_sigma_m dictionary"
     size_key = "size_m"
     side, sides = "side of the dark square", "a side"
@@ -168,10 +172,11 @@ def single_marker(markers: Sequence[Marker]) -> Identity | None:
     if others:
         notes.append(
             f"Also seen: {some_of([*map(str, others)], _LISTED)}. A target is one marker, and the "
-            "largest is taken; where they are a board's, show more of it; where they lie freely, "
-            'describe them by a table of their corners (kind = "points").'
+            "largest is taken; where they are a board's, show more of it, or describe it if it is "
+            'an AprilGrid (kind = "aprilgrid"); where they lie freely, describe them by a table of '
+            'their corners (kind = "points").'
         )
     if len(names) > 1:
         notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this one.")
     board = _target("board", 1.0, DEFAULT_RELATIVE_SIGMA, names[0], ids[0])
-    return Identity(board, True, 4, 4, names[1:], marker_ids=ids, notes=tuple(notes))
+    return Identity(board, 4, 4, names[1:], ids, tuple(notes))

@@ -11,7 +11,7 @@ from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.documents.tables import read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, is_inside
-from visioncal.core.types import FloatArray, Image, IntArray, Target, TargetKind
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.kind import (
     LEAST_SIGMA_M,
     BoardKind,
@@ -42,7 +42,8 @@ _LEAST_TAGS = 2
 class Rig(BoardKind):
     """A rig of points, in the frame of its table. Points are found if they are corners of tags."""
 
-    name: ClassVar[TargetKind] = "points"
+    name: ClassVar[str] = "points"
+    noun = "rig"
     unit = "side"
     fewest = 4
     is_seen_in_part = has_lone_tags = True
@@ -54,17 +55,7 @@ class Rig(BoardKind):
             column in columns for column in RIG_COLUMNS[:4]
         ):
             raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
-        names = [column for column in RIG_COLUMNS if column in columns]
-        lists = [columns[word] for word in names]
-        try:
-            values = np.array(lists, dtype=float)
-        except (TypeError, ValueError):
-            values = np.zeros(0)
-        for words, step in _rig_problems(names, values):
-            culprit = f"{table.label}: points"
-            raise DataError(f"{culprit}, its table, {words}.", culprits=[culprit], next_step=step)
-        numbers, places_m = values[0], values[1:4].T
-        sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
+        numbers, places_m = points_of(table, columns)
         extent_m = float(np.ptp(places_m, axis=0).max())
         return Target(
             name,
@@ -74,10 +65,24 @@ class Rig(BoardKind):
             extent_m,
             0.0,
             points_m=tuple((x, y, z) for x, y, z in places_m.tolist()),
-            point_numbers=tuple(numbers.astype(int).tolist()),
-            point_sigmas_m=tuple(sigmas_m.tolist()),
+            point_numbers=numbers,
+            point_sigmas_m=tuple(map(float, columns.get("sigma_m", ()))),
             **_tags_of_rig(table, columns),
         )
+
+    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The content of its `.toml` with the columns of its table."""
+        table = document.get("points")
+        if not isinstance(table, str):
+            return document
+        return document | {"points": read_points(folder, table, RIG_COLUMNS, RIG_COLUMNS[:4])}
+
+    def stored(
+        self, document: Mapping[str, Any], stem: str
+    ) -> tuple[Mapping[str, Any], dict[str, str]]:
+        """The content of its `.toml`, and its table `STEM.points.csv`."""
+        table = f"{stem}.points.csv"
+        return {**document, "points": table}, {table: points_csv(document["points"])}
 
     def document(self, target: Target) -> dict[str, Any]:
         """The rig as the content of a `.toml`, with its table."""
@@ -187,9 +192,11 @@ class Rig(BoardKind):
         return np.asarray(places[numbers, :2])
 
 
-def read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
-    """Reads the table of a rig's points by columns, from the folder of the rig's description."""
-    path = folder / name
+def read_points(
+    folder: Path, name: str, known: Sequence[str], needed: Sequence[str]
+) -> dict[str, list[Any]]:
+    """Reads a table of points by columns, from the folder of its target's description."""
+    path = folder / name.replace("\\", "/")
     if not is_inside(path, folder):
         raise DataError(
             f"points = {name!r} leads out of the folder of the target's file.",
@@ -197,12 +204,13 @@ def read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
             next_step="Copy the table of points beside the target's file.",
         )
     table = read_table(path)
-    unknown = [column for column in table.columns if column not in RIG_COLUMNS]
-    missing = [column for column in RIG_COLUMNS[:4] if column not in table.columns]
+    unknown = [column for column in table.columns if column not in known]
+    missing = [column for column in needed if column not in table.columns]
     if unknown or missing:
+        optional = ", ".join(column for column in known if column not in needed)
         raise DataError(
-            f"{path}: its columns are {', '.join(table.columns)}; point, x_m, y_m, z_m and, where "
-            "it is known, sigma_m are needed; tag and corner where they are corners of tags.",
+            f"{path}: its columns are {', '.join(table.columns)}; {', '.join(needed)} are needed, "
+            f"and {optional} where they are known.",
             culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
         )
     reader = TableReader(table)
@@ -216,11 +224,25 @@ def read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
     return read
 
 
-def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
-    """Text of a rig's table, from its columns."""
-    columns = [column for column in RIG_COLUMNS if column in points]
-    rows = zip(*(points[column] for column in columns), strict=True)
-    return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
+def points_csv(points: Mapping[str, Sequence[float]]) -> str:
+    """Text of a table of points, from its columns."""
+    rows = zip(*points.values(), strict=True)
+    return "\n".join([",".join(points), *(",".join(map(repr, row)) for row in rows), ""])
+
+
+def points_of(
+    table: DocumentTable, columns: Mapping[str, Any]
+) -> tuple[tuple[int, ...], FloatArray]:
+    """Checked numbers and (n, 3) places [m] of a table's points, by its columns as lists."""
+    names = [column for column in RIG_COLUMNS if column in columns]
+    try:
+        values = np.array([columns[word] for word in names], dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    for words, step in _rig_problems(names, values):
+        culprit = f"{table.label}: points"
+        raise DataError(f"{culprit}, its table, {words}.", culprits=[culprit], next_step=step)
+    return tuple(values[0].astype(int).tolist()), values[1:4].T
 
 
 def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[str, str]]:

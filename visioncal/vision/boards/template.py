@@ -139,7 +139,7 @@ class Print:
     # without them.
     inset: float
     half: float = _HALF  # Half-width of the patch around a corner [squares].
-    radius: float = 0.0  # Radius of the circle [squares]; 0 without one.
+    radii: FloatArray | None = None  # (n,) radii of circles [squares]; None without circles.
     # (n, 2) signs of x and y on the dark square of a lone tag's corner; None where two dark squares
     # meet.
     lone: FloatArray | None = None
@@ -152,8 +152,10 @@ class Print:
 
     def at(self, chosen: IntArray) -> Self:
         """The print around some of the corners."""
-        lone, axes = (None if array is None else array[chosen] for array in (self.lone, self.axes))
-        return replace(self, signs=self.signs[chosen], lone=lone, axes=axes)
+        lone, axes, radii = (
+            None if array is None else array[chosen] for array in (self.lone, self.axes, self.radii)
+        )
+        return replace(self, signs=self.signs[chosen], lone=lone, axes=axes, radii=radii)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,11 +198,12 @@ class _Windows:
         jacobian = np.asarray(np.linalg.inv(jacobian_px), float)
         side_px = np.sqrt(np.abs(np.linalg.det(jacobian)))
         # A circle needs its whole edge.
-        most = np.inf if pattern.radius else _MOST_PX
+        radii = None if pattern.radii is None else pattern.radii[chosen]
+        most = _MOST_PX if radii is None else np.inf
         half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
-        if pattern.radius:
-            around_px = np.maximum(_AROUND_CIRCLE * pattern.radius * side_px, _AROUND_PX)
-            half = np.minimum(half, pattern.radius + around_px / side_px)
+        if radii is not None:
+            around_px = np.maximum(_AROUND_CIRCLE * radii * side_px, _AROUND_PX)
+            half = np.minimum(half, radii + around_px / side_px)
         needed_px = float(np.max(half * np.abs(jacobian).sum(axis=2).max(axis=1)))
         affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
         reach = int(np.ceil(min(most, affordable, needed_px)))
@@ -223,7 +226,7 @@ class _Windows:
             (columns >= rim) & (columns < width - rim)
         )[:, None, :]
         rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
-        distances = np.hypot(x, y) if pattern.radius else np.maximum(np.abs(x), np.abs(y))
+        distances = np.hypot(x, y) if radii is not None else np.maximum(np.abs(x), np.abs(y))
         within = distances < half[:, None, None]
         return cls(
             start,
@@ -393,9 +396,9 @@ def _refine_corners(
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
     sample = indices[:: -(-len(px) // _BLUR_SAMPLE)]
     windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
-    blur_px, radius = _estimate_blur(windows.at(sample), pattern.at(sample))
-    if pattern.radius:
-        pattern = replace(pattern, radius=radius)
+    blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
+    if pattern.radii is not None:
+        pattern = replace(pattern, radii=pattern.radii + grown)
         windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
     is_lone = pattern.lone is not None
     tolerances_px, last_px = (
@@ -438,19 +441,21 @@ def _refine_corners(
 
 
 def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float]:
-    """(2,) median edge widths of the smoothed image [px], and the circles' radius."""
+    """(2,) median edge widths of the smoothed image [px], and the growth of circles' radii."""
     side_px = 1.0 / np.median(windows.widths)
     # A larger start would exclude all white around a lone corner.
     blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * min(pattern.outside, 1.0) * side_px))
-    shift = np.zeros((len(windows.px), 2))
+    shift, total = np.zeros((len(windows.px), 2)), 0.0
     for _ in range(_BLUR_ITERATIONS):
         step = _step(windows, pattern, shift, blur_px, blurs=True)
         shift = shift + _limited(step.shift)
         medians = np.array([_median(column) for column in step.blur.T])
         changes = np.clip(np.nan_to_num(medians), -0.5, 0.5)
-        change, grown = changes[:2], float(changes[2]) if pattern.radius else 0.0
-        radius = np.clip(pattern.radius + grown, 0.5 * pattern.radius, 1.5 * pattern.radius)
-        pattern = replace(pattern, radius=float(radius))
+        change = changes[:2]
+        if pattern.radii is not None:
+            least = float(pattern.radii.min())
+            grown = float(np.clip(changes[2], -0.5 * least, 0.5 * least))
+            pattern, total = replace(pattern, radii=pattern.radii + grown), total + grown
         blur_px = np.clip(blur_px * np.exp(change), _BLUR_LEAST_PX, 0.5 * side_px)
         if np.abs(change).max() < (
             _BLUR_TOLERANCE if pattern.lone is None else _LONE_BLUR_TOLERANCE
@@ -458,7 +463,7 @@ def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float
             break
     # With too few pixels around a lone corner the blur does not converge.
     converged = pattern.lone is None or np.abs(medians).max() < _LONE_BLUR_TOLERANCE
-    return blur_px if converged else np.full(2, np.nan), pattern.radius
+    return blur_px if converged else np.full(2, np.nan), total
 
 
 def _fit_positions(
@@ -538,7 +543,7 @@ def _steps(
         used &= (lone_x * x > far_x) & (lone_y * y > far_y)
         # At a slanted corner the blur is not a product of two edges.
         used &= (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
-    if pattern.radius:
+    if pattern.radii is not None:
         product, *derivatives = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
     else:
         # Next lines matter if any corner is blurred enough.
@@ -617,7 +622,7 @@ def _circle(
     distance = np.hypot(x, y) + np.float32(1e-6)
     part_x, part_y = (sx * x / distance) ** 2, (sy * y / distance) ** 2
     width = np.sqrt(part_x + part_y)
-    depth = np.float32(pattern.radius) - distance
+    depth = np.asarray(pattern.radii, np.float32)[:, None, None] - distance
     edge, slope, width_derivative = _edges(depth, width, blurs=True, wide=False)
     inward = -slope / distance
     by_width = width_derivative / (part_x + part_y)

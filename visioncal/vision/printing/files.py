@@ -8,14 +8,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import (
     check_free,
     named_errors,
-    read_toml,
     write_atomically,
     write_generation,
 )
 from visioncal.core.types import Target
 from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import Sheet
-from visioncal.vision.targets import target_document, target_from_document
+from visioncal.vision.targets import read_target, stored_target, target_document
 
 # Larger pages take gigabytes of memory to draw.
 _MOST_PIXELS = 2.5e8
@@ -48,27 +47,21 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
     name = sheet.target.name
     _check_name(name, not_in_font(name))
     _check_dpi(sheet, dpi)
-    files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
+    names = [f"{name}.{ending}" for ending in ("pdf", "svg", "png")]
     # The folder's name may be invalid for the file system.
     with named_errors(folder):
-        kept = _describes(files["toml"], sheet.target)
-        for ending, path in files.items():
-            if ending != "toml" or not kept:
-                check_free(path, force=force)
-    drawn: dict[str, bytes | str] = {
-        "pdf": to_pdf(sheet),
-        "svg": to_svg(sheet),
-        "png": to_png(sheet, dpi),
-    }
-    if not kept:
-        drawn["toml"] = _description(sheet)
+        described = {} if _describes(folder / f"{name}.toml", sheet.target) else _described(sheet)
+        for file in (*names, *described):
+            check_free(folder / file, force=force)
+    drawings = (to_pdf(sheet), to_svg(sheet), to_png(sheet, dpi))
+    drawn: dict[str, bytes | str] = {**dict(zip(names, drawings, strict=True)), **described}
 
     def write(aside: Path) -> None:
-        for ending, content in drawn.items():
-            write_atomically(aside / files[ending].name, content)
+        for file, content in drawn.items():
+            write_atomically(aside / file, content)
 
-    write_generation(folder, [files[ending].name for ending in drawn], write)
-    return tuple(files[ending] for ending in drawn)
+    write_generation(folder, list(drawn), write)
+    return tuple(folder / file for file in drawn)
 
 
 def _check_name(name: str, not_in_font: str) -> None:
@@ -99,20 +92,22 @@ def _describes(path: Path, target: Target) -> bool:
     if not path.is_file():
         return False
     try:
-        described = target_from_document(read_toml(path, path.name), target.name)
+        described = read_target(path.name, path.parent)[0]
     except DataError:
         return False
     return described == target
 
 
-def _description(sheet: Sheet) -> str:
+def _described(sheet: Sheet) -> dict[str, str]:
+    """Texts of the board's `.toml` and of its tables, by name."""
     left, top, right, bottom = sheet.pattern.box
-    page = sheet.page
+    page, name = sheet.page, sheet.target.name
     lying = "landscape" if page.width_mm > page.height_mm else "portrait"
     size = kind_of(sheet.target).size_key
-    return (
+    content, tables = stored_target(target_document(sheet.target), name)
+    described = (
         f"# {1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, for {page.name}, {lying}.\n"
         f"# {size} is what was meant to be printed: replace it by what you measure on paper,\n"
-        "# and square_sigma_m by how well you measured it.\n"
-        + tomli_w.dumps(target_document(sheet.target))
+        "# and square_sigma_m by how well you measured it.\n" + tomli_w.dumps(content)
     )
+    return {f"{name}.toml": described, **tables}

@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
@@ -158,12 +158,7 @@ def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
     while fails - fits > 1:
         middle = (fits + fails) // 2
         scale = 1e-3 * middle / target.square_m
-        tried = replace(
-            target,
-            square_m=scale * target.square_m,
-            marker_m=scale * target.marker_m,
-            diameter_m=scale * target.diameter_m,
-        )
+        tried = kind_of(target).scaled(target, scale)
         pattern = draw_pattern(tried)
         rooms = [(_room(tried, pattern, page), page) for page in pages]
         if any(

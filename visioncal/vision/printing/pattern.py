@@ -23,7 +23,7 @@ def dark_cells(target: Target) -> tuple[Cells, ...]:
 
 
 def dark_discs(target: Target) -> FloatArray:
-    """(n, 2) centres of the dark discs on a target [m], of its diameter."""
+    """(n, 3) centres and radii of the dark discs on a target [m]."""
     return kind_of(target).discs(target)
 
 
@@ -54,7 +54,7 @@ def draw_pattern(target: Target) -> Pattern:
         for grid in grids
         for loop in outlines(grid.dark)
     ]
-    loops += [disc + target.diameter_m / 2 * _CIRCLE for disc in dark_discs(target)]
+    loops += [disc[:2] + disc[2] * _CIRCLE for disc in dark_discs(target)]
     return Pattern(tuple(loops), (left, top, right, bottom), kind.quiet_m(grids))
 
 
