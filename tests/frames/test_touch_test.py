@@ -3,7 +3,6 @@
 import io
 import json
 import shutil
-from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +20,6 @@ from visioncal.frames.touch_test import (
 )
 from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import rewrite_result
-from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.hover import Hovering
-from visioncal.live.drivers.ur import UrArm
-from visioncal.live.planning.cell import Limits, cell_of_calibration, touching_model
-from visioncal.live.simulated.controller import ControllerOptions, spawn
 from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
 from visioncal.session import Session
@@ -112,55 +106,6 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
     test = evaluate_gaps(points, gaps_mm)
     assert test.passed == passed
     assert (f"The gap at {points[3].name} (" in touch_test_finding(test).words) != passed
-
-
-@pytest.mark.usefixtures("patient")
-def test_a_driven_arm_hovers_above_each_point(proved, known, located, monkeypatch):
-    pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
-    folder, look, _ = proved
-    session = Session.load(folder / "session")
-    cell = replace(cell_of_calibration(known, session.target, Limits()), robot=known.robot)
-    clear = touching_model(cell, located.flange_from_tip.matrix, located.board.edge)
-    starts = [view.joints_rad for view in session.views]
-    # A posture in which the camera is far enough from the wrist.
-    start = next(q for q in starts if clear.first_contact(q[None])[0] < 0)
-    points, above = located.points, located.above
-    # The controller believes in the data sheet, as the calibration's nominal arm does.
-    with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
-        with closing(UrArm(controller.host)) as arm:
-            hovering = Hovering.of(arm, known, session.target, located, 0.05, Consent(None))
-            hovering.bring(above(points[0], 0.05), points[0].name)
-            away = invert(above(points[0], 0.05)) @ arm.state().base_from_flange
-            # A tenth of the least gap that can be read.
-            assert np.linalg.norm(away[:3, 3]) < 1e-5
-            # Through the board leads no way.
-            with pytest.raises(DataError, match=r"no clear way|above the board|mm apart"):
-                hovering.bring(above(points[1], -0.03), points[1].name)
-        drive = "touch-test", look, "-c", folder / "out", *GAUGE, "--drive", f"ur:{controller.host}"
-        monkeypatch.setattr("sys.stdin", io.StringIO("y\n" + "0.1\n" * 5))
-        refused = visioncal(*drive)
-        assert refused.status == 2
-        assert "stdin is no terminal" in refused.err
-        # A terminal whose input ends after the first motion and its gap.
-        typed = io.StringIO("y\ny\n0.1\n")
-        typed.isatty = lambda: True
-        monkeypatch.setattr("sys.stdin", typed)
-        ended = visioncal(*drive)
-        assert ended.status == 2
-        assert "without consent" in ended.err
-        away = invert(above(points[0], 0.05)) @ _stands(controller, known)
-        assert np.linalg.norm(away[:3, 3]) < 2e-3
-        monkeypatch.setattr("sys.stdin", io.StringIO("0.1\n" * 5))
-        done = visioncal(*drive, "--yes")
-        assert done.status == 0, done.err
-        away = invert(above(points[-1], 0.05)) @ _stands(controller, known)
-        assert np.linalg.norm(away[:3, 3]) < 2e-3
-
-
-def _stands(controller, known):
-    """Where the simulated arm's flange is, by its encoders and the data sheet."""
-    with closing(UrArm(controller.host, watch_only=True)) as arm:
-        return known.robot.base_from_flange(arm.state().q[None])[0]
 
 
 def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):

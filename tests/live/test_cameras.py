@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from support.mjpeg import NetworkCamera, number_of, served
 
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DriverError
 from visioncal.live.drivers import extras
-from visioncal.live.drivers.images import FolderCamera
 from visioncal.live.drivers.oak import OakCamera
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.live.drivers.uvc import UvcCamera
@@ -48,43 +47,6 @@ def test_the_command_installs_what_the_extra_would():
         ]
 
 
-def a_folder(path, names=("view1.png", "view2.png", "view10.png"), shape=(48, 64)):
-    path.mkdir()
-    images = {name: RNG.integers(0, 255, shape, dtype=np.uint8) for name in names}
-    for name, image in images.items():
-        cv2.imwrite(str(path / name), image)
-    return images
-
-
-def test_a_folder_gives_its_images_in_the_order_of_their_numbers(tmp_path):
-    images = a_folder(tmp_path / "bilder ü")
-    camera = FolderCamera(tmp_path / "bilder ü")
-    assert isinstance(camera, CameraDevice)
-    assert camera.resolution == (64, 48)
-    for name in ("view1.png", "view2.png", "view10.png"):
-        before = time.monotonic()
-        frame = camera.frame()
-        assert np.array_equal(frame.image, images[name])
-        assert before <= frame.stamp_s <= time.monotonic()
-    with pytest.raises(DriverError, match="all 3 were given"):
-        camera.frame()
-
-
-def test_a_folder_without_images_or_with_a_bad_one_is_refused_by_name(tmp_path):
-    with pytest.raises(DataError, match="no folder"):
-        FolderCamera(tmp_path / "none")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="holds no images"):
-        FolderCamera(tmp_path / "empty")
-    a_folder(tmp_path / "mixed")
-    cv2.imwrite(str(tmp_path / "mixed" / "view2.png"), np.zeros((10, 20), np.uint8))
-    (tmp_path / "mixed" / "view10.png").write_bytes(b"")
-    camera = FolderCamera(tmp_path / "mixed")
-    camera.frame()
-    with pytest.raises(DataError, match=r"view2\.png has 20x10"):
-        camera.frame()
-
-
 def test_a_video_file_is_refused_whose_pictures_have_no_time(tmp_path):
     path = str(tmp_path / "a.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 10.0, (64, 48))
@@ -93,7 +55,7 @@ def test_a_video_file_is_refused_whose_pictures_have_no_time(tmp_path):
     writer.release()
     with pytest.raises(DriverError, match="video file") as error:
         UvcCamera(path)
-    assert "folder:" in error.value.next_step
+    assert "visioncal convert" in error.value.next_step
 
 
 def test_what_cannot_be_opened_tells_where_to_look(tmp_path, capfd):

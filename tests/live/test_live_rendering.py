@@ -96,7 +96,7 @@ def test_the_arm_is_asked_for_the_time_of_exposure():
 
 def test_an_unplugged_camera_says_so_in_time():
     _, time, camera = a_camera()
-    camera.fault = "unplugged"
+    camera.is_unplugged = True
     before = time.seconds
     with pytest.raises(DriverError, match="no picture within"):
         camera.frame(timeout_s=0.5)

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import re
 import signal
 import sys
@@ -13,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import rerun as rr
-from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.drawn import column
 from support.live_cell import fake_devices, fake_plan
@@ -21,15 +19,12 @@ from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
 from visioncal.cli import record as record_module
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DataError
 from visioncal.live.capture import devices
 from visioncal.live.capture.cell import HostClock
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
+from visioncal.live.planning.plan_file import plan_document, read_plan
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.present.recording import paths
-from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
-from visioncal.present.viewer import live as viewer
 from visioncal.session import Session
 
 ARM, CAMERA = ("--arm", "fake:here"), ("--camera", "fake")
@@ -302,46 +297,6 @@ def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_pa
         number = number_of(cv2.imread(str(tmp_path / "live" / view.image)))
         off = view.base_from_flange().translation - true_flanges[number][:3, 3]
         assert np.linalg.norm(off) < REPEATABILITY_M
-
-
-def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
-    plan = read_plan(planned[0])
-    arm, camera = fake_devices(plan)
-    (tmp_path / "pictures").mkdir()
-    lines = []
-    for at, stop in enumerate(plan.stops):
-        arm.q0 = stop.q
-        cv2.imwrite(str(tmp_path / "pictures" / f"shot{at}.png"), camera.frame().image)
-        pose = arm.true_flange(0.0)
-        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-        numbers = ", ".join(f"{value:.6f}" for value in [*pose[:3, 3], *turn])
-        lines.append(f"p[{numbers}]")
-    answers = io.StringIO("\n".join([*lines, ""]))
-    words = ["--arm", "manual", "--camera", f"folder:{tmp_path / 'pictures'}"]
-    words += ["--target", "charuco_9x6_30mm", "-o", tmp_path / "live"]
-    with patch.object(sys, "stdin", answers):
-        done = visioncal("record", *words)
-    assert done.status == 0, done.err
-    # A pipe that gives nothing yet is waited for, which has to be said first.
-    assert done.err.startswith("Poses are read from stdin")
-    session = Session.load(tmp_path / "live")
-    assert len(session.views) == len(plan.stops)
-    for view, stop in zip(session.views, plan.stops, strict=True):
-        flange = plan.cell.robot.base_from_flange(stop.q[None])[0]
-        # Six digits of metres and radians.
-        assert np.allclose(view.base_from_flange().as_matrix(), flange, atol=5e-6)
-    with patch.object(sys, "stdin", io.StringIO("")):
-        done = visioncal("record", *words, "--resume")
-    assert done.status == 2
-    assert "begins with its first picture again" in done.err
-    # What is advised where it ends early is possible, too.
-    words[-1] = tmp_path / "ended"
-    with patch.object(sys, "stdin", io.StringIO("\n".join([lines[0], "no pose", ""]))):
-        done = visioncal("record", *words)
-    assert done.status == 2
-    assert "1 view is safe" in done.err
-    assert "record all of it into a new session" in done.err
-    assert "--resume" not in done.err
 
 
 def test_a_recording_is_drawn(tmp_path):

@@ -1,6 +1,6 @@
 """Simulated cells to be planned: their guesses, and what calibrating at planned stops gives."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from support.cells import known_of
@@ -13,7 +13,6 @@ from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.design import Design, choose_stops
 from visioncal.live.planning.information import WORLDS, predict_worlds
-from visioncal.live.planning.plan import stop_contributions
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import PartialCalibration, SessionStart
 from visioncal.robot import load_robot
@@ -54,28 +53,17 @@ def postures_in_view(options: CellOptions, count: int) -> FloatArray:
     return simulate(replace(free, cut_views=0.0)).robot.joints
 
 
-@dataclass(frozen=True)
-class Additions:
-    """Stops to add to a session: which candidates, and what each of them is good for."""
-
-    design: Design
-    helps: tuple[str, ...]
-
-
 def next_best(
     begun: SessionStart,
     purpose: Purpose,
     q: FloatArray,
     count: int,
     **draw,
-) -> Additions:
+) -> Design:
     """The stops that a plan adds to a session, wherever the arm can drive."""
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
     worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)
-    design = choose_stops(worlds, count)
-    names = [f"added stop {index + 1}" for index in range(len(design.rows))]
-    said = stop_contributions(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
-    return Additions(design, tuple(said))
+    return choose_stops(worlds, count)
 
 
 def so_far_of(cell: SimulatedCell, **changes) -> PartialCalibration:

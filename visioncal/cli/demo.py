@@ -13,7 +13,6 @@ from visioncal.cli.console import (
     answer,
     exit_status,
     print_table,
-    report_error,
     report_written,
     say,
 )
@@ -28,8 +27,6 @@ from visioncal.cli.record import (
 )
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_rows
-from visioncal.core.choices import Faults
-from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.transforms import invert, log, pose_difference
@@ -58,9 +55,7 @@ _CANDIDATES = 600
 _NEAR_RAD = 2e-3
 
 
-def record_simulated(
-    session: Path, plan: Path, stops: int, seed: int, fault: Faults | None
-) -> None:
+def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     """Plans stops of a simulated cell and records them, with its truth beside the session.
 
     Args:
@@ -68,13 +63,12 @@ def record_simulated(
         plan: Folder of the plan.
         stops: Number of planned stops.
         seed: Of everything random.
-        fault: What happens half way; the recording then ends, is mended and resumed.
 
     Raises:
-        DriverError: The client library is missing, or a device failed other than by the fault.
+        DriverError: The client library is missing, or a device failed.
         DataError: The views cannot be written, or stops gave none.
     """
-    bench = Bench(seed, fault, after=max(1, stops // 2))
+    bench = Bench(seed)
     plan.parent.mkdir(parents=True, exist_ok=True)
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
@@ -83,18 +77,7 @@ def record_simulated(
     with closing(bench):
         host = bench.controller.host
         say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
-        if fault is not None:
-            try:
-                _drive(bench, scene, session, resume=False)
-            except VisioncalError as error:
-                if "Ctrl-C" in error.culprits:
-                    raise
-                report_error(error, as_json=False)
-            else:
-                raise DriverError(f"demo: {fault} did not happen before all views were taken.")
-            say(f"  ({fault} is mended; on with --resume)")
-            bench.mend()
-        _drive(bench, scene, session, resume=fault is not None)
+        _drive(bench, scene, session)
     flange = np.array([state.base_from_flange[0] for _, state in bench.views])
     x, z = bench.truth.transforms.values()
     poses = {"base_from_flange": flange, "cam_from_target": invert(flange @ x) @ z}
@@ -116,12 +99,12 @@ def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> RecordedSe
     return scene_of(folder)
 
 
-def _drive(bench: Bench, scene: RecordedSetup, session: Path, *, resume: bool) -> None:
+def _drive(bench: Bench, scene: RecordedSetup, session: Path) -> None:
     with ExitStack() as opened, signals_as_interrupts():
         cell = opened.enter_context(bench.connected())
-        begin = Journal.resume if resume else Journal.begin
         facts = facts_of(scene, cell, session.name)
-        journal = begin(session, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
+        count, offset_s = len(scene.planned.stops), cell.clock.unix_offset_s()
+        journal = Journal.begin(session, facts, offset_s, count)
         steps = record_driven(cell, scene, journal, _TAKING, [ViewLines(), bench], Consent(None))
         check_all(journal, steps)
 
@@ -141,7 +124,7 @@ def demo_command(options: DemoOptions) -> None:
         # An earlier demonstration's; nothing else is ever removed.
         shutil.rmtree(session, ignore_errors=True)
     if options.live:
-        record_simulated(session, options.out / "plan", options.views, options.seed, options.fault)
+        record_simulated(session, options.out / "plan", options.views, options.seed)
     with shown_progress(quiet=False) as progress:
         if not options.live:
             cell = simulate(

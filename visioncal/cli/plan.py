@@ -35,12 +35,11 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.messages import looks_note, need_words, summary_of
+from visioncal.live.planning.messages import need_words, summary_of
 from visioncal.live.planning.plan import Plan, PlanRequest, make_plan
 from visioncal.live.planning.plan_file import plan_document
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.recorded import (
-    RoughEdges,
     SessionStart,
     calibrate_partially,
     start_from_session,
@@ -167,7 +166,6 @@ def _request(stops: StopOptions, cell: PlanCell) -> PlanRequest:
         purpose,
         stops.add or stops.stops or (purpose.stops if has_no_need else MOST_FOR_NEED),
         stops.candidates,
-        _box_of(stops.workspace, "--workspace", "workspace") if stops.workspace else None,
         np.array(start) if start else None,
         stops.seed,
         None if has_no_need else Need(stops.need_mm, stops.need_deg),
@@ -194,20 +192,18 @@ def floor_of(kept: ClearanceOptions) -> float | None:
     return 1e-3 * numbers_in(kept.floor, "--floor", "z")[0]
 
 
-def _box_of(words: str, option: str = "--box", name: str = "") -> Box:
+def _box_of(words: str) -> Box:
     """Parses a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
-    parts = ([name] if name else []) + words.split(":")
+    parts = words.split(":")
     if len(parts) != 3 or not parts[0].strip():
-        label = "" if name else "NAME:"
-        form = f"{label}X,Y,Z:SX,SY,SZ"
         raise DataError(
-            f"{option} is {words[:80]!r}; {form} is needed, with the centre in the base and the "
-            "lengths in mm.",
-            culprits=[option],
-            next_step=f"Such as {option} {label.lower()}500,0,300:400,400,400",
+            f"--box is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the base "
+            "and the lengths in mm.",
+            culprits=["--box"],
+            next_step="Such as --box name:500,0,300:400,400,400",
         )
-    centre = numbers_in(parts[1], option, "x,y,z")
-    size = numbers_in(parts[2], option, "sx,sy,sz")
+    centre = numbers_in(parts[1], "--box", "x,y,z")
+    size = numbers_in(parts[2], "--box", "sx,sy,sz")
     return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
 
 
@@ -246,8 +242,6 @@ def _report(plan: Plan) -> None:
         answer(f"{stops} exchanged for want of a safe way ({obstacles})")
     if plan.need is not None and plan.need.limits:
         answer(plan.need.limits, "warning: ", "bold yellow")
-    elif note := looks_note(plan):
-        answer(note)
     if plan.need is not None and plan.need.met:
         answer(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
     if plan.request.start_q is None:
@@ -320,13 +314,13 @@ def begun_session(
             next_step="Name the session, or ask for a plan of its own with --stops.",
         )
     refuse_given(
-        words.options("target", "camera", "resolution", "mount"), "the session has its own"
+        words.options("target", "camera", "resolution", "mount", "cam", "board"),
+        "the session has its own",
     )
     if words.robot is not None:
         session = _with_robot(session, words.robot)
-    guess = _guess(words) if words.cam or words.board else None
     recorded = calibrate_partially(session, progress=progress)
-    begun = start_from_session(recorded, guess=guess, limits=kept[0], boxes=kept[1])
+    begun = start_from_session(recorded, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
@@ -355,16 +349,15 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
         )
     refuse_given(words.options("robot"), f"{source.words} is named already")
     camera = _camera(str(words.camera), words.resolution)
-    guess = _guess(words)
     cell = PlanCell(
         words.mount or "eye-in-hand",
         source.robot,
         camera,
         target_named(str(words.target)),
-        guess.x,
-        guess.z,
-        guess.sigma_rad,
-        guess.sigma_m,
+        pose_of(str(words.cam), "--cam"),
+        pose_of(str(words.board), "--board"),
+        math.radians(words.guess_deg),
+        1e-3 * words.guess_mm,
         TYPICAL_NOISE,
         TYPICAL_PX,
         *kept,
@@ -421,21 +414,6 @@ def _calibrated(
         return cell
     return replace(
         cell, sigma_m=1e-3 * words.guess_mm, sigma_rad=float(np.deg2rad(words.guess_deg))
-    )
-
-
-def _guess(words: PlanCellOptions) -> RoughEdges:
-    missing = [f"--{name}" for name in ("cam", "board") if getattr(words, name) is None]
-    if missing:
-        raise DataError(
-            f"{missing[0]} is needed too: a guess is one of both, the camera and the board.",
-            culprits=missing,
-        )
-    return RoughEdges(
-        pose_of(str(words.cam), "--cam"),
-        pose_of(str(words.board), "--board"),
-        float(np.deg2rad(words.guess_deg)),
-        1e-3 * words.guess_mm,
     )
 
 

@@ -18,7 +18,7 @@ from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.cell import HostClock, LiveCell
-from visioncal.live.capture.devices import ArmSetup, is_folder, open_arm, open_camera
+from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
 from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -58,8 +58,6 @@ def record_command(options: RecordOptions) -> None:
         speed=takes.speed,
         frames=takes.frames,
         still=Stillness(image_px=takes.still_px, quiet_s=takes.settle_s),
-        # A folder provides each picture once.
-        single=is_folder(options.camera),
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
     requested = DeviceSetup(device.resolution, device.exposure_us, device.gain, device.focus)
@@ -76,13 +74,6 @@ def record_command(options: RecordOptions) -> None:
         count = len(scene.planned.stops) if drives else options.views
         facts = facts_of(scene, cell, options.out.name)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        if taking.single and journal.views:
-            raise DataError(
-                f"--resume: {options.camera} begins with its first picture again, and "
-                f"{len(journal.views)} views are there.",
-                culprits=["--resume"],
-                next_step="Record all of it into a new folder.",
-            )
         with shown_in(scene, cell, wanted=options.view) as viewers:
             watchers = [ViewLines(), *viewers]
             if drives:

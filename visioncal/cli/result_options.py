@@ -27,7 +27,6 @@ from visioncal.cli.options import (
     out_folder,
     robot_name,
     session_argument,
-    yes_flag,
 )
 from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
@@ -403,11 +402,6 @@ class TouchTestOptions:
     gaps_mm: str | None = option(
         "Measured gaps from tip to point, in their order.", metavar="A,B,C,D,E"
     )
-    drive: str | None = option(
-        "Bring the tip above each point by this arm, slowly; the rest is by hand.",
-        metavar="ur:HOST",
-    )
-    yes: bool = yes_flag()
     force: bool = force_bad()
     as_json: bool = json_flag()
 

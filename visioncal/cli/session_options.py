@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 from visioncal.cli.options import (
     REQUIRED,
@@ -28,7 +28,6 @@ from visioncal.core.choices import (
     SIMULATED_CELLS,
     UNITS_M,
     CameraMount,
-    Faults,
     Mount,
 )
 from visioncal.live.capture.options import Stillness
@@ -51,7 +50,6 @@ _camera = partial(option, panel="Its camera")
 _doubt = partial(option, panel="Poses that may be misread, of a session as well")
 
 Instrument: TypeAlias = Literal["point", "points", "probe"]
-BoardKind: TypeAlias = Literal["charuco", "checkerboard", "aprilgrid", "circles", "marker"]
 # Largest number of stops where a need decides it.
 MOST_FOR_NEED = 40
 _USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
@@ -74,12 +72,6 @@ class DemoOptions:
     seed: int = seed_option()
     live: bool = flag(
         "Plan the stops and record them, with a UR's own client library and a simulated controller."
-    )
-    fault: Faults | None = option(
-        f"With --live, let this happen half way: {', '.join(get_args(Faults))}.",
-        metavar="FAULT",
-        show_default=False,
-        needs="live",
     )
 
 
@@ -169,7 +161,9 @@ class SimulateOptions:
 class BoardOptions:
     """Options that describe a board."""
 
-    kind: BoardKind | None = option("What to print.")
+    kind: str | None = option(
+        "What to print.", metavar="charuco|checkerboard|aprilgrid|circles|marker"
+    )
     columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
     rows: int | None = option("The same along y.")
     square_mm: float | None = option(
@@ -250,11 +244,6 @@ class StopOptions:
         f"{MOST_FOR_NEED} stops where no number is given."
     )
     need_deg: float | None = _what("The same of the rotation, in degrees.")
-    workspace: str | None = _what(
-        "Where the arm's accuracy matters: a box by its centre in the base and its "
-        "lengths, in mm; by default all of its reach.",
-        metavar="X,Y,Z:SX,SY,SZ",
-    )
     start_joints: str | None = _what(
         "The arm's present joint angles, in radians; without them the path to the first "
         "stop is not checked.",
@@ -438,10 +427,10 @@ class RecordOptions:
         metavar="ur:HOST|manual",
     )
     camera: str = option(
-        "The camera: an OAK (oak:SERIAL for one of several), a webcam, a network "
-        "camera's stream, or pictures that were taken already.",
+        "The camera: an OAK (oak:SERIAL for one of several), a webcam, or a network "
+        "camera's stream.",
         default=REQUIRED,
-        metavar="oak|uvc:N|uvc:URL|folder:PATH",
+        metavar="oak|uvc:N|uvc:URL",
     )
     described: RecordCellOptions
     takes: TakingOptions

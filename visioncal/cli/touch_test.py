@@ -3,13 +3,13 @@
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from visioncal.cli.console import (
     EXIT_BAD,
@@ -17,7 +17,6 @@ from visioncal.cli.console import (
     asked,
     check_usable,
     print_json,
-    report_error,
     report_written,
     say,
     warn,
@@ -25,9 +24,8 @@ from visioncal.cli.console import (
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.types import FloatArray, Target
 from visioncal.frames.touch_test import (
     TouchPoint,
     TouchTargets,
@@ -37,10 +35,6 @@ from visioncal.frames.touch_test import (
 )
 from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import load_result, rewrite_result
-from visioncal.live.capture.devices import ArmSetup, open_arm
-from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.hover import Hovering
-from visioncal.live.drivers.protocols import MovingArm
 from visioncal.results import Calibration, to_document
 from visioncal.results.compensation.correction import correct
 from visioncal.session import Session
@@ -64,8 +58,6 @@ def touch_test_command(options: TouchTestOptions) -> None:
     touching = _touching(result, calibration, options.tool)
     misplaced_mm = None if options.tool == "none" else options.clearance_mm
     refuse_given({"--clearance-mm": misplaced_mm}, "it is for --tool none")
-    if options.drive is not None:
-        refuse_given({"--gaps-mm": options.gaps_mm}, "with --drive, gaps are asked for")
     with shown_progress(quiet=options.as_json):
         clearance_m = None if options.clearance_mm is None else 1e-3 * options.clearance_mm
         located = touch_targets(loaded, result, touching, clearance_m)
@@ -82,9 +74,6 @@ def touch_test_command(options: TouchTestOptions) -> None:
     if options.gaps_mm is not None:
         count = options.gaps_mm.count(",") + 1
         gaps = [*numbers_in(options.gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
-    elif options.drive is not None:
-        board = next(iter(loaded.boards.values()))
-        gaps = _drive(options, result, board, located, targets)
     elif sys.stdin.isatty() and not options.as_json:
         say(_FORM)
         gaps = []
@@ -161,42 +150,6 @@ def _report_point(point: TouchPoint, target: dict[str, Any], show: Callable[[str
         place, turn = target[name][:3], target[name][3:]
         numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
         show(f"  {name}: {', '.join(numbers)}")
-
-
-def _drive(
-    options: TouchTestOptions,
-    calibration: Calibration,
-    board: Target,
-    located: TouchTargets,
-    targets: Sequence[dict[str, Any]],
-) -> list[float]:
-    """Drives the tip above each point, and asks for its gap."""
-    consent, height_m = Consent.of("touch-test", asked, yes=options.yes), 1e-3 * options.height_mm
-    gaps = []
-    with closing(open_arm(str(options.drive), ArmSetup("", watch_only=False, ask=_line))) as arm:
-        if not isinstance(arm, MovingArm):
-            raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
-        hovering = Hovering.of(arm, calibration, board, located, height_m, consent)
-        for point, target in zip(located.points, targets, strict=True):
-            place, turn = target["hover"][:3], Rotation.from_rotvec(target["hover"][3:])
-            hover = np.asarray(RigidTransform.from_components(place, turn).as_matrix())
-            _bring(hovering, hover, point.name)
-            _report_point(point, target, say)
-            gaps.append(_gap())
-    return gaps
-
-
-def _bring(hovering: Hovering, base_from_flange: FloatArray, name: str) -> None:
-    """Drives the tip above a point; retries while the arm refuses, as in local control."""
-    while True:
-        try:
-            hovering.bring(base_from_flange, name)
-        except DriverError as error:
-            report_error(error, as_json=False)
-            if _line("Enter tries again, q ends: ").strip().lower() == "q":
-                raise
-        else:
-            return
 
 
 def _gap() -> float:

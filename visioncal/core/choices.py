@@ -23,16 +23,6 @@ Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
 
-# Faults of a simulated live cell; the last two are of the camera, at a stop.
-Faults: TypeAlias = Literal[
-    "protective-stop",
-    "emergency-stop",
-    "remote-off",
-    "link-lost",
-    "silent",
-    "unplugged",
-    "covered",
-]
 # Joint speed and acceleration of a UR that drives a plan, slow enough to reach the stop button
 # [rad/s and rad/s^2].
 PLAN_SPEED, PLAN_ACCELERATION = 0.4, 0.6

@@ -20,19 +20,15 @@ from visioncal.robot import Robot
 _ACROSS, _DOWN = 8, 5
 # Assumed corner noise for the pose of a view [px]; advice needs no better.
 _PIXEL_PX = 0.2
-# Tilts below the first count as frontal; to separate the board's distance from the focal length
-# some must exceed the second [deg].
-_STRAIGHT_DEG, _LEANING_DEG = 10.0, 20.0
+# Tilt that some views must exceed, to separate the board's distance from the focal length [deg].
+_LEANING_DEG = 20.0
 # Number of views before advice is given on tilt and distance.
 _FIRST = 3
 # Ratio below which the greatest and the least distance count as one.
 _ONE_DISTANCE = 1.25
 _COVERED = 0.8
-_THIRDS = (("left", "middle", "right"), ("top", "middle", "bottom"))
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2
-# Largest motion of joints and of a flange that count as still [rad, m].
-_STILL_RAD, _STILL_M = 1e-4, 1e-4
 
 # Accuracy predicted with some views, by their numbers; None while there is no prediction.
 Prediction: TypeAlias = Callable[[Sequence[int]], Accuracy | None]
@@ -94,21 +90,10 @@ class Coach:
             tilts = self._tilts
             if tilts.max() < _LEANING_DEG:
                 yield f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
-            leaning = np.array(self._normals)[tilts > _STRAIGHT_DEG]
-            for axis, name in ((1, "x"), (0, "y")) if len(leaning) else ():
-                if np.rad2deg(np.abs(leaning[:, axis])).max() < _STRAIGHT_DEG:
-                    yield f"tilt the camera about its {name}: no view leans that way"
             if max(self._distances) < _ONE_DISTANCE * min(self._distances):
                 yield f"another distance: all views are about {self._distances[0]:.2f} m away"
         if self._covered_cells.mean() < _COVERED:
-            # The third of the image, across and down, with the least coverage.
-            rows = np.array_split(np.arange(_DOWN), 3)
-            columns = np.array_split(np.arange(_ACROSS), 3)
-            shares = [[self._covered_cells[np.ix_(r, c)].mean() for c in columns] for r in rows]
-            row, column = np.unravel_index(int(np.argmin(shares)), (3, 3))
-            words = [_THIRDS[1][row], _THIRDS[0][column]]
-            region = " ".join(word for word in words if word != "middle") or "middle"
-            yield f"bring the board to the {region} of the image"
+            yield "bring the board to where it was not yet in the image, near the edges too"
 
 
 @dataclass(eq=False)
@@ -140,15 +125,9 @@ class JointPoseCheck:
             self._states.append(state)
             return ""
         cause = (
-            "one of them is of another moment, the tool was changed on the pendant, or the arm is "
-            f"no {self.robot.name}"
+            "one of them is stale, the tool was changed on the pendant, or the arm is no "
+            f"{self.robot.name}"
         )
-        turned = float(np.abs(q[0] - q[-1]).max())
-        is_still = float(np.linalg.norm(pose[0, :3, 3] - pose[-1, :3, 3])) < _STILL_M
-        if is_still and turned > _STILL_RAD:
-            cause = "the joints turned and the pose stayed, so the pose is stale"
-        elif turned < _STILL_RAD and not is_still:
-            cause = "the pose changed and the joints stayed, so the joint angles are stale"
         return (
             f"joint angles and pose disagree by {1e3 * shift_m:.0f} mm and "
             f"{np.rad2deg(angle):.1f} deg (limits {1e3 * _SAME_M:.0f} mm and "

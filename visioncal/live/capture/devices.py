@@ -1,8 +1,7 @@
-"""Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `folder:images`."""
+"""Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `uvc:0`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TypeVar
 
 from visioncal.core.errors import DataError
@@ -10,7 +9,7 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 # Kinds that need an address, with its form.
-_ADDRESSES = {"ur": "ur:HOST, as ur:192.168.0.10", "folder": "folder:PATH"}
+_ADDRESSES = {"ur": "ur:HOST, as ur:192.168.0.10"}
 
 
 @dataclass(frozen=True)
@@ -53,11 +52,6 @@ def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
     return opener(address, requested)
 
 
-def is_folder(words: str) -> bool:
-    """Whether a camera is a folder of pictures, each taken at another pose."""
-    return words.partition(":")[0] == "folder"
-
-
 def _opener(words: str, openers: Mapping[str, _Opener], option: str) -> tuple[_Opener, str]:
     kind, _, address = words.partition(":")
     if kind not in openers:
@@ -98,15 +92,8 @@ def _uvc(address: str, requested: DeviceSetup) -> CameraDevice:
     return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, requested)
 
 
-def _folder(address: str, _: DeviceSetup) -> CameraDevice:
-    from visioncal.live.drivers.images import FolderCamera
-
-    return FolderCamera(Path(address))
-
-
 ARMS: Mapping[str, Callable[[ArmSetup], Arm]] = {"ur": _ur, "manual": _manual}
 CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
     "oak": _oak,
     "uvc": _uvc,
-    "folder": _folder,
 }

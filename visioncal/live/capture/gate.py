@@ -17,7 +17,6 @@ from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.path import order_stops
 from visioncal.robot import Robot
-from visioncal.robot.collision import Collisions
 
 # Polling interval of the arm while it moves [s].
 _POLL_S = 0.02
@@ -231,7 +230,7 @@ def check_limits(robot: Robot, q: FloatArray) -> None:
 
 
 def clear_path(
-    cell: PlanCell, q: FloatArray, goal: FloatArray, name: str, collisions: Collisions | None = None
+    cell: PlanCell, q: FloatArray, goal: FloatArray, name: str
 ) -> tuple[FloatArray, ...]:
     """Finds postures (n,) to a goal (n,) [rad], clear of everything declared; the goal is last.
 
@@ -240,13 +239,12 @@ def clear_path(
         q: (n,) where the arm stands [rad].
         goal: (n,) where it shall go [rad].
         name: What the goal is, for messages.
-        collisions: Distances of the cell; by default as it is planned for.
 
     Raises:
         DataError: There is none, or the arm stands too near to something or beyond its limits.
     """
     check_limits(cell.robot, q)
-    route = order_stops(cell, q, goal[None], collisions=collisions)
+    route = order_stops(cell, q, goal[None])
     if route.unreachable:
         (obstacle,) = route.unreachable.values()
         angles = ", ".join(f"{value:.0f}" for value in np.rad2deg(q))

@@ -33,9 +33,6 @@ class CaptureOptions:
     frames: int = 3  # Frames per view, of which the sharpest is kept.
     # Limits within which arm and image count as still.
     still: Stillness = field(default_factory=Stillness)
-    # Whether every frame is of another pose, as in a folder of pictures; it is then taken without
-    # waiting.
-    single: bool = False
     # Number of stops in a row without a view that ends the recording; 0 for never, where a person
     # sees it.
     missed_in_a_row: int = 3

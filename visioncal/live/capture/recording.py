@@ -208,9 +208,6 @@ class Capture:
             if not count:
                 stored = f"No view was taken; {folder} is no session yet."
             resume = "Go on with --resume."
-            if self.options.single and count:
-                resume = "A folder begins with its first picture again: record all of it into a "
-                resume += "new session."
             if isinstance(error, KeyboardInterrupt):
                 raise DriverError(
                     f"stopped by Ctrl-C or a signal; the arm was halted. {stored}",

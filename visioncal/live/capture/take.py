@@ -108,7 +108,7 @@ def take(
             return rest, settled_s
         first, last = rest
         frames, motion_px, reason = [last], 0.0, ""
-        while not reason and len(frames) < (1 if options.single else options.frames):
+        while not reason and len(frames) < options.frames:
             frames.append(_StillFrame.of(cell))
             reason, motion_px = first.why_moved(frames[-1], options.still)
         if not reason:
@@ -120,8 +120,6 @@ def _settled(cell: LiveCell, options: CaptureOptions) -> tuple[_StillFrame, _Sti
     """Waits until arm and image are still: first and latest frame of a rest that lasts."""
     still, start = options.still, cell.clock.now()
     first = _StillFrame.of(cell)
-    if options.single:
-        return first, first
     while True:
         latest = _StillFrame.of(cell)
         reason, _ = first.why_moved(latest, still)

@@ -254,7 +254,7 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
     # Only a file has a number of pictures.
     elif int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
         why = "is a video file, whose pictures have no time"
-        step = "Extract them into a folder, and record with --camera folder:PATH."
+        step = "Extract them into a folder, and give their poses in a table: visioncal convert."
     if why:
         capture.release()
         raise DriverError(f"The {name} {why}.", culprits=[name], next_step=step)

@@ -32,8 +32,6 @@ _FULL_JOINTS = 6
 # A joint cannot pass a range of angles at least this wide [rad] in which no stop has it and this
 # share of postures collides.
 _WIDE_RAD, _BARRED, _TURN = np.pi / 3.0, 0.5, 2.0 * np.pi
-# Number of unreachable views that are examined again for the message.
-_RETRIED = 12
 IMAGE = "the whole board in the image"
 GUESS = "the whole board in the image although the guesses are off"
 FOCUS, TILT, DISTANCE = "the range of focus", "the tilt", "the distance"
@@ -125,7 +123,6 @@ class _CandidateSearch:
         self._shade = Occlusion(cell, np.vstack([self._sight.outline, self._sight.centre]))
         self.collisions = collision_model(cell)
         self._inverse = Inverse(cell.robot)
-        self._unreached: list[FloatArray] = []
 
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""
@@ -152,29 +149,13 @@ class _CandidateSearch:
 
     def error(self) -> DataError:
         """Error of a search with too few stops."""
-        # Joints whose limits alone kept the arm from unreached views are named.
-        cell, losses = self._cell, self.losses
-        zeros = np.zeros(cell.robot.joint_count)
-        solutions = [self._inverse.solve(flange, zeros) for flange in self._unreached]
-        losses.blame(
-            REACH, [f"limits of {name}" for solution in solutions for name in solution.beyond]
-        )
+        losses = self.losses
         worst, counts = losses.worst(), losses.counts()
         named = {name: count for name, count in counts.items() if name.startswith(f"{worst} (")}
         culprit = max(named, key=lambda name: named[name], default=worst)
         words = some_of([f"{times} to {what}" for what, times in counts.items()], _NAMED)
         share = 100.0 * losses.lost[worst] / losses.tried[worst]
         advice = _ADVICE[worst]
-        is_fixed = cell.mount != "eye-in-hand" and cell.limits.distance_m is None
-        if is_fixed and worst in (AWAY, REACH):
-            # A fixed camera may be farther away than the distance at which its board fills the
-            # image.
-            near, far = (1e3 * distance for distance in self._sight.distance_m)
-            advice = (
-                "Allow other distances than those at which the board fills the image, "
-                f"{near:.0f} to {far:.0f} mm (--distance-mm), bring camera and arm nearer to each "
-                "other, or look whether the guesses are right."
-            )
         return DataError(
             f"plan: {len(self.kept)} of {self._count} possible stops were found in "
             f"{max(losses.tried.values())} tries. Lost were {words}. Most in the way is {culprit}: "
@@ -205,7 +186,6 @@ class _CandidateSearch:
         positions, reached = self._inverse.from_starts(
             flange, self._inverse.starts(len(flange), self._rng)
         )
-        self._unreached += list(flange[~reached][: _RETRIED - len(self._unreached)])
         reached = passed(REACH, reached)
         return robot.chain.encoded(positions[reached]), share[reached]
 

@@ -9,7 +9,7 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
-from visioncal.results import Calibration, Edge
+from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body, capsule
 from visioncal.vision.targets import corner_positions, extent_m
@@ -252,36 +252,6 @@ def collision_model(cell: PlanCell) -> Collisions:
         *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),
     ]
     return Collisions(cell.robot, bodies, cell.limits.clearance_m, cell.limits.floor_m)
-
-
-def touching_model(cell: PlanCell, flange_from_tip: FloatArray, board: Edge | None) -> Collisions:
-    """Collision model of a cell whose arm holds a tool above a board.
-
-    Args:
-        cell: The cell; a board that its arm held while it was calibrated is off the flange.
-        flange_from_tip: (4, 4) the tool's tip [m].
-        board: The board in the base; None to leave it and the floor out, where a tip that touched
-            it is lifted off.
-    """
-    hand, flange = cell.robot.joint_count, cell.robot.chain.placements[-1]
-    in_hand = cell.mount == "eye-in-hand"
-    camera = camera_body(hand, flange @ cell.x) if in_hand else camera_body(0, cell.x)
-    bodies = [*arm_bodies(cell.robot), camera]
-    tip_m = flange_from_tip[:3, 3]
-    length_m = float(np.linalg.norm(tip_m))
-    if length_m > _HOLDER_RADIUS_M:
-        # The capsule's round end is at the tip.
-        end = compose(np.eye(3), tip_m * (1.0 - _HOLDER_RADIUS_M / length_m))
-        bodies.append(capsule("tool", hand, flange[:3, 3], (flange @ end)[:3, 3], _HOLDER_RADIUS_M))
-    bodies += [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes]
-    if board is None:
-        return Collisions(cell.robot, bodies, cell.limits.clearance_m, None)
-    unsure_m = 1e-3 * _KEEP_OFF_SIGMAS * board.sigma_mm
-    bodies.append(_board(cell.target, 0, board.matrix, unsure_m))
-    # A board that lies lower than the base's origin shows that the floor does, too.
-    underside_m = float((board.matrix[:3, 3] - _PLATE_M * np.abs(board.matrix[:3, 2]))[2])
-    floor_m = min(cell.limits.floor_m or 0.0, underside_m)
-    return Collisions(cell.robot, bodies, cell.limits.clearance_m, floor_m)
 
 
 def board_size_m(target: Target) -> float:

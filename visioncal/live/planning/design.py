@@ -155,7 +155,6 @@ class Design:
     # Accuracy predicted without any of them, and after each in the order of `rows`.
     history: tuple[Accuracy, ...]
     best: Accuracy  # Accuracy with all candidates.
-    best_known_lens_board: Accuracy  # The same if lens and board were known exactly.
 
     @property
     def predicted(self) -> Accuracy:
@@ -195,13 +194,10 @@ def choose_stops(worlds: Sequence[World], count: int) -> Design:
         for _ in rows:
             ranking = ranking.with_best()
             history.append(ranking.accuracy)
-        best, known_lens_board = (
-            _Selection.of(assumed).with_rows(list(range(candidates))).accuracy
-            for assumed in (worlds, [world.with_known_lens_board() for world in worlds])
-        )
+        best = _Selection.of(worlds).with_rows(list(range(candidates))).accuracy
     sigma_mm = 1e3 * float(np.sqrt(state.variances[0]))
     rows = rows[list(ranking.rows)]
-    return Design(rows, sigma_mm, tuple(history), best, known_lens_board)
+    return Design(rows, sigma_mm, tuple(history), best)
 
 
 def _exchanged(state: _Selection) -> _Selection:

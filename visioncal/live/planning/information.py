@@ -33,7 +33,7 @@ from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.workspace import postures
-from visioncal.live.planning.cell import Box, PlanCell
+from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
@@ -44,8 +44,6 @@ WORLDS = 4
 # A calibration does not use the guesses. This weak prior on the edges only keeps the information
 # invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
-# Postures drawn for a declared workspace, and the most of those inside it that are used.
-_TRIED, _POSTURES = 8000, 400
 # Least number of corners with which a partly visible ChArUco board is detected.
 _FEWEST_CORNERS = 6
 
@@ -95,12 +93,10 @@ class World:
             covariance C: of a position, as a mean over where it matters [m^2].
         position: (p, p) the same for the position whose accuracy is reported [m^2].
         rotation: (p, p) the same for the rotation [rad^2].
-        lens_board_count: Number of unknowns of lens and boards; they come after the edges.
         unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
             estimate: arm errors that it treats as noise, in their sigmas, and held parameters of
             lens and boards.
         gradient: (p, a) the same of the recorded stops' gradient.
-        held: How many of these parameters are of lens and boards; they come last.
     """
 
     factors: FloatArray
@@ -109,39 +105,12 @@ class World:
     objective: FloatArray
     position: FloatArray
     rotation: FloatArray
-    shared_count: int
     unestimated: FloatArray
     gradient: FloatArray
-    held: int
 
     def of_candidates(self, rows: IntArray) -> "World":
         """Returns the same world with some of the candidates."""
         return replace(self, factors=self.factors[rows], unestimated=self.unestimated[rows])
-
-    def with_known_lens_board(self) -> "World":
-        """Returns the same world with lens and board known exactly."""
-        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.shared_count))
-        block = np.ix_(kept, kept)
-        of_arm = slice(self.gradient.shape[1] - self.held)
-        return World(
-            self.factors[:, :, kept],
-            self.prior[block],
-            self.recorded[block],
-            self.objective[block],
-            self.position[block],
-            self.rotation[block],
-            0,
-            self.unestimated[:, :, of_arm],
-            self.gradient[kept, of_arm],
-            0,
-        )
-
-    def without_unestimated_arm(self) -> "World":
-        """Returns the same world without arm errors that a fit treats as noise."""
-        of_held = slice(self.gradient.shape[1] - self.held, None)
-        return replace(
-            self, unestimated=self.unestimated[:, :, of_held], gradient=self.gradient[:, of_held]
-        )
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
         """Covariance (p, p) of the unknowns from some candidates and the recorded stops."""
@@ -162,18 +131,14 @@ def predict_worlds(
     q: FloatArray,
     *,
     recorded: RecordedStops | None = None,
-    workspace: Box | None = None,
 ) -> tuple[World, ...]:
     """Predicts the information of candidates with joints (k, n) [rad] in each possible cell.
 
-    The arm's accuracy counts within the workspace, or all of its reach for None.
-
     Raises:
-        DataError: The workspace holds no posture, or joint angles of recorded stops are needed and
-            not known.
+        DataError: Joint angles of recorded stops are needed and not known.
     """
     with one_blas_thread():
-        return tuple(_world(cell, purpose, q, recorded, workspace) for cell in cells)
+        return tuple(_world(cell, purpose, q, recorded) for cell in cells)
 
 
 def stop_factors(
@@ -240,7 +205,6 @@ def _world(
     purpose: Purpose,
     q: FloatArray,
     recorded: RecordedStops | None,
-    workspace: Box | None,
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
@@ -258,9 +222,9 @@ def _world(
     if purpose.judged == "sight":
         weights = _sight_weights(cell, arm, q)
     else:
-        weights = _workspace_weights(cell, purpose, workspace)
+        weights = _workspace_weights(cell, purpose)
     counted, place, turn = (_padded(array, shared_count) for array in weights)
-    misfit, gradient, held = factors[:, :, size:], recorded_information[:size, size:], 0
+    misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
     if recorded is not None and not purpose.blocks:
         error_root, held = recorded.edge_error_root, recorded.held.shape[1]
         held_gradient = np.zeros((size, held))
@@ -276,10 +240,8 @@ def _world(
         counted,
         place,
         turn,
-        shared_count,
         misfit,
         gradient,
-        held,
     )
 
 
@@ -396,23 +358,11 @@ def _sight_weights(
 
 
 def _workspace_weights(
-    cell: PlanCell, purpose: Purpose, workspace: Box | None
+    cell: PlanCell, purpose: Purpose
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weights for the pose of what the arm carries, relative to what is fixed in the base."""
-    q = postures(cell.robot) if workspace is None else postures(cell.robot, _TRIED)
+    q = postures(cell.robot)
     flange = cell.robot.base_from_flange(q)
-    if workspace is not None:
-        carried = flange @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
-        position = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
-        within = np.all(np.abs(position) <= np.asarray(workspace.size_m) / 2, axis=1)
-        if not within.any():
-            raise DataError(
-                f"workspace {workspace.name}: none of {len(q)} postures all over the "
-                f"{cell.robot.name}'s reach brings what it carries into the box.",
-                culprits=[f"workspace {workspace.name}"],
-                next_step="Give its centre in the base frame and its full lengths [m].",
-            )
-        q, flange = q[within][:_POSTURES], flange[within][:_POSTURES]
     problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
     pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
     # (w, 4, 4) poses of the camera-board pair, and their Jacobian (w, 6, 12 + a).

@@ -7,9 +7,6 @@ from visioncal.dynamics.sweeps import Sweeps
 from visioncal.live.planning.pick_probability import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
 
-# The board's size limits a plan if knowing it exactly would reduce the error by this factor.
-_LIMITED = 1.5
-
 
 def need_words(prediction: NeedPlanned) -> str:
     """States the prediction for picks: `97 % of picks land within 0.3 mm`."""
@@ -27,18 +24,6 @@ def summary_of(plan: Plan) -> str:
     return (
         f"{stops} to add, from {plan.candidate_count} possible ones; {wanted}: "
         f"{design.before.words} before, {design.predicted.words} after"
-    )
-
-
-def looks_note(plan: Plan) -> str:
-    """States that lens or board limit a plan, so that more stops would not help; else empty."""
-    best, exact = plan.design.best, plan.design.best_known_lens_board
-    if best.is_open or best.mm < _LIMITED * exact.mm:
-        return ""
-    return (
-        f"All candidates together give {figure(best.mm)} mm, and {figure(exact.mm)} mm if the "
-        "board's size were known exactly: measure its squares over the whole board, and state "
-        "square_sigma_m."
     )
 
 

@@ -125,14 +125,7 @@ class Route:
     unreachable: Mapping[int, str]
 
 
-def order_stops(
-    cell: PlanCell,
-    start_q: FloatArray | None,
-    q: FloatArray,
-    seed: int = 0,
-    *,
-    collisions: Collisions | None = None,
-) -> Route:
+def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
     """Orders stops for a short path of the joints, and finds collision-free segments.
 
     The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each segment
@@ -143,7 +136,6 @@ def order_stops(
         start_q: (n,) joint angles of the arm before [rad]; None to begin at any stop.
         q: (k, n) joint angles of the stops [rad], free of collisions as from `candidates`.
         seed: Random seed of the detours.
-        collisions: Distances of the cell's bodies; by default `collision_model`.
 
     Returns:
         The path. Stops that cannot be reached safely are left out and named.
@@ -151,7 +143,7 @@ def order_stops(
     Raises:
         DataError: The start violates the clearance.
     """
-    collisions = collisions or collision_model(cell)
+    collisions = collision_model(cell)
     if start_q is not None and (contact := int(collisions.first_contact(start_q[None])[0])) >= 0:
         first_body, second_body = collisions.names[contact]
         apart_m, needed_m = collisions.distances(start_q)[contact], collisions.needed_m()[contact]

@@ -26,22 +26,6 @@ from visioncal.vision.targets import corner_positions
 _LOOKS = 40
 # Stops that together add less to the probability are not worth taking.
 _NEARLY = 0.01
-# Possible limits, each with its remedy.
-_REMEDIES = {
-    "looks": (
-        "the uncertainty of the board's size and the lens",
-        "measure the print over many squares, and state its square_sigma_m",
-    ),
-    "arm": (
-        "errors of the arm that go with its posture",
-        "record joint angles (q1_rad ...) with all views, and they are calibrated",
-    ),
-    "noise": (
-        "the robot's own noise at look and pick",
-        "let it come to rest, look from nearer, or state its noise if it is less (--noise-mm, "
-        "--noise-deg)",
-    ),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,23 +37,15 @@ class Picking:
     q: FloatArray  # (k, n) joint angles of the candidates [rad].
     need: Need  # Tolerance of the picks.
 
-    def chance(self, rows: IntArray, *, without: str = "") -> float:
-        """Probability that a pick lands within tolerance, calibrated from some candidates.
-
-        Args:
-            rows: (m,) the candidates.
-            without: What is taken as exact: `optics` (lens and board), `arm` (posture-dependent
-                errors) or `noise` (of the robot at observation and pick).
-        """
+    def chance(self, rows: IntArray) -> float:
+        """Probability that a pick lands within tolerance, calibrated from (m,) candidates."""
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
         q = self.q[np.linspace(0, len(self.q) - 1, min(_LOOKS, len(self.q))).astype(np.int64)]
         chances = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
-            exact = {"looks": world.with_known_lens_board, "arm": world.without_unestimated_arm}
-            assumed = exact.get(without, lambda world=world: world)()
-            noise = np.repeat(cell.noise.robots[0], 3) ** 2 * (without != "noise")
-            covariances = _pick_covariances(cell, assumed.covariance(rows)[:6, :6], noise, q)
+            noise = np.repeat(cell.noise.robots[0], 3) ** 2
+            covariances = _pick_covariances(cell, world.covariance(rows)[:6, :6], noise, q)
             chances.append(chance_within(covariances, turn_rad, shift_m))
         return float(np.mean(chances))
 
@@ -117,15 +93,9 @@ def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
     if words and best >= least:
         words += f"More than {count} stops are needed: all candidates give {percent(best)}."
     elif words:
-        without = {name: picking.chance(every, without=name) for name in _REMEDIES}
-        most = max(without, key=lambda name: without[name])
-        cause, advice = _REMEDIES[most]
-        is_all = without[most] >= least
         words += (
-            f"All candidates together give {percent(best)}. "
-            f"{'In the way' if is_all else 'The most of what is in the way'} is {cause} "
-            f"({percent(without[most])} without it): {advice}."
-            f"{'' if is_all else ' A larger board or a nearer camera helps, too.'}"
+            f"All candidates together give {percent(best)}: a larger board or a nearer camera "
+            "helps, a square_sigma_m that is measured better, or less noise of the robot."
         )
     return NeedPlanned(picking.need, picking.chance(rows[:0]), probability, best, words)
 

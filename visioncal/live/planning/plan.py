@@ -1,22 +1,18 @@
 """A plan: the chosen stops, their order, and the accuracy predicted after each."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, percent, some_of
-from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
-from visioncal.estimation.armmodel import block_size
 from visioncal.live.planning.candidates import Candidates, candidates
-from visioncal.live.planning.cell import Box, PlanCell
+from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.design import (
-    OPEN_SIGMA,
     Accuracy,
     Design,
     choose_stops,
@@ -37,14 +33,6 @@ from visioncal.live.planning.recorded import SessionStart
 # to six for 8 to 30 stops.
 _ROUNDS = 12
 
-# Cosine above which a rotation axis is named after the optical axis, and the component from which a
-# second axis is named.
-_NEARLY_AXIS, _ASIDE = 0.95, 0.4
-# A rotation from an earlier stop smaller than this is called a shift [rad].
-_TURN_RAD = 0.17
-# Distance at which a rotation error is compared with an offset error [m].
-_LEVER_M = 0.5
-
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
@@ -53,8 +41,6 @@ class PlanRequest:
     purpose: Purpose
     count: int  # Most stops.
     candidates: int = 1500
-    # Region in which the arm's accuracy counts; None for all of its reach.
-    workspace: Box | None = None
     # (n,) present joint angles of the arm [rad]; None where they are not known, and the path to the
     # first stop is not checked.
     start_q: FloatArray | None = None
@@ -138,7 +124,6 @@ def make_plan(
         request.purpose,
         stops.q,
         recorded=None if begun is None else begun.recorded,
-        workspace=request.workspace,
     )
     progress("choice", 0, 1)
     planning = _Planning(cells, request, stops, worlds, begun)
@@ -240,11 +225,6 @@ class _Planning:
         first = 1 if begun is None else 1 + max(begun.views)
         numbers = np.empty(len(design.rows), dtype=np.int64)
         numbers[list(route.order)] = first + np.arange(len(design.rows))
-        names = [f"view {number}" for number in numbers]
-        purpose, world = self.request.purpose, self.worlds[0]
-        contributions = tuple(
-            stop_contributions(cell, purpose, found.q, world, design, names, begun=begun)
-        )
         q = found.q[design.rows]
         flange = cell.robot.base_from_flange(q)
         segments = route.segments
@@ -255,7 +235,7 @@ class _Planning:
                 int(numbers[row]),
                 q[row],
                 via,
-                contributions[row],
+                _contribution(*design.history[row : row + 2]),
                 flange[row],
                 found.cam_from_target[design.rows[row]],
                 float(found.seen[design.rows[row]]),
@@ -267,101 +247,12 @@ class _Planning:
         )
 
 
-def stop_contributions(
-    cell: PlanCell,
-    purpose: Purpose,
-    q: FloatArray,
-    world: World,
-    design: Design,
-    names: Sequence[str],
-    *,
-    begun: SessionStart | None = None,
-) -> Iterator[str]:
-    """States what each chosen stop contributes, given those before it and the recorded ones.
-
-    The candidates have joints (k, n) [rad] and their information in `world` if the guesses are
-    right; `names` are those of the chosen ones, in their order.
-    """
-    earlier_poses, earlier_names = np.zeros((0, 4, 4)), []
-    if begun is not None:
-        earlier_poses = next(iter(begun.recorded.problem.poses.values()))
-        earlier_names = [f"view {view}" for view in begun.views]
-    poses = cell.robot.base_from_flange(q[design.rows])
-    before = world.covariance([])
-    for place in range(len(design.rows)):
-        after = world.covariance(design.rows[: place + 1])
-        motion = _motion_words(cell, earlier_poses, poses[place], earlier_names)
-        effect = _effect_words(cell, purpose, before, after, design.history[place : place + 2])
-        yield f"{motion}: {effect}"
-        earlier_poses = np.concatenate([earlier_poses, poses[place][None]])
-        earlier_names = [*earlier_names, names[place]]
-        before = after
-
-
-def _motion_words(
-    cell: PlanCell, earlier_poses: FloatArray, pose: FloatArray, names: Sequence[str]
-) -> str:
-    """Describes a stop's motion from the earlier stop with the nearest orientation."""
-    if not len(earlier_poses):
-        return "begin here"
-    rotations = Rotation.from_matrix((invert(earlier_poses) @ pose)[:, :3, :3]).as_rotvec()
-    angles = np.linalg.norm(rotations, axis=1)
-    nearest = int(np.argmin(angles))
-    if angles[nearest] < _TURN_RAD:
-        shift = 1e2 * float(np.linalg.norm(pose[:3, 3] - earlier_poses[nearest, :3, 3]))
-        return f"shift by {shift:.0f} cm from {names[nearest]}"
-    axis = rotations[nearest] / angles[nearest]
-    degrees = f"by {np.rad2deg(angles[nearest]):.0f} deg from {names[nearest]}"
-    flange_from_cam = cell.x
-    if cell.mount == "eye-to-hand":
-        flange_from_cam = invert(earlier_poses[nearest]) @ cell.x
-    if abs(axis @ flange_from_cam[:3, 2]) > _NEARLY_AXIS:
-        return f"turn about the optical axis {degrees}"
-    verb = "turn" if abs(axis[2]) > np.linalg.norm(axis[:2]) else "tilt"
-    # One axis, or the two that it lies between.
-    first, second = np.argsort(-np.abs(axis))[:2].tolist()
-    names = "xyz"[first] + (f" and {'xyz'[second]}" if abs(axis[second]) > _ASIDE else "")
-    return f"{verb} about the tool's {names} {degrees}"
-
-
-def _effect_words(
-    cell: PlanCell,
-    purpose: Purpose,
-    before: FloatArray,
-    after: FloatArray,
-    history: Sequence[Accuracy],
-) -> str:
-    """Describes a stop's effect; `history` is the accuracy without it and with it."""
-    drops = np.diag(before - after)
-    if purpose.judged == "sight":
-        # The component of x that improves most, along or about the camera's axes.
-        component = int(np.argmax(drops[:6] * np.repeat([_LEVER_M**2, 1.0], 3)))
-        axis = ("the image's x", "the image's y", "the optical axis")[component % 3]
-        is_rotation = component < 3
-        sigmas = (float(np.sqrt(array[component, component])) for array in (before, after))
-        words = f"the error {'about' if is_rotation else 'along'} {axis}"
-        return _change_words(words, *sigmas, is_rotation=is_rotation)
-    # The joint whose errors' variances drop most.
-    count = cell.robot.joint_count
-    by_joint, remaining = np.zeros(count), drops
-    for name in reversed(tuple(purpose.blocks)):
-        remaining, block = np.split(remaining, [len(remaining) - block_size(name, count)])
-        # Values of links are grouped by joint, six each; other blocks are grouped by function.
-        values = block.reshape(count, -1) if name == "links" else block.reshape(-1, count).T
-        by_joint += values.sum(axis=1)
-    sigmas = (1e-3 * accuracy.mm for accuracy in history)
-    change = _change_words("the error over the workspace", *sigmas, is_rotation=False)
-    joint = cell.robot.joint_names[int(np.argmax(by_joint))]
-    return f"{change}; most information on {joint}"
-
-
-def _change_words(what: str, before: float, after: float, *, is_rotation: bool) -> str:
-    """Describes the drop of a sigma [m or rad]."""
-    unit, scale = ("deg", float(np.rad2deg(1.0))) if is_rotation else ("mm", 1e3)
-    if after > OPEN_SIGMA:
-        return f"a beginning; {what} is not determined yet"
-    if before > OPEN_SIGMA:
-        return f"determines what was open; {what} is now {figure(after * scale)} {unit}"
-    figures = f"({figure(before * scale)} -> {figure(after * scale)} {unit})"
-    less = 100.0 * (1.0 - after / before)
-    return f"takes {f'{less:.0f} %' if less >= 1.0 else 'little'} off {what} {figures}"
+def _contribution(before: Accuracy, after: Accuracy) -> str:
+    """States what a stop contributes, by the accuracy without it and with it."""
+    if after.is_open:
+        return "a beginning; not all is determined yet"
+    if before.is_open:
+        return f"determines what was open; the error is now {figure(after.mm)} mm"
+    figures = f"({figure(before.mm)} -> {figure(after.mm)} mm)"
+    less = 100.0 * (1.0 - after.mm / before.mm)
+    return f"takes {f'{less:.0f} %' if less >= 1.0 else 'little'} off the error {figures}"

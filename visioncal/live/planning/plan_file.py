@@ -111,8 +111,6 @@ def _request_document(request: PlanRequest) -> dict[str, Any]:
     }
     if request.need is not None:
         document["need"] = _stated_values(request.need)
-    if request.workspace is not None:
-        document["workspace"] = _box_document(request.workspace)
     if request.start_q is not None:
         document["start_q"] = request.start_q.tolist()
     return document

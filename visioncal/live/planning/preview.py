@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.dynamics.plan_files import MotionPlan
-from visioncal.live.planning.messages import looks_note, plan_words, summary_of
+from visioncal.live.planning.messages import plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
 from visioncal.present.recording.preview import MotionPart, MotionPreview, Preview, PreviewStop
@@ -51,8 +51,6 @@ def _plan_note(plan: Plan, name: str) -> str:
     lines.append(f"{summary_of(plan)}.")
     if plan.need is not None and plan.need.limits:
         lines += ["", f"**{plan.need.limits}**"]
-    elif note := looks_note(plan):
-        lines += ["", note]
     if plan.start is not None and plan.start.refusal:
         lines += ["", f"So far: {plan.start.refusal}"]
     lines += [

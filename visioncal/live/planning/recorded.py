@@ -5,20 +5,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
-from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, Mount, Progress
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.chain import robot_part
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import (
     fisher_information,
@@ -31,34 +27,14 @@ from visioncal.live.planning.information import RecordedStops
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import extent_m, first_corners
 
-# Without a guess, prior sigma of the mounted camera's or board's offset, per axis [m].
+# Prior sigma of the mounted camera's or board's offset, per axis [m].
 _MOUNTED_M = 0.1
 # Edges with larger sigmas are too uncertain to plan stops [rad and m].
 _TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
 # Lower bound of a robot's noise; few stops may show less by chance [rad and m].
 _LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
-# Noise of a well-kept arm, where it was not observed [rad and m].
-_TYPICAL = Noise.of_robot(5e-5, 3e-5)
 # Newton steps; the problem is nearly linear.
 _STEPS = 20
-
-
-@dataclass(frozen=True, eq=False)
-class RoughEdges:
-    """Rough guesses of both edges (4, 4) [m], with sigmas per axis [rad and m]."""
-
-    x: FloatArray
-    z: FloatArray
-    sigma_rad: float
-    sigma_m: float
-
-    def __post_init__(self) -> None:
-        for name in ("sigma_rad", "sigma_m"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise DataError(
-                    f"the guesses: {name} is {getattr(self, name)}; a number above zero is needed.",
-                    culprits=[name],
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,41 +77,37 @@ def calibrate_partially(
 def start_from_session(
     partial: PartialCalibration,
     *,
-    guess: RoughEdges | None = None,
     limits: Limits | None = None,
     boxes: tuple[Box, ...] = (),
 ) -> SessionStart:
     """Prepares a session as the start of a plan.
 
-    In directions that the stops leave undetermined, the edges are those nearest to the guess;
-    without a guess, those with the mounted camera or board nearest to the flange.
+    In directions that the stops leave undetermined, the edges are those with the mounted camera or
+    board nearest to the flange.
 
     Args:
         partial: The session, calibrated as far as it goes.
-        guess: Rough guesses of the edges.
         limits: Limits of the added stops.
         boxes: Obstacles in the cell.
 
     Raises:
         DataError: The session lacks a robot's model, a camera or a board, or has too few
-            views to start without a guess.
+            usable views for a fit.
     """
     run = partial.known
     robot, targets = run.robot, tuple(run.session.boards.values())
     if robot is None or not targets or run.pixel_px is None or not run.scenes:
         raise _missing_input_error(run)
+    if run.cell_fit_or_none is None:
+        raise _too_vague_error(run)
     with one_blas_thread():
-        start = (
-            _start_from_guess(run, guess)
-            if run.cell_fit_or_none is None
-            else _start_from_fit(run, run.cell_fit_or_none)
-        )
+        start = _start_from_fit(run, run.cell_fit_or_none)
         edges, covariance = _posterior_edges(
-            start.problem, start.state, start.noise, run.session.mount, guess
+            start.problem, start.state, start.noise, run.session.mount
         )
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague_error(run, len(start.views))
+        raise _too_vague_error(run)
     # Up to the frame of the reported poses, calibrated where possible.
     arm, joints = robot, start.arm.joints_rad
     if start.arm.model is not None:
@@ -255,61 +227,19 @@ def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
     )
 
 
-def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart:
-    """Recorded stops of a session with too few for a fit, from a guess."""
-    observed = ObservedPoses.of(run)
-    posed = run.base_from_flange
-    views = [view for view in run.poses if view in posed and view not in run.held_back]
-    if guess is None or not views:
-        raise _too_vague_error(run, len(views))
-    shown = [run.poses[view].board for view in views]
-    board = max(dict.fromkeys(shown), key=shown.count)
-    chosen = [view for view in sorted(views) if run.poses[view].board == board]
-    observed = replace(observed, boards=(board,), used=tuple(chosen))
-    robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
-    target = tuple(run.session.boards.values())[board]
-    poses = [
-        run.poses[index].nearest(pose, target)
-        for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
-    ]
-    ((frame, scene),) = run.scenes.items()
-    problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
-    optics = CellFrameModel(problem, alone, chosen, {}).camera_parameters(
-        {frame: scene}, {frame: poses}
-    )
-    free = free_parameters_of_camera(optics.linearised())
-    observed = replace(observed, free=free).posed(poses)
-    problem = observed.problem(chosen)
-    return _RecordedStart(
-        problem,
-        problem.start(observed.framed(np.stack([guess.x, guess.z]))),
-        _TYPICAL,
-        observed.free or free,
-        observed.arm_at_stops,
-        board,
-        tuple(observed.first_of_stops(chosen)),
-    )
-
-
 def _posterior_edges(
-    problem: Problem, state: State, noise: Noise, mount: Mount, guess: RoughEdges | None
+    problem: Problem, state: State, noise: Noise, mount: Mount
 ) -> tuple[FloatArray, FloatArray]:
     """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
     prior = np.full((2, 2, 3), 1e-6)
-    if guess is not None:
-        prior[:] = np.array([[guess.sigma_rad**-2.0], [guess.sigma_m**-2.0]])
-    else:
-        prior[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
+    prior[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
     weights = np.zeros((problem.size, problem.size))
     weights[:12, :12] = np.diag(prior.ravel())
     for _ in range(_STEPS):
         information, gradient = normal_equations(problem, state, noise)
         # Twists from the prior to the edges.
         distance, edges = np.zeros(problem.size), state.edges[:2]
-        if guess is not None:
-            distance[:12] = log(invert(np.stack([guess.x, guess.z])) @ edges).ravel()
-        else:
-            distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges)
+        distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges)
         step = -covariance_among(information + weights, problem.moving) @ (
             gradient + weights @ distance
         )
@@ -348,11 +278,12 @@ def _missing_input_error(run: RunState) -> DataError:
     )
 
 
-def _too_vague_error(run: RunState, stops: int) -> DataError:
+def _too_vague_error(run: RunState) -> DataError:
+    posed = [view for view in run.poses if view in run.base_from_flange]
     return DataError(
-        f"session {run.session.name!r}: its {counted(stops, 'usable stop')} of "
+        f"session {run.session.name!r}: its {counted(len(posed), 'usable stop')} of "
         "the robot do not show where camera and board are, not even roughly.",
         culprits=[f"session {run.session.name!r}"],
-        next_step="Give rough guesses of both, in mm and degrees: --cam 'X Y Z RX RY RZ' --board "
-        "'X Y Z RX RY RZ'.",
+        next_step="Plan without it, from rough guesses of both, in mm and degrees: visioncal plan "
+        "ROBOT --cam 'X Y Z RX RY RZ' --board 'X Y Z RX RY RZ'.",
     )

@@ -1,16 +1,12 @@
 """A simulated cell to record live: the truth, what its user would know of it, and its devices."""
 
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 
-from visioncal.core.choices import Faults
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray
@@ -37,17 +33,8 @@ _FLOOR_DEPTH_M = 0.1
 _GUESSES = 101
 # An OAK's rate [1/s].
 _RATE_HZ = 30.0
-# Joint speeds above which the arm counts as moving, and below which as stopped [rad/s].
-_MOVING_SPEED, _STOPPED_SPEED = 0.05, 1e-3
-# Polling interval, delay of a fault after the start of a motion, and more than any motion between
-# two stops takes, even on a busy computer [s].
-_POLL_S, _INTO_MOTION_S, _PATIENCE_S = 0.02, 0.2, 60.0
 # Moments of an exposure at which the arm's joints are read, start and end included.
 _MOMENTS = 5
-# Dark, as the inside of a lens cap [grey level].
-_DARK = 12
-
-CameraFault = Literal["none", "unplugged", "covered"]
 
 
 class SimulatedCamera:
@@ -82,7 +69,7 @@ class SimulatedCamera:
         self._rate_hz, self._exposure_s = rate_hz, exposure_s
         self._start = self._clock.now()
         self._last: FloatArray | None = None
-        self.fault: CameraFault = "none"
+        self.is_unplugged = False
         self.resolution = cell.camera().camera.resolution
         # The cell's stated intrinsics.
         self.factory: Camera | None = cell.stated[""] if cell.camera().state_intrinsics else None
@@ -99,7 +86,7 @@ class SimulatedCamera:
         exposure_s, rate_hz = self._exposure_s, self._rate_hz
         start = self._start + np.ceil((requested_at - self._start) * rate_hz) / rate_hz
         is_late = start + exposure_s > requested_at + timeout_s
-        if is_late or self.fault == "unplugged":
+        if is_late or self.is_unplugged:
             self._clock.sleep(timeout_s)
             raise DriverError(
                 f"The {self.name} gave no picture within {timeout_s:g} s.",
@@ -108,9 +95,6 @@ class SimulatedCamera:
             )
         self._clock.sleep(max(start + exposure_s - requested_at, 0.0))
         middle_s = start + 0.5 * exposure_s
-        if self.fault == "covered":
-            dark = np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
-            return Frame(dark, middle_s, exposure_s)
         try:
             joints = self._true_joints(np.linspace(start, start + exposure_s, _MOMENTS))
         except DriverError:
@@ -128,7 +112,7 @@ class Bench:
     """A simulated cell with a camera on the flange of a UR; the same seed gives the same cell.
 
     Once started, its controller is another process, and its camera renders the truth. As a watcher
-    of its recording it notes the truth of each view, and lets a fault happen.
+    of its recording it notes the truth of each view.
 
     Attributes:
         truth: The true arm, edges, lens and board.
@@ -136,8 +120,7 @@ class Bench:
         views: The arm's true state in the middle of each view's exposure, with the view.
     """
 
-    def __init__(self, seed: int, fault: Faults | None = None, after: int = 0) -> None:
-        """Builds the cell; `fault` happens after a number of stops."""
+    def __init__(self, seed: int) -> None:
         options = CellOptions(robot=_ROBOT, views=1, cut_views=0.0, seed=seed)
         self._options = ControllerOptions(robot=_ROBOT, seed=seed, errors=_WORN)
         cell = simulate(options)
@@ -162,7 +145,6 @@ class Bench:
             Limits(floor_m=min(0.0, float(z[2, 3])) - _FLOOR_DEPTH_M),
         )
         self.views: list[tuple[TakenView, TrueState]] = []
-        self._fault, self._after = fault, after
 
     def start(self, q: FloatArray, host: str | None = None) -> None:
         """Starts the controller, its arm at a posture [rad].
@@ -183,7 +165,6 @@ class Bench:
             self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=_RATE_HZ
         )
         with closing(UrArm(self.controller.host)) as arm:
-            self._camera = camera
             yield LiveCell(arm, (camera,))
 
     def close(self) -> None:
@@ -191,38 +172,7 @@ class Bench:
         self.controller.close()
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Notes the truth of a view, and starts the fault once its number of stops was visited."""
+        """Notes the truth of a view."""
         if isinstance(step.found, TakenView):
             state = self.controller.state([step.found.frame.stamp_s])
             self.views.append((step.found, state))
-        if self._fault is not None and step.place == self._after:
-            threading.Thread(target=self._inject, args=(self._fault,), daemon=True).start()
-
-    def mend(self) -> None:
-        """Ends the fault, as a person would do in the cell before going on."""
-        if self._fault == "link-lost":
-            self.close()
-            self.start(self._stopped_q, self.controller.host)
-        self.controller.inject("none")
-        self._fault = None
-
-    def _inject(self, fault: Faults) -> None:
-        """Lets a fault happen: of the controller in the next motion, of the camera after it."""
-        self._wait(moving=True)
-        if fault == "unplugged" or fault == "covered":
-            self._wait(moving=False)
-            self._camera.fault = fault
-            return
-        time.sleep(_INTO_MOTION_S)
-        # Where a controller that is restarted has its arm.
-        self._stopped_q = self.controller.state([time.monotonic()]).q[0]
-        self.controller.inject(fault)
-
-    def _wait(self, *, moving: bool) -> None:
-        """Waits until the arm moves, or has stopped."""
-        ends_s = time.monotonic() + _PATIENCE_S
-        while time.monotonic() < ends_s:
-            speed = float(np.abs(self.controller.state([time.monotonic()]).dq).max())
-            if (speed > _MOVING_SPEED) if moving else (speed < _STOPPED_SPEED):
-                return
-            time.sleep(_POLL_S)
