@@ -162,7 +162,7 @@ class BoardOptions:
     """Options that describe a board."""
 
     kind: str | None = option(
-        "What to print.", metavar="charuco|checkerboard|aprilgrid|circles|marker"
+        "What to print.", metavar="charuco|checkerboard|aprilgrid|circles|dots|marker"
     )
     columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
     rows: int | None = option("The same along y.")

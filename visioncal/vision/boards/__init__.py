@@ -9,6 +9,7 @@ from visioncal.vision.boards.aprilgrid import AprilGrid
 from visioncal.vision.boards.charuco import CHARUCO
 from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.circles import CircleGrid
+from visioncal.vision.boards.dots import Dots
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.marker import MarkerKind
@@ -18,7 +19,7 @@ __all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "ki
 
 KINDS: Mapping[str, BoardKind] = {
     kind.name: kind
-    for kind in (CHARUCO, Checkerboard(), AprilGrid(), CircleGrid(), MarkerKind(), Rig())
+    for kind in (CHARUCO, Checkerboard(), AprilGrid(), CircleGrid(), MarkerKind(), Rig(), Dots())
 }
 
 
