@@ -6,7 +6,7 @@ image's point-spread function, times the light:
     grey(p) = o(p) + g(p) (L * h)(p),   h^(w) = exp(-|w|^2 s^2 / 2) sinc(w . m / 2),
 
 with L the print, s the Gaussian of lens and defocus, m the motion during the exposure, and o and g
-linear over the image. Levenberg and Marquardt's method fits all unknowns. A corner's own position
+linear over the image. Nonlinear least squares fit all unknowns. A corner's own position
 is its shift against that model, by the pixels half way to the next corners: patches share no pixel,
 so that corners are independent, and a lens bent in another way biases none. A convolution that is
 even, as one with the disc of defocus, moves no corner.
@@ -24,6 +24,8 @@ from typing import Self
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards import DetectedCorners, find_target, kind_of
@@ -120,7 +122,7 @@ class _Fit:
     # (h, w, 2) pixels relative to the middle of the image, in half its diagonal.
     places: FloatArray
     unit_px: FloatArray  # (3,) middle and half the diagonal of the reduced image [px].
-    texture: FloatArray  # The print, light being 1.
+    texture: npt.NDArray[np.float32]  # The print, light being 1.
     start: FloatArray  # (8,) homography to start from.
     side_px: float  # Side of a square [px].
 
@@ -158,58 +160,27 @@ class _Fit:
             side_px / factor,
         )
 
-    def on_board(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(h, w, 2) places of all pixels on the board [squares]; (9, h, w, 2) derivatives."""
-        radii = np.sum(self.places**2, axis=-1, keepdims=True)
-        straight = self.places / (1 + values[8] * radii)
+    def on_board(self, values: FloatArray) -> FloatArray:
+        """(h, w, 2) places of all pixels on the board [squares]."""
+        straight = self.places / (1 + values[8] * np.sum(self.places**2, axis=-1, keepdims=True))
         flat = np.append(values[:8], 1.0).reshape(3, 3)
-        terms = np.concatenate([straight, np.ones_like(radii)], axis=-1)
-        mapped = terms @ flat.T
-        at, depth = mapped[..., :2] / mapped[..., 2:], mapped[..., 2:]
-        derivatives = np.zeros((9, *at.shape))
-        for axis in (0, 1):
-            derivatives[3 * axis : 3 * axis + 3, ..., axis] = np.moveaxis(terms / depth, -1, 0)
-        derivatives[6:8] = -np.moveaxis(straight / depth, -1, 0)[..., None] * at
-        bending = -straight * radii / (1 + values[8] * radii)
-        slopes = bending @ flat[:, :2].T
-        derivatives[8] = (slopes[..., :2] - at * slopes[..., 2:]) / depth
-        return at, derivatives
+        mapped = np.concatenate([straight, np.ones_like(straight[..., :1])], axis=-1) @ flat.T
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
-    def blurred(self, values: FloatArray, *, slopes: bool = False) -> FloatArray:
-        """(h, w) the blurred print; or (15, h, w) with its derivatives.
-
-        These are by the twelve parameters of place and blur, and by u and v [1/px].
-        """
-        at, by_place = self.on_board(values)
-        size = np.array(self.texture.shape[::-1])
-        texels = np.clip(_TEXELS * (at + 1 + _PAPER) - 0.5, 0.0, size - 1.001)
-        first = texels.astype(int)
-        x, y = np.moveaxis(texels - first, -1, 0)
-        i, j = np.moveaxis(first, -1, 0)
-        near, right = self.texture[j, i], self.texture[j, i + 1]
-        below, across = self.texture[j + 1, i], self.texture[j + 1, i + 1]
-        drawn = (1 - y) * ((1 - x) * near + x * right) + y * ((1 - x) * below + x * across) - 1.0
+    def blurred(self, values: FloatArray) -> FloatArray:
+        """(h, w) the blurred print."""
+        texels = (_TEXELS * (self.on_board(values) + 1 + _PAPER) - 0.5).astype(np.float32)
+        drawn = cv2.remap(
+            self.texture, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         height, width = drawn.shape
         wu = 2 * np.pi * np.fft.rfftfreq(width)
         wv = 2 * np.pi * np.fft.fftfreq(height)[:, None]
-        square, half = wu**2 + wv**2, 0.5 * (wu * values[10] + wv * values[11])
-        gauss, line = np.exp(-0.5 * square * values[9] ** 2), np.sinc(half / np.pi)
-        spectrum = np.fft.rfft2(drawn) * gauss
-        if not slopes:
-            return np.asarray(np.fft.irfft2(spectrum * line, s=drawn.shape) + 1.0)
-        by_x = _TEXELS * ((1 - y) * (right - near) + y * (across - below))
-        by_y = _TEXELS * ((1 - x) * (below - near) + x * (across - right))
-        moved = np.fft.rfft2(by_x * by_place[..., 0] + by_y * by_place[..., 1]) * gauss * line
-        safe = np.where(np.abs(half) < 1e-4, 1.0, half)
-        by_half = np.where(np.abs(half) < 1e-4, -half / 3, (np.cos(half) - line) / safe)
-        others = np.stack([
-            -values[9] * square * line, 0.5 * wu * by_half, 0.5 * wv * by_half,
-            1j * wu * line, 1j * wv * line,
-        ])  # fmt: skip
-        parts = np.concatenate([(spectrum * line)[None], moved, spectrum * others])
-        images = np.fft.irfft2(parts, s=drawn.shape)
-        images[0] += 1.0
-        return np.asarray(images)
+        gauss = np.exp(-0.5 * (wu**2 + wv**2) * values[9] ** 2)
+        line = np.sinc((wu * values[10] + wv * values[11]) / (2 * np.pi))
+        return (
+            np.asarray(np.fft.irfft2(np.fft.rfft2(drawn - 1.0) * gauss * line, s=drawn.shape)) + 1
+        )
 
     @cached_property
     def light(self) -> FloatArray:
@@ -223,7 +194,7 @@ class _Fit:
 
     def used(self, values: FloatArray) -> Mask:
         """(h, w) mask of pixels of the board and a rim around it."""
-        at = self.on_board(values)[0]
+        at = self.on_board(values)
         low, high = (end / self.target.square_m for end in extent_m(self.target))
         on_board = np.all((at > low - _RIM) & (at < high + _RIM), axis=-1)
         return np.asarray(on_board & np.isfinite(self.image))
@@ -252,38 +223,24 @@ class _Fit:
         cost, values = min(self.starts(used), key=lambda at: at[0])
         if not np.isfinite(cost):
             return values, 0.0
-        damping = 1e-3
-        for _ in range(_STEPS):
-            images = self.blurred(values, slopes=True)[:, used]
-            light = self.light[used].T
-            jacobian = np.concatenate(
-                [(values[15:18] @ light) * images[1:13], light, light * images[0]]
-            )
-            rest = self.residuals(values, used)
-            normal, gradient = jacobian @ jacobian.T, jacobian @ rest
-            weight = cost / len(rest) / _BENDING**2
-            normal[8, 8] += weight
-            gradient[8] += weight * values[8]
-            before = cost
-            while damping < 1e6:
-                damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
-                trial = values - np.linalg.solve(damped, gradient)
-                trial_cost = float(np.sum(self.residuals(trial, used) ** 2))
-                damping *= 0.2 if trial_cost < cost else 5.0
-                if trial_cost < cost:
-                    values, cost = trial, trial_cost
-                    break
-            if not cost < (1.0 - _SETTLED) * before:
-                break
-        return values, 1.0 - cost / float(np.var(self.image[used]) * used.sum())
+        # In proportion to the noise, as the prior of what some views leave open.
+        weight = np.sqrt(cost / used.sum()) / _BENDING
+
+        def residuals(values: FloatArray) -> FloatArray:
+            return np.append(self.residuals(values, used), weight * values[8])
+
+        fit = least_squares(residuals, values, x_scale="jac", ftol=_SETTLED, max_nfev=_STEPS)
+        explained = float(np.var(self.image[used]) * used.sum())
+        return fit.x, 1.0 - float(np.sum(self.residuals(fit.x, used) ** 2)) / explained
 
     def corners(self) -> DenseCorners | None:
         """The corners; None where the board explains too little of the image."""
         values, explained = self.solved()
         if explained < _LEAST_EXPLAINED:
             return None
-        gain, board = self.light @ values[15:18], self.on_board(values)[0]
-        images = self.blurred(values, slopes=True)[[0, 13, 14]]
+        gain, board = self.light @ values[15:18], self.on_board(values)
+        blurred = self.blurred(values)
+        images = np.stack([blurred, *np.gradient(blurred)[::-1]])
         terms = np.concatenate([np.ones_like(gain)[None], gain * images])
         grey = self.image - self.light @ values[12:15]
         places = corner_positions(self.target)[:, :2] / self.target.square_m
@@ -333,7 +290,7 @@ class _Fit:
         return np.asarray(self.unit_px[:2] + self.unit_px[2] * bent)
 
 
-def _texture(target: Target, blur: float) -> FloatArray:
+def _texture(target: Target, blur: float) -> npt.NDArray[np.float32]:
     """The print with paper around it, light being 1; blurred by a share of a square."""
     low, high = extent_m(target)
     counts = np.rint((high - low) / target.square_m).astype(int).tolist()
@@ -351,4 +308,4 @@ def _texture(target: Target, blur: float) -> FloatArray:
             )
         texture -= shares[1] @ cells.dark @ shares[0].T
     # Dark squares of a ChArUco board and its markers share no area.
-    return np.asarray(cv2.GaussianBlur(texture, (0, 0), _TEXELS * blur), float)
+    return np.asarray(cv2.GaussianBlur(texture, (0, 0), _TEXELS * blur), np.float32)
