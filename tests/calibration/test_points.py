@@ -558,18 +558,6 @@ def test_a_deleted_row_takes_its_corners_along(cube):
         Session.load(cube)
 
 
-def test_tables_that_count_from_other_numbers_are_told_apart(cube):
-    lines = (cube / "views.csv").read_text().splitlines()
-    numbers = [int(line.partition(",")[0]) for line in lines[1:]]
-    moved = [
-        f"{at + 1},{line.partition(',')[2]}" for at, line in zip(numbers, lines[1:], strict=True)
-    ]
-    (cube / "views.csv").write_text("\n".join([lines[0], *moved]) + "\n")
-    with pytest.raises(DataError, match="one of them is numbered otherwise") as caught:
-        Session.load(cube)
-    assert caught.value.next_step.startswith("Add 1 to the views of corners.csv")
-
-
 @pytest.fixture
 def drawn(tmp_path: Path) -> Path:
     """A session of corners alone, whose board and lens are stated."""

@@ -80,14 +80,10 @@ def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[int, Int
     numbers, places = numbers.ravel(), places.reshape(-1, 2)
     if not np.array_equal(numbers, np.floor(numbers)):
         raise DataError(f"{name}: its ids are no whole numbers.", culprits=[name])
-    wrong = np.flatnonzero(~np.isfinite(places).all(axis=1))
-    if wrong.size:
-        at = int(wrong[0])
-        more = f", and {wrong.size - 1} more are not" if wrong.size > 1 else ""
+    if not np.isfinite(places).all():
         raise DataError(
-            f"{name}: px[{at}], of id {int(numbers[at])}, is ({places[at, 0]:g}, "
-            f"{places[at, 1]:g}) and not finite{more}.",
-            culprits=[f"{name}: px[{at}]"],
+            f"{name}: px has numbers that are not finite.",
+            culprits=[name],
             next_step="Leave corners that were not found out of ids and px.",
         )
     return view, numbers.astype(np.int64), places
@@ -114,16 +110,14 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
             culprits=[what, "base_from_flange"],
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
-    faulty = enumerate(rigid_fault(matrix, _ROUGH) for matrix in matrices)
-    faults = {at: pair for at, pair in faulty if pair[0]}
-    if faults:
-        at, (fault, step) = next(iter(faults.items()))
-        more = f" So are {len(faults) - 1} more of {count}." if len(faults) > 1 else ""
-        raise DataError(
-            f"base_from_flange[{at}] is no rigid transform: {fault}.{more}",
-            culprits=[f"base_from_flange[{fault}]" for fault in faults],
-            next_step=step,
-        )
+    for at, matrix in enumerate(matrices):
+        fault, step = rigid_fault(matrix, _ROUGH)
+        if fault:
+            raise DataError(
+                f"base_from_flange[{at}] is no rigid transform: {fault}.",
+                culprits=[f"base_from_flange[{at}]"],
+                next_step=step,
+            )
     stacked = np.array(matrices).reshape(-1, 4, 4)
     stacked[:, 3] = LAST_ROW
     return stacked

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -243,17 +242,6 @@ def _target_problems(
 ) -> Iterator[TableProblem]:
     """Problems of the rows' views and targets."""
     first = next((target for target in table.targets if target), "")
-    numbers = sorted(set(table.views.tolist()))
-    if len(numbers) == len(rows) and numbers != sorted(rows):
-        (offset, *others) = {b - a for a, b in zip(numbers, sorted(rows), strict=True)}
-        if not others:
-            yield TableProblem(
-                f"{FILE}, column view",
-                f"it goes from {numbers[0]} to {numbers[-1]}, and that of views.csv from "
-                f"{min(rows)} to {max(rows)}: one of them is numbered otherwise",
-                step=f"Add {offset} to the views of {FILE}, if both tables have the same order.",
-            )
-            return
     for view in dict.fromkeys(view for view in table.views.tolist() if view not in rows):
         own_rows = np.flatnonzero(table.views == view)
         more = f" and {len(own_rows) - 1} more" if len(own_rows) > 1 else ""
@@ -280,10 +268,6 @@ def _target_problems(
             yield TableProblem(f"{place}, column {COLUMN}", words)
 
 
-# Smallest number of foreign points of an exchanged target; fewer are mistyped.
-_FEWEST_EXCHANGED = 4
-
-
 def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str, Target]) -> None:
     """Checks that points exist on their targets, with (n,) `names`, and are unique in each view.
 
@@ -297,20 +281,6 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     numbers = {name: frozenset(point_numbers(targets[name])) for name in by_name}
     for name, used in by_name.items():
         _check_first_number(used, numbers[name], targets[name], file)
-    for one, other in combinations(by_name, 2):
-        wrong, right = (other, one) if by_name[one] <= numbers[one] else (one, other)
-        if len(by_name[wrong] - numbers[wrong]) < _FEWEST_EXCHANGED:
-            continue
-        if not (by_name[one] <= numbers[other] and by_name[other] <= numbers[one]):
-            continue
-        raise DataError(
-            f"Targets {one} and {other} are exchanged: {file} has points {min(by_name[wrong])} to "
-            f"{max(by_name[wrong])} of {wrong}, which has {min(numbers[wrong])} to "
-            f"{max(numbers[wrong])}; {right} has them all.",
-            culprits=[f"target {one}", f"target {other}"],
-            next_step=f"Exchange {one} and {other}: in [targets] of session.toml what each is, or "
-            "in column target of views.csv which one each row shows.",
-        )
     problems: list[TableProblem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
@@ -341,7 +311,7 @@ def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: s
                 f"{min(seen)} to {max(seen)}, and {_range(target)}.",
                 culprits=[f"{file}: point"],
                 next_step=f"In {file}, write point {sign} 1 in the place of point"
-                f"{rig * (target.kind == 'points')}.",
+                f"{rig * bool(target.points_m)}.",
             )
 
 

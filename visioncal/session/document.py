@@ -2,8 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import reduce
-from typing import Annotated, Any, Literal, TypeAlias, cast, get_args
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
@@ -148,8 +147,6 @@ Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
 KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
-# Number of entries of a 3 x 3 matrix, and their indices if it is written column by column.
-_ENTRIES, _TRANSPOSED = 9, (0, 3, 6, 1, 4, 7, 2, 5, 8)
 # Names that can be part of a frame's name: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 # Largest plausible offsets on a flange and in a cell [m]; offsets of more than 3 mm and 100 mm that
@@ -251,15 +248,11 @@ def read_declaration(
     try:
         declaration = Declaration.model_validate(dict(document))
     except ValidationError as error:
-        problems = list(_type_errors(error.errors(), document))
+        problems = list(_type_errors(error.errors()))
     else:
         problems = list(_contradictions(declaration, observed))
         hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
     if problems:
-        given = str(document.get("mount", ""))
-        spelt = given.lower().replace("_", "-").replace(" ", "-")
-        if spelt in get_args(CameraMount) and spelt != given:
-            hints = [f'In {label}, write mount = "{spelt}".']
         raise DataError(
             f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
             culprits=[f"{label}: {field}" for field, _ in problems],
@@ -268,35 +261,18 @@ def read_declaration(
     return declaration
 
 
-def _type_errors(
-    errors: Sequence[Mapping[str, Any]], document: Mapping[str, Any]
-) -> Iterator[tuple[str, str]]:
+def _type_errors(errors: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """Messages for pydantic's errors by dotted path; one for each wrongly nested list."""
-    lists: dict[str, str] = {}
+    nested: set[str] = set()
     for entry in errors:
         place = tuple(entry["loc"])
         at = next((at for at, value in enumerate(place) if value in ("matrix", "distortion")), None)
-        field = () if at is None else place[: at + 1]
-        value = reduce(lambda table, key: table[key], field, document) if field else None
-        words = _list_message(str(field[-1]), value) if isinstance(value, list) else ""
-        if not words:
+        if at is None or not isinstance(entry["input"], list):
             yield _dotted(place), _error_message(entry)
-        elif lists.setdefault(_dotted(field), words) is words:
-            yield _dotted(field), words
-
-
-def _list_message(name: str, value: list[Any]) -> str:
-    """Message for a 3 x 3 camera matrix, or a nested list; else empty."""
-    flat = [number for part in value for number in (part if isinstance(part, list) else [part])]
-    if not all(type(number) in (int, float) for number in flat):
-        return ""
-    if name == "matrix" and len(flat) == _ENTRIES:
-        for fx, skew, cx, low, fy, cy, *last in (flat, [flat[index] for index in _TRANSPOSED]):
-            if [skew, low, *last] == [0, 0, 0, 0, 1]:
-                return f"is the 3 x 3 {value!r}, but must be fx, fy, cx, cy: {[fx, fy, cx, cy]}"
-        return f"is {value!r}, but must be fx, fy, cx, cy"
-    is_nested = any(isinstance(number, list) for number in value)
-    return f"is {value!r}, but must be one list: {flat}" if is_nested else ""
+        elif (field := _dotted(place[: at + 1])) not in nested:
+            nested.add(field)
+            form = "fx, fy, cx, cy" if place[at] == "matrix" else "coefficients"
+            yield field, f"must be one list of {form}, without further brackets"
 
 
 def _dotted(location: Sequence[int | str]) -> str:
@@ -384,11 +360,8 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
         most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
         for axis, place in zip("xyz", places, strict=True):
             if place is not None and abs(place) > most:
-                yield (
-                    f"prior.{edge}.{axis}_m",
-                    f"is {place:g}, but is in metres, at most {most:g} {where}: write "
-                    f"{1e-3 * place:g} for {place:g} mm",
-                )
+                words = f"is {place:g}, but is in metres, at most {most:g} {where}"
+                yield f"prior.{edge}.{axis}_m", words
 
 
 def _plural_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
@@ -401,20 +374,6 @@ def _plural_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tup
             yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
 
 
-def _coefficients_remedy(model: str, distortion: Sequence[float]) -> str:
-    """Remedy for a wrong number of distortion coefficients."""
-    counts, count = _COEFFICIENTS[model], len(distortion)
-    other = next((name for name in _COEFFICIENTS if count in _COEFFICIENTS[name]), None)
-    if count < max(counts):
-        padding = " (write 0 for those that are not used)"
-        return f'{padding}; {count} are those of "{other}"' if other else padding
-    if not any(distortion[max(counts) :]):
-        return f": leave out the last {count - max(counts)}, which are 0"
-    if other is not None:
-        return f'; {count} are those of "{other}"'
-    return ": delete matrix and distortion, and a lens of this model is estimated"
-
-
 def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str, str]]:
     counts = _COEFFICIENTS[camera.model]
     if camera.distortion is not None and len(camera.distortion) not in counts:
@@ -422,7 +381,7 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
         yield (
             f"{path}.distortion",
             f'has {len(camera.distortion)} coefficients, but the "{camera.model}" model needs '
-            f"{needed}{_coefficients_remedy(camera.model, camera.distortion)}",
+            f"{needed} (0 for those that are not used)",
         )
     if camera.matrix is not None:
         if camera.distortion is None:

@@ -163,46 +163,21 @@ def _none_fits(
     label: str,
 ) -> DataError:
     """Error that no combination fits the names."""
-    culprits = [f"--{name}" for name in named]
     for part in needs:
         if not by_part[part]:
             return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
-    only = {
-        part: next(iter(collection)) for part, collection in by_part.items() if len(collection) == 1
-    } | dict(named)
-    camera, target, flange = (only.get(name) for name in ("camera", "target", "robot"))
-    robot = None if flange is None else object_name(flange, "robot")
-    if camera and target and "target" in needs:
-        robots = robots_between(frames, camera, target)
-        names = " and ".join(robot or "robot" for robot in robots)
-        on = f"{camera} is on {frames[camera]} and {target} on {frames[target]}"
-        if not robots:
-            words = f"{on}, and no robot moves them before each other"
-            step = "Name a camera or a target that a robot carries."
-        elif len(robots) > 1:
-            words = f"{on}: robots {names} part them, and one is needed"
-            step = "Name a camera and a target of which one robot carries one."
-        else:
-            words = f"{on}: robot {names} parts them, and robot {robot} does not"
-            step = f"Name that robot: --robot {names}."
-        return DataError(f"{label}: {words}.", culprits=culprits, next_step=step)
-    if camera:
-        carrier = f"{camera} is on {frames[camera]}"
-        which = f"robot {robot} has no part in what it sees" if robot else "no robot parts it"
-        return DataError(
-            f"{label}: {carrier}, and {which}.",
-            culprits=culprits,
-            next_step="Name another robot, or another camera.",
-        )
     pairs = [
         f"{object_name(option.camera, 'camera')} and {object_name(option.target, 'target')} "
         f"by robot {object_name(option.flange, 'robot')}"
         for option in _combinations(frames, by_part, parted=True)
         if option.camera and option.target
     ]
+    between = [frame for part, frame in named.items() if part != "robot"]
+    robots = robots_between(frames, *between) if len(between) == 2 else ()
+    parting = f" ({' and '.join(robots)} part them)" if robots else ""
     return DataError(
-        f"{label}: no robot parts a camera from a target as they are named.",
-        culprits=culprits,
+        f"{label}: no one robot parts a camera from a target as they are named{parting}.",
+        culprits=[f"--{name}" for name in named],
         next_step=f"These go together: {some_of(pairs)}." if pairs else "",
     )
 

@@ -1,6 +1,5 @@
 """Session: the recording of a cell, read from a folder and written to one."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,7 +33,7 @@ from visioncal.session.document import (
     read_declaration,
 )
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
-from visioncal.session.images import IMAGE_ENDINGS, FolderImages, ImageStore, MemoryImages
+from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import (
     COLUMN,
     check_images_can_be_used,
@@ -139,16 +138,6 @@ class Session:
                 next_step=f"Name its folder: {path.parent}."
                 if (path.parent / "session.toml").is_file()
                 else "",
-            )
-        if not (path / "session.toml").exists() and any(
-            file.suffix.lower() in IMAGE_ENDINGS for file in path.iterdir()
-        ):
-            raise DataError(
-                f"{path} is a folder of pictures, and no session: it has no session.toml.",
-                culprits=[str(path)],
-                next_step="With a table of the robot's poses they become one: visioncal convert "
-                f"TABLE my-session --images {shlex.quote(str(path))} --target BOARD --mount "
-                "eye-in-hand (or eye-to-hand).",
             )
         document = parse_toml(
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"

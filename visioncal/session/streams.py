@@ -23,8 +23,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
 _GAP_RATIO, _GAP_S = 2.5, 0.02
 # Cells that stand for missing numbers in other programs' tables.
 _NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
-# Units that stamps may be in by mistake, per second.
-_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # Largest size of all streams together: half an hour of twenty columns at 500 Hz.
 _MOST_BYTES = 300_000_000
 
@@ -208,18 +206,11 @@ def _checks(stream: Stream, label: str) -> NumberChecks:
 
 def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
     """Error for samples whose typical step `usual_s` exceeds the accepted `slowest_s` [s]."""
-    # The first unit in which the steps are plausible for a controller.
-    unit = next((name for name, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
-    like = "no time in seconds"
-    if unit:
-        like = f"{unit} ({_UNITS[unit] / usual_s:.3g} samples a second)"
     return DataError(
-        f"{label}: by stamp_s its samples are {usual_s:.4g} s apart, which looks like {like}. Over "
-        f"{slowest_s:g} s they show no motion.",
+        f"{label}: by stamp_s its samples are {usual_s:.4g} s apart; over {slowest_s:g} s they "
+        "show no motion.",
         culprits=[f"{label}, stamp_s"],
-        next_step=f"stamp_s is in seconds: divide it by {_UNITS[unit]:.0f}."
-        if unit
-        else "stamp_s is in seconds.",
+        next_step="stamp_s is in seconds: divide by 1000 where it is in milliseconds.",
     )
 
 
