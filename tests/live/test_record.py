@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import signal
 import sys
@@ -19,12 +20,15 @@ from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
 from visioncal.cli import record as record_module
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
 from visioncal.live.capture.cell import HostClock
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import plan_document, read_plan
+from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
 from visioncal.live.planning.purposes import purpose_of
+from visioncal.present.recording import paths
+from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
+from visioncal.present.viewer import live as viewer
 from visioncal.session import Session
 
 ARM, CAMERA = ("--arm", "fake:here"), ("--camera", "fake")

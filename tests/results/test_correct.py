@@ -313,8 +313,9 @@ def test_targets_out_of_reach_are_named_and_nothing_is_written(stored, result):
     poses = targets_near(3, result)
     poses[1, :3, 3] = [1.5, 0.0, 0.3]
     table, out = write_poses(stored / "t.csv", poses), stored / "o.csv"
+    left = "t.csv, line 3: out of reach within the joints' limits: the nearest posture leaves"
     run("correct", table, "-c", stored, "-o", out, "--seed-joints", SEED).refused(
-        "1 of 3 targets", "t.csv, line 3: out of reach: the nearest posture leaves"
+        "1 of 3 targets", left
     )
     assert not out.exists()
     done = run("correct", table, "-c", stored, "-o", out, "--skip-unreachable").good()

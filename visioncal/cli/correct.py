@@ -171,14 +171,11 @@ def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, 
     """Rows that cannot be reached, with the reason."""
     for row in np.flatnonzero(~corrected.reached):
         off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
-        nearest = f"the nearest posture leaves {mm_and_deg(off_mm, off_deg)}"
-        beyond = corrected.beyond[row]
-        reason = (
-            f"reached only with {some_of(beyond)} beyond its limits; within them "
-            if beyond
-            else "out of reach: "
+        left = mm_and_deg(off_mm, off_deg)
+        yield (
+            targets.places[row],
+            f"out of reach within the joints' limits: the nearest posture leaves {left}",
         )
-        yield targets.places[row], reason + nearest
 
 
 def _warn_turns(

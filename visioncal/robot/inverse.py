@@ -10,7 +10,7 @@ exactly two pi, whatever the gear ratio.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,9 +60,6 @@ class Posture:
     off_m: float  # Position error of the flange [m].
     off_rad: float  # Rotation error of the flange [rad].
     reached: bool  # Whether the pose is reached within the joints' limits.
-    # If not, the joints whose limits alone prevent it; empty where the pose is out of reach without
-    # limits, too.
-    beyond: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +93,6 @@ class _Bounds:
         half = np.where(known, 0.5 * (upper - lower), _SPREAD)
         half = np.where(self.turning, np.minimum(half, _SPREAD), half)
         return np.where(known, 0.5 * (lower + upper), around), half
-
-    def beyond(self, positions: FloatArray) -> FloatArray:
-        """Excess (n,) of positions over the limits [rad or m]."""
-        return np.maximum(np.maximum(self.lower - positions, positions - self.upper), 0.0)
 
 
 class Inverse:
@@ -152,8 +145,7 @@ class Inverse:
         if reached:
             return min(reached, key=lambda value: bounds.apart(value.positions - wanted))
         nearest = min(candidates, key=lambda value: value.off_m**2 + value.off_rad**2)
-        nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
-        return replace(nearest, beyond=self._limiting_joints(goal, wanted))
+        return self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
 
     def from_starts(
         self, base_from_flange: FloatArray, starts: FloatArray
@@ -183,24 +175,6 @@ class Inverse:
         for share in rng.uniform(-1.0, 1.0, (_STARTS, len(wanted))):
             start = centre + share * half
             yield self._descend(goal, start, bounds, wanted)
-
-    def _limiting_joints(self, goal: "pin.SE3", wanted: FloatArray) -> tuple[str, ...]:
-        """The joints whose limits the solution without limits exceeds least; empty for none."""
-        free = replace(
-            self._bounds,
-            lower=np.full_like(self._bounds.lower, -np.inf),
-            upper=np.full_like(self._bounds.upper, np.inf),
-        )
-        centre, _ = self._bounds.middle_and_half(wanted)
-        candidates = [
-            posture for posture in self._from_random_starts(goal, free, centre) if posture.reached
-        ]
-        if not candidates:
-            return ()
-        excess = [self._bounds.beyond(posture.positions) for posture in candidates]
-        least = min(excess, key=lambda value: float(np.sum(value)))
-        names = zip(self._names, least, strict=True)
-        return tuple(name for name, value in names if value > 0.0)
 
     def _descend(
         self,

@@ -178,8 +178,6 @@ class Corrected:
     # (m, n) rotation of each joint from its seed, or else from the target before; zero for a
     # prismatic joint, and for a first target without a seed.
     turned_rad: FloatArray
-    # (m,) for an unreached target, the joints whose limits alone prevent it.
-    beyond: tuple[tuple[str, ...], ...]
 
     def __len__(self) -> int:
         return len(self.q)
@@ -260,7 +258,6 @@ def correct(
         off_m=np.array([posture.off_m for posture in postures]),
         off_rad=np.array([posture.off_rad for posture in postures]),
         turned_rad=np.where(chain.prismatic, 0.0, np.abs(positions - starts)),
-        beyond=tuple(posture.beyond for posture in postures),
     )
 
 
