@@ -35,6 +35,7 @@ from visioncal.vision.targets import corner_positions, extent_m
 _SQUARE_PX, _TEXELS = 16.0, 32
 # Blur of the print before it is sampled once a pixel; narrower edges would alias [px].
 _DRAWN_PX = 0.5
+_EDGE = cv2.BORDER_REPLICATE
 # White paper around the print, and how much of it is fitted [squares].
 _PAPER, _RIM = 2, 0.25
 # Prior sigma of the relative radial distortion at the image's corner, which some views leave open.
@@ -170,8 +171,8 @@ class _Fit:
     def blurred(self, values: FloatArray) -> FloatArray:
         """(h, w) the blurred print."""
         texels = (_TEXELS * (self.on_board(values) + 1 + _PAPER) - 0.5).astype(np.float32)
-        drawn = cv2.remap(
-            self.texture, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        drawn = np.asarray(
+            cv2.remap(self.texture, texels[..., 0], texels[..., 1], cv2.INTER_LINEAR, None, _EDGE)
         )
         height, width = drawn.shape
         wu = 2 * np.pi * np.fft.rfftfreq(width)

@@ -214,7 +214,7 @@ class Dots(Board):
                 flat = cv2.getPerspectiveTransform(
                     _round_about(places[large]), np.roll(px, turn, axis=0)
                 )
-                pairs = _matched(_mapped(flat, places), tree)
+                pairs = _matched(_mapped(np.asarray(flat, float), places), tree)
                 if len(pairs) > most:
                     best, most = pairs, len(pairs)
         for at in range(_ROUNDS if most >= _LARGE else 0):
