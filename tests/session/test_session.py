@@ -543,14 +543,6 @@ def test_a_shared_column_that_names_two_cameras_is_refused(folder):
     assert "names first, " in refusal(folder).message
 
 
-def test_a_folder_of_pictures_is_pointed_to_convert(tmp_path):
-    folder = tmp_path / "shots of cell 4"
-    folder.mkdir()
-    (folder / "1.PNG").touch()
-    caught = raised(DataError, "is a folder of pictures, and no session", Session.load, folder)
-    assert f"visioncal convert TABLE my-session --images '{folder}'" in caught.next_step
-
-
 def test_a_link_to_another_kind_of_file_is_no_board(folder, tmp_path):
     (tmp_path / "passwords").write_text(BOARD)
     (folder / "board.toml").unlink()
