@@ -94,8 +94,8 @@ def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():
 
     best = np.array([0.5 * np.log(99.0)])
     low, high = np.array([-9.0]), np.array([9.0])
-    model, enough = SimpleNamespace(at=at), at(best).value + 1.0
-    likely = MixedModel.maximised(model, np.array([-2.3]), low, high, enough=enough)
+    model, enough = SimpleNamespace(at=at, prior=None), at(best).value + 1.0
+    likely = MixedModel.maximised(model, np.array([-2.3]), low, high, enough, 1e-7)
     assert likely.value == pytest.approx(at(best).value, abs=1e-6)
 
 

@@ -242,7 +242,7 @@ class _Blocks:
         `enough` is a value that matters: the search ends once it is unlikely to be reached.
         """
         low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
-        return self.likelihood.model.maximised(start, low, high, 0.0, enough, _LITTLE)
+        return self.likelihood.model.maximised(start, low, high, enough, _LITTLE)
 
     def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
         """The same without a block, and the logarithms of the other sizes."""

@@ -21,8 +21,8 @@ _SCALES = 0.02 * np.sinh(np.linspace(-6.2, 5.4, 59))
 # Levels under a tenth of a micrometre or microradian count as zero. They are then integrated about
 # this one: arms repeat to some hundredths of a millimetre [m].
 _NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
-# Steps of the other levels' logarithms after which an interval's end moves by less than 1 %.
-_CONVERGED = 1e-2
+# Gain in log-likelihood of the other levels after which an interval's end moves by less than 1 %.
+_CONVERGED = 1e-3
 # Degrees of freedom of a level not significantly above zero: those of a handful of stops.
 _LEAST_FREEDOM = 8.0
 
@@ -74,7 +74,7 @@ def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
     def profile(level: int, logarithm: float) -> float:
         at, others = sigmas.copy(), np.arange(len(sigmas)) != level
         at[level] = np.exp(logarithm)
-        return likelihood.most_likely(at.reshape(noise.robots.shape), others, settled=_CONVERGED)[1]
+        return likelihood.most_likely(at.reshape(noise.robots.shape), others, little=_CONVERGED)[1]
 
     intervals = [
         profile_interval(partial(profile, level), sigma, lowest)

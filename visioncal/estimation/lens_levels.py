@@ -29,7 +29,7 @@ from visioncal.estimation.lens_field import (
 )
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import (
-    HARDLY,
+    LITTLE,
     CommonRows,
     MixedEstimate,
     MixedModel,
@@ -43,8 +43,8 @@ from visioncal.estimation.robot_likelihood import ratio_prior
 from visioncal.estimation.scene import BoardSizes, CornerProblem
 
 # Correlation lengths of the field that are tried, as shares of the image's width, and least gain in
-# log-likelihood of the next one.
-_LENGTHS, _GAIN = (0.2, 0.12, 0.07), 0.5
+# log-likelihood of the next one; gain that a likelihood-ratio statistic may neglect.
+_LENGTHS, _GAIN, _LITTLE_GAIN = (0.2, 0.12, 0.07), 0.5, 1e-2
 # The corner noise lies between the residuals with lens, board and field all free and those with
 # lens and board alone, times these factors.
 _NOISE_RANGE = (0.7, 3.0)
@@ -101,18 +101,20 @@ class _Likelihood:
     """Restricted likelihood of the levels' logarithms, at one correlation length of the field."""
 
     model: MixedModel  # Sizes are the levels.
-    counts: FloatArray  # (k,) number of random values of each level; zero for the corner noise.
     # RMS corner residuals with lens, board and field all free, and with lens and board alone [px].
     noise_px: tuple[float, float]
     flanges: int  # Index of the first size of a flange.
 
     def minimised(
-        self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
+        self,
+        logs: FloatArray,
+        closed: tuple[int, ...],
+        enough: float = np.inf,
+        little: float = LITTLE,
     ) -> MixedEstimate:
         """The most likely levels; `closed` ones stay at their lower bounds."""
         low, high = self.limits(closed)
-        hardly = HARDLY * np.maximum(self.counts, 1.0)
-        found = self.model.maximised(logs, low, high, enough=enough, hardly=hardly)
+        found = self.model.maximised(logs, low, high, enough, little)
         # Insignificant levels decrease by ever smaller gains: tries their lower bounds directly.
         for level in (_FIELD, _BREATHING, _JITTER, *range(_FOCAL, self.flanges)):
             if found.gradient[level] <= 0.0 or found.logs[level] <= low[level]:
@@ -133,7 +135,8 @@ class _Likelihood:
         # The other levels are only refitted where it matters.
         if upper_bound < SIGNIFICANT or (level >= _FOCAL and not _is_scale(level)):
             return upper_bound
-        return 2.0 * (self.minimised(without, (*closed, level)).value - found.value)
+        refitted = self.minimised(without, (*closed, level), little=_LITTLE_GAIN)
+        return 2.0 * (refitted.value - found.value)
 
     def limits(self, closed: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of the levels' logarithms."""
@@ -152,7 +155,7 @@ class _Likelihood:
                 (1.0, 1.0, 1.0),
                 *[_LENS_ERRORS] * 3,
                 *_BOARD_ERRORS * ((self.flanges - _BOARDS) // 3),
-                *[_FLANGE_ERRORS] * (len(self.counts) - self.flanges),
+                *[_FLANGE_ERRORS] * (self.model.shares.shape[1] - self.flanges),
             ]
         )
         bounds[_FIELD, [0, 2]] *= left_px
@@ -449,14 +452,8 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     sizes = np.r_[_NOISE, _JITTER, flanges:levels]
     units = Units(residuals, jacobian, known_noise, parts, sizes)
     prior = ratio_prior(range(robots), levels, flanges)
-    counts = np.sum(shares > 0.0, axis=0).astype(float)
-    counts[_JITTER] = views
-    counts[flanges:] = [
-        3 * np.sum(rows.robots == robot) for robot in range(robots) for _ in range(2)
-    ]
     return _Likelihood(
         MixedModel((units,), (of_corners, known), shares, prior),
-        counts,
         (left_px(len(shared)), left_px(focus)),
         flanges,
     )

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import eigh, lapack
+from scipy.linalg import blas, eigh, lapack
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 
@@ -56,6 +56,24 @@ def covariance_root(information: FloatArray) -> FloatArray:
         return np.asarray(scale[:, None] * np.tril(inverse).T)
     values, vectors, scale = _floored(information)
     return np.asarray(scale[:, None] * vectors / np.sqrt(values))
+
+
+def times_root(rows: FloatArray, root: FloatArray) -> FloatArray:
+    """(u, d, n) product of rows with a `covariance_root` (n, n)."""
+    flat = rows.reshape(-1, len(root))
+    if np.tril(root, -1).any():
+        return np.asarray((flat @ root).reshape(rows.shape))
+    # Half of the work for a triangular root.
+    return np.asarray(blas.dtrmm(1.0, root.T, flat.T, lower=1).T.reshape(rows.shape))
+
+
+def inverse_roots(covariance: FloatArray) -> FloatArray:
+    """(u, d, d) whitening `w` with `w covariance w^T = 1` of (u, d, d), even if singular."""
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+    except np.linalg.LinAlgError:
+        values, vectors, scale = _floored(covariance)
+        return np.swapaxes(scale[..., :, None] * vectors / np.sqrt(values)[..., None, :], 1, 2)
 
 
 def _floored(information: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -19,21 +19,28 @@ from scipy.special import expit, logit
 
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram
+from visioncal.estimation.linalg import (
+    NULL_SHARE,
+    covariance_root,
+    gram,
+    inverse_roots,
+    times_root,
+)
 
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
-# A step changes a sigma by a factor of e at most; a change of 1e-4 is far below its uncertainty.
-_LONGEST_STEP, SETTLED = 1.0, 1e-4
-_WORST_DAMPING = 1e6
-# A smaller gain of log-likelihood corresponds to a thousandth of the levels' uncertainty.
-_LITTLE = 1e-6
-# Levels near zero have a gradient below this per value that they describe, and at most this ratio
-# of curvature to gradient (that of a variance is 2): they decrease by steps twice as long.
-HARDLY, _VARIANCES = 0.1, 3.0
+# A step changes a sigma by a factor of e at most, unless it vanishes.
+_LONGEST_STEP = 1.0
+# A smaller gain of log-likelihood corresponds to a hundredth of the levels' uncertainty.
+LITTLE = 2e-5
+# Sizes near zero have a gradient below this, and at most this ratio of curvature to gradient (that
+# of a variance is 2): they become zero at once.
+_HARDLY, _VARIANCES = 0.1, 3.0
 # The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
 # this length: at three times the initial level it is three times the prediction.
 _SURELY, _SHORT_STEP = 3.0, 0.5
+# Least share of the predicted change of the gradient along a step that corrects the curvature.
+_LEAST_CHANGE = 0.05
 # Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
 SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
 # First and largest half width and tolerance of its search, in logarithms of the sigma.
@@ -139,12 +146,12 @@ class CommonRows:
 
 
 @dataclass(frozen=True, eq=False)
-class WeightedUnits:
-    """Units at some sizes."""
+class WhiteUnits:
+    """Units at some sizes, in units of their noise."""
 
-    weights: FloatArray  # (u, d, d) inverse covariance of the residuals.
-    weighted: FloatArray  # (u, d, q) weights times the Jacobian.
-    pulled: FloatArray  # (u, d) weighted residuals at the most likely common unknowns.
+    whitening: FloatArray  # (u, d, d) inverse roots of the residuals' covariance.
+    jacobian: FloatArray  # (u, d, q).
+    residuals: FloatArray  # (u, d) at the most likely common unknowns.
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +161,7 @@ class MixedEstimate(LikelihoodValue):
     logs: FloatArray  # (k,) logarithms of the sizes.
     values: FloatArray  # (q,) best linear unbiased prediction of the common unknowns.
     root: FloatArray  # (q, q) root of their covariance `root @ root^T`.
-    units: tuple[WeightedUnits, ...]
+    units: tuple[WhiteUnits, ...]
 
     def likely_size(self, moved: FloatArray, among: Mask) -> tuple[float, float]:
         """Maximum-likelihood size of additional random unknowns of equal variance.
@@ -164,13 +171,14 @@ class MixedEstimate(LikelihoodValue):
         mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
         """
         own = self.units[0]
-        absorbed = self.root.T @ gram(own.weighted[among], moved)
-        information = gram(moved, own.weights[among] @ moved) - absorbed.T @ absorbed
+        moved = own.whitening[among] @ moved
+        absorbed = self.root.T @ gram(own.jacobian[among], moved)
+        information = gram(moved, moved) - absorbed.T @ absorbed
         values, vectors = np.linalg.eigh(information)
         # Directions that the parameters absorb entirely hold rounding only.
         kept = values > NULL_SHARE * np.trace(information + absorbed.T @ absorbed)
         values, vectors = values[kept], vectors[:, kept]
-        squares = (gram(moved, own.pulled[among]) @ vectors) ** 2
+        squares = (gram(moved, own.residuals[among]) @ vectors) ** 2
         sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
         added = 1.0 + sizes**2 * values
         change = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
@@ -198,15 +206,15 @@ class MixedModel:
         gradient = np.zeros(len(self.shares))
         information = np.diag(gradient)
         information[is_random, is_random] = 1.0 / variances
-        value, weighed = float(np.log(variances).sum()), []
+        value, white = float(np.log(variances).sum()), []
         for unit in self.units:
-            total = unit.total(logs)
-            weights = np.asarray(np.linalg.inv(total), dtype=float)
-            weighted = weights @ unit.jacobian
-            information += gram(unit.jacobian, weighted)
-            gradient += gram(weighted, unit.residuals)
-            value += float(np.linalg.slogdet(total)[1].sum())
-            weighed.append((weights, weighted))
+            whitening = inverse_roots(unit.total(logs))
+            jacobian = whitening @ unit.jacobian
+            residuals = (whitening @ unit.residuals[:, :, None])[:, :, 0]
+            information += gram(jacobian, jacobian)
+            gradient += gram(jacobian, residuals)
+            value -= 2.0 * float(np.linalg.slogdet(whitening)[1].sum())
+            white.append(WhiteUnits(whitening, jacobian, residuals))
         for rows in self.common:
             weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
             information += weight * rows.information
@@ -217,17 +225,15 @@ class MixedModel:
         values = root @ (root.T @ gradient)
         value += float(np.sum(values[is_random] ** 2 / variances))
         value -= 2.0 * float(np.linalg.slogdet(root)[1])
-        units = []
-        for unit, (weights, weighted) in zip(self.units, weighed, strict=True):
-            left = unit.residuals - unit.jacobian @ values
-            pulled = (weights @ left[:, :, None])[:, :, 0]
-            value += float(np.einsum("ui,ui->", left, pulled))
-            units.append(WeightedUnits(weights, weighted, pulled))
+        units = tuple(
+            replace(unit, residuals=unit.residuals - unit.jacobian @ values) for unit in white
+        )
+        value += sum(float(np.sum(unit.residuals**2)) for unit in units)
         for rows in self.common:
             weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
             value += weight * rows.left(values)[1]
         flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
-        here = MixedEstimate(0.5 * value, *flat, logs, values, root, tuple(units))
+        here = MixedEstimate(0.5 * value, *flat, logs, values, root, units)
         gradient, curvature = self._slopes(here) if is_sloped else flat
         if self.prior is not None:
             prior = self.prior.at(logs)
@@ -251,16 +257,20 @@ class MixedModel:
         along[is_random] = 2.0 * parts * (values[is_random] / own)[:, None]
         average, absorbed = np.zeros((len(variances),) * 2), np.zeros_like(along)
         for unit, at in zip(self.units, here.units, strict=True):
-            by_root = (at.weighted.reshape(-1, len(root)) @ root).reshape(at.weighted.shape)
-            remaining = at.weights - by_root @ np.swapaxes(by_root, 1, 2)
-            pulls = (unit.parts @ at.pulled[:, :, None])[..., 0]
+            back = np.swapaxes(at.whitening, 1, 2)
+            fitted = times_root(at.jacobian, root)
+            remaining = np.eye(fitted.shape[1]) - fitted @ np.swapaxes(fitted, 1, 2)
+            remaining = back @ remaining @ at.whitening
+            pulled = back @ at.residuals[:, :, None]
+            pulls = (unit.parts @ pulled)[..., 0]
             traces = np.tensordot(unit.parts, remaining, axes=([1, 2, 3], [0, 1, 2]))
             squares = variances[unit.sizes]
-            by_size[unit.sizes] += squares * (traces - np.einsum("jui,ui->j", pulls, at.pulled))
-            working = unit.jacobian @ along
-            working[:, :, unit.sizes] += np.moveaxis(2.0 * squares[:, None, None] * pulls, 0, 2)
-            average += gram(working, at.weights @ working)
-            absorbed += gram(at.weighted, working)
+            by_size[unit.sizes] += squares * (traces - np.sum(pulls * pulled[..., 0], axis=(1, 2)))
+            working = at.jacobian @ along
+            moved = at.whitening @ np.moveaxis(2.0 * squares[:, None, None] * pulls, 0, 2)
+            working[:, :, unit.sizes] += moved
+            average += gram(working, working)
+            absorbed += gram(at.jacobian, working)
         for rows in self.common:
             weight = 1.0 if rows.noise < 0 else 1.0 / variances[rows.noise]
             rest, cost = rows.left(values)
@@ -284,60 +294,79 @@ class MixedModel:
         logs: FloatArray,
         low: FloatArray | float,
         high: FloatArray | float,
-        settled: float = SETTLED,
         enough: float = np.inf,
-        little: float = _LITTLE,
-        hardly: FloatArray | float = HARDLY,
+        little: float = LITTLE,
     ) -> MixedEstimate:
         """Finds the most likely sizes by damped Newton steps of their (k,) logarithms.
+
+        The curvature is the average information, corrected by the changes of the gradient along
+        the last steps (Dennis, Gay and Welsch 1981).
 
         Args:
             logs: (k,) initial logarithms.
             low: Lower bounds; equal to `high` for fixed sizes.
             high: Upper bounds.
-            settled: Step below which the search has converged.
             enough: The search ends once it is unlikely to reach a value below this.
-            little: Predicted gain of log-likelihood below which the search has converged, too.
-            hardly: Gradient below which a size may be near zero.
+            little: Predicted gain of log-likelihood below which the search has converged.
         """
         low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
         logs = np.clip(logs, low, high)
-        now, damping = self.at(logs), 1e-3
+        # A prior of its ratio to another keeps a size from becoming zero at once.
+        is_untied = np.ones(len(logs), dtype=bool)
+        if self.prior is not None:
+            is_untied &= ~self.prior.jacobian.any(axis=0)
+        now, damping, correction = self.at(logs), 1e-3, np.zeros((len(logs),) * 2)
         for _ in range(60):
             # Levels at a bound that they would cross are held there.
             free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
-            curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
-            near_zero = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
-            vanishing = free & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
-            least = np.maximum(low - logs, np.where(vanishing, -2.0, -1.0) * _LONGEST_STEP)
+            second = now.curvature + correction
+            curvature = second + damping * np.diag(np.maximum(np.diag(second), 1.0))
+            near_zero = (now.gradient > 0.0) & (now.gradient < _HARDLY) & (damping < 1.0)
+            vanishing = (
+                free & is_untied & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
+            )
+            moving, least = free & ~vanishing, low - logs
             # A vanishing variance affects the other levels like half a step of its logarithm.
             fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
             newton = _bounded_step(
-                now.gradient + curvature @ fall, curvature, np.where(free & ~vanishing, least, 0.0),
-                np.where(free & ~vanishing, np.minimum(high - logs, _LONGEST_STEP), 0.0),
+                now.gradient + curvature @ fall, curvature,
+                np.where(moving, np.maximum(least, -_LONGEST_STEP), 0.0),
+                np.where(moving, np.minimum(high - logs, _LONGEST_STEP), 0.0),
             )  # fmt: skip
             step = np.where(vanishing, least, newton)
-            candidate, length = logs + step, np.abs(step).max(initial=0.0)
-            predicted = -float(newton @ (now.gradient + now.curvature @ (fall + 0.5 * newton)))
+            predicted = -float(newton @ (now.gradient + second @ (fall + 0.5 * newton)))
             predicted += 0.5 * float(now.gradient[vanishing].sum())
-            if damping < 1.0:
-                if length < settled or predicted < little:
-                    break
-                is_short = np.abs(newton).max(initial=0.0) < _SHORT_STEP
-                if is_short and now.value - _SURELY * predicted > enough:
-                    break
+            is_short = damping < 1.0 and np.abs(newton).max(initial=0.0) < _SHORT_STEP
+            if predicted < little or (is_short and now.value - _SURELY * predicted > enough):
+                break
             trial = None
             # Levels of very different size can make matrices numerically singular.
             with suppress(np.linalg.LinAlgError):
-                trial = self.at(candidate)
+                trial = self.at(logs + step)
             if trial is not None and trial.value <= now.value:
-                logs, now, damping = candidate, trial, max(damping / 10, 1e-6)
+                change = trial.gradient - now.gradient - now.curvature @ fall
+                correction = _corrected(trial.curvature, correction, newton, change)
+                logs, now, damping = logs + step, trial, max(damping / 10, 1e-6)
             else:  # The next step is at most half as long.
                 damping = max(10.0 * damping, 1.0)
-            # If no step lowers the value any more, only rounding is left.
-            if length < settled or damping > _WORST_DAMPING:
-                break
         return now
+
+
+def _corrected(
+    curvature: FloatArray, correction: FloatArray, step: FloatArray, change: FloatArray
+) -> FloatArray:
+    """What to add to the curvature for the gradient's change along a short step; else nothing."""
+    moved = step != 0.0
+    if np.abs(step).max(initial=0.0) > _SHORT_STEP or not moved.any():
+        return np.zeros_like(correction)
+    inner = np.ix_(moved, moved)
+    step, change, second = step[moved], change[moved], (curvature + correction)[inner]
+    along = second @ step
+    corrected = correction.copy()
+    if step @ change > _LEAST_CHANGE * (step @ along):
+        corrected[inner] += np.outer(change, change) / (step @ change)
+        corrected[inner] -= np.outer(along, along) / (step @ along)
+    return corrected
 
 
 def _bounded_step(

@@ -78,6 +78,10 @@ class InlierFit:
         """The problem of the inliers."""
         return self.problem.subset(self.used)
 
+    def with_noise(self, noise: Noise) -> Self:
+        """The same beside a noise from which searches start."""
+        return replace(self, fit=replace(self.fit, noise=noise))
+
     def refitted(self) -> Self:
         """Refits the inliers, starting at the present state and noise."""
         return replace(self, fit=fit_problem(self.part, self.fit.state, self.fit.noise))

@@ -12,8 +12,8 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.estimation.mixed import (
     LEAST_SIGMA,
+    LITTLE,
     MOST_SIGMA,
-    SETTLED,
     CommonRows,
     MixedEstimate,
     MixedModel,
@@ -80,8 +80,8 @@ class RobotLikelihood:
         start: FloatArray,
         free: Mask,
         least: FloatArray | float = LEAST_SIGMA,
-        settled: float = SETTLED,
         enough: float = np.inf,
+        little: float = LITTLE,
     ) -> tuple[FloatArray, float]:
         """Finds the maximum-likelihood levels, and the negative log-likelihood there.
 
@@ -89,12 +89,12 @@ class RobotLikelihood:
             start: (r, 2) initial levels; or (2 r + k,) with k more sizes.
             free: (2 r + k,) mask of the sizes to estimate, robot by robot.
             least: Lower bound of the sizes.
-            settled: See `MixedModel.maximised`.
             enough: See `MixedModel.maximised`.
+            little: See `MixedModel.maximised`.
         """
         logs = np.log(np.maximum(start.ravel(), LEAST_SIGMA))
         low, high = (np.where(free, np.log(bound), logs) for bound in (least, MOST_SIGMA))
-        found = self.model.maximised(logs, low, high, settled, enough)
+        found = self.model.maximised(logs, low, high, enough, little)
         return np.exp(found.logs).reshape(start.shape), found.value
 
     def levels(self, *, from_above: bool) -> FloatArray:

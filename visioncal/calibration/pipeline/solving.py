@@ -42,7 +42,7 @@ from visioncal.estimation.outliers import (
     refine_inliers,
 )
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -54,7 +54,7 @@ from visioncal.estimation.steps import find_steps, joints_of
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
-_ROUNDS, _CONVERGED_RAD = 4, 1e-7
+_ROUNDS, _CONVERGED_RAD = 4, 1e-6
 
 
 def solve(
@@ -118,9 +118,9 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
-    cell_fit = _calibrate_arms(cell_fit, observed, final)
+    cell_fit, noise = _calibrate_arms(cell_fit, observed, final)
     if level != "hand-eye":
-        cell_fit = _with_functions(cell_fit)
+        cell_fit = _with_functions(cell_fit, noise)
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, problem, fit))
@@ -142,17 +142,23 @@ def _without_misreported(
     return replace(inliers, used=used).refitted()
 
 
-def _calibrate_arms(cell_fit: CellFit, observed: Observed, final: InlierFit | None) -> CellFit:
+def _calibrate_arms(
+    cell_fit: CellFit, observed: Observed, final: InlierFit | None
+) -> tuple[CellFit, Noise]:
     """Alternates between calibrating the arms and updating the inliers until neither changes.
 
     Args:
         cell_fit: The fit.
         observed: The observations.
         final: Inliers that need no update, if any.
+
+    Returns:
+        The fit, and its noise without errors that repeated views share.
     """
+    noise = cell_fit.inlier_fit.fit.noise
     for iteration in range(_ROUNDS + 1):
         if cell_fit.level != "hand-eye":
-            arms = _choose_levels(cell_fit)
+            arms = _choose_levels(cell_fit, noise)
             erring = [name for name, arm in arms.items() if arm.has_free_errors()]
             clock_errors = clock_effects(cell_fit.cell, observed.clocks, erring)
             effects = (*clock_errors, *of_random_effects(cell_fit.other_effects))
@@ -161,15 +167,22 @@ def _calibrate_arms(cell_fit: CellFit, observed: Observed, final: InlierFit | No
         # The arms are calibrated with the last inliers.
         if iteration == _ROUNDS or before is final:
             break
+        # Beside errors that repeated views share, the noise is another: each search has its own.
         inliers = _without_misreported(
-            updated_inliers(cell_fit.cell, before), cell_fit.arms, before.used
+            updated_inliers(cell_fit.cell, before.with_noise(noise)), cell_fit.arms, before.used
         )
-        cell_fit = _converge_arms(replace(cell_fit, inlier_fit=inliers))
+        noise = inliers.fit.noise
         # Other inliers, or other moved frames, may allow another calibration level.
-        same_frames = before.problem.unknown.keys() == inliers.problem.unknown.keys()
-        if same_frames and np.array_equal(before.used, inliers.used):
-            break
-    return cell_fit
+        if (
+            before.problem.unknown.keys() == inliers.problem.unknown.keys()
+            and np.array_equal(before.used, inliers.used)
+            and before.problem.priors == inliers.problem.priors
+        ):
+            inliers = replace(inliers, problem=before.problem, fit=before.fit)
+            return replace(cell_fit, inlier_fit=inliers), noise
+        inliers = inliers.with_noise(before.fit.noise)
+        cell_fit = _converge_arms(replace(cell_fit, inlier_fit=inliers))
+    return cell_fit, noise
 
 
 def _by_closed_form(cell_fit: CellFit, solver: str) -> CellFit:
@@ -236,15 +249,15 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     )
 
 
-def _choose_levels(cell_fit: CellFit, *, functions: bool = False) -> dict[str, RobotArm]:
+def _choose_levels(
+    cell_fit: CellFit, noise: Noise, *, functions: bool = False
+) -> dict[str, RobotArm]:
     """Selects the errors of each arm; functions of its joints only where asked for."""
     part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        found = arm.with_level(
-            nominal, start, cell_fit.level, views, fit.noise, functions=functions
-        )
+        found = arm.with_level(nominal, start, cell_fit.level, views, noise, functions=functions)
         if not functions:
             return found
         # They also explain much of a slipped joint: where the slip explains more, they are left
@@ -257,10 +270,10 @@ def _choose_levels(cell_fit: CellFit, *, functions: bool = False) -> dict[str, R
     return change_each(cell_fit.arms, part, fit, with_level)
 
 
-def _with_functions(cell_fit: CellFit) -> CellFit:
+def _with_functions(cell_fit: CellFit, noise: Noise) -> CellFit:
     """Fits error functions of the joints of each arm that supports them."""
     # Their many unknowns would slow each update of the inliers down, so that they come last.
-    arms = _choose_levels(cell_fit, functions=True)
+    arms = _choose_levels(cell_fit, noise, functions=True)
     if all(arms[name] is arm for name, arm in cell_fit.arms.items()):
         return cell_fit
     return _converge_arms(replace(cell_fit, arms=arms))
