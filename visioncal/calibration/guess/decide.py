@@ -1,4 +1,4 @@
-"""Decision which reading is right: by its posterior beside the declared one and none of these.
+"""Decision which reading is right: by its posterior beside the declared one and mixed rows.
 
 Inverting the robot's poses, inverting the camera's, and changing the mount all exchange the unknown
 edges: no residual distinguishes them. The robot's joints do, and plausibility: what is mounted on
@@ -31,6 +31,9 @@ from visioncal.core.types import MOUNTS, FloatArray, Mount
 
 # Log posterior odds from which one reading is preferred to another.
 _CLEAR = 3.0
+# Random orders of the rows, by which a reading closes the chain by chance; a score from which on it
+# explains nothing, as of a board that looks the same after half a turn.
+_SHUFFLES, _MOST_SCORE = 8, 0.3
 # Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
 _BY_LENGTH = 10.0
 # Poses of two readings that differ by less than this share of the residuals are the same.
@@ -104,22 +107,37 @@ def guess_reading(
 
 
 def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
-    """All readings, and the one whose posterior stands out from the others' and none's.
+    """All readings, and the one whose posterior stands out from the others' and chance's.
 
     The declared reading, the first, where none does.
     """
     declared, *others = tried
     best = others[0] if others else declared
-    rivals = [declared.log_posterior, EVIDENCE * best.fit.unexplained]
+    rivals = [declared.log_posterior, EVIDENCE * _by_other_rows(best)]
     rivals += [
         other.log_posterior
         for other in others
         if other.log_posterior > best.log_posterior - _CLEAR and not _are_same(best, other)
     ]
-    if _is_poor(best) or best.log_posterior <= max(rivals) + _CLEAR:
+    is_odd = _is_poor(best) or best.fit.score > _MOST_SCORE
+    if is_odd or best.log_posterior <= max(rivals) + _CLEAR:
         return tried, declared
     chosen = _with_likeliest_label(best)
     return [chosen if item is best else item for item in tried], chosen
+
+
+def _by_other_rows(best: Candidate) -> float:
+    """Log-likelihood of a reading whose positions, or rotations, are those of other rows."""
+    if not best.fit.is_readable:
+        return -np.inf
+    (robot,), (camera,) = chains(best.recording, [best.hypothesis], best.of_rows)
+    rng, mixed = np.random.default_rng(0), np.tile(robot, (2 * _SHUFFLES, 1, 1, 1))
+    for at in range(_SHUFFLES):
+        order = rng.permutation(len(robot))
+        mixed[2 * at, :, :3, 3] = robot[order, :3, 3]
+        mixed[2 * at + 1, :, :3, :3] = robot[order, :3, :3]
+    fits = robust_fits(mixed, np.broadcast_to(camera, mixed.shape), STARTS)
+    return max(replace(fit, lost=best.fit.lost).log_likelihood for fit in fits)
 
 
 def _with_likeliest_label(best: Candidate) -> Candidate:

@@ -33,9 +33,9 @@ _FOLLOWED = 3
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 # The unknowns of both edges, and the equations of a view.
 _UNKNOWNS, _PER_VIEW = 12, 6
-# Standard deviation by axis [rad, or share of the distance]: readings are not distinguished by less
-# than the first, and beyond the second no reading explains the views.
-_LEAST_SIGMA, _UNEXPLAINED_SIGMA = 5e-4, 0.12
+# Standard deviation by axis [rad, or share of the distance], at least and at most: readings are not
+# distinguished by less than the first.
+_LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
 # Prior probability of an outlier view.
 _OUTLIER_PRIOR = 0.05
 
@@ -104,12 +104,6 @@ class Fit:
         return self._log_likelihood(self._estimate[0]) if self.is_readable else -np.inf
 
     @cached_property
-    def unexplained(self) -> float:
-        """Log-likelihood of the residuals if positions, or rotations, remain unexplained."""
-        beyond = np.where(np.eye(2), _UNEXPLAINED_SIGMA, self._estimate[0])
-        return max(map(self._log_likelihood, beyond))
-
-    @cached_property
     def agreeing(self) -> int:
         """Number of views that are no outliers."""
         return int((self._estimate[1] > 0.5).sum())
@@ -117,12 +111,12 @@ class Fit:
     @cached_property
     def _estimate(self) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
-        sigma, squares = np.full(2, _UNEXPLAINED_SIGMA), self._squares
+        sigma, squares = np.full(2, _MOST_SIGMA), self._squares
         weights = np.where(np.isin(np.arange(len(self.angle)), self.kept), 1.0, 0.0)
         for _ in range(5 if self.is_readable else 0):
             # Three equations a view each, less the six unknowns of the edges.
             freedom = max(3.0 * weights.sum() - 0.5 * _UNKNOWNS, 3.0)
-            sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _UNEXPLAINED_SIGMA)
+            sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _MOST_SIGMA)
             inlier, outlier = self._densities(sigma)
             weights = 1.0 / (1.0 + np.exp(np.clip(outlier - inlier, -500.0, 500.0)))
         return sigma, weights
