@@ -40,6 +40,7 @@ from visioncal.estimation.robust import (
 )
 from visioncal.estimation.solve import (
     Solution,
+    estimate_noise,
     fit_problem,
     mahalanobis_sq,
     solve_problem,
@@ -162,9 +163,10 @@ def _without_needless(agreed: InlierFit) -> InlierFit:
 
 
 def all_as_inliers(problem: Problem, state: State) -> InlierFit:
-    """Fits all observations as inliers, for sets known not to agree."""
+    """All observations as inliers at a start, for sets known not to agree."""
     used = np.ones(len(problem), dtype=bool)
-    return _inlier_fit(problem, used, fit_problem(problem, state), ())
+    noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
+    return _inlier_fit(problem, used, Solution(state, noise), ())
 
 
 def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:

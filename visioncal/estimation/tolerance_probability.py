@@ -97,7 +97,9 @@ def _crossings(
     along = np.einsum("ni,ni->n", known, errors) / length
     beside_sq = np.maximum(np.sum(known**2, axis=1) - along**2, 0.0)
     half = np.sqrt(np.maximum(limit**2 - beside_sq, 0.0))
-    low, high = ((root - along) / length for root in (-half, half))
+    # Of an error of next to nothing they are infinite.
+    with np.errstate(over="ignore"):
+        low, high = ((root - along) / length for root in (-half, half))
     return np.clip(low, 0.0, _INFINITE), np.clip(high, 0.0, _INFINITE)
 
 

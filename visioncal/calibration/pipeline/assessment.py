@@ -17,7 +17,6 @@ from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_o
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.fault_messages import (
     PoseFault,
-    Version,
     explained_outliers,
     movements,
     versions,
@@ -89,8 +88,8 @@ class FitAssessment:
         return self.fit.noise
 
     @cached_property
-    def versions(self) -> dict[str, Version]:
-        """All unknown frames over time, by their names in the problem."""
+    def versions(self) -> dict[str, str]:
+        """Names in the result of all unknown frames over time, by their names in the problem."""
         return versions(self.cell_fit)
 
     @cached_property
@@ -99,14 +98,14 @@ class FitAssessment:
         transforms, edges = {}, self.state.edges
         for key, index in self.problem.unknown.items():
             block = self.covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
-            transforms[self.versions[key].name] = Edge(edges[index], block)
+            transforms[self.versions[key]] = Edge(edges[index], block)
         return transforms
 
     @property
     def last_edges(self) -> dict[str, Edge]:
         """The estimated transforms at the end of the session, by frame."""
-        last = (version.frame for version in self.versions.values() if version.is_last)
-        return {frame: self.edges[frame] for frame in last}
+        last = {key.partition("@")[0] for key in self.versions}
+        return {frame: edge for frame, edge in self.edges.items() if frame in last}
 
     def clocks(self, observed: Observed) -> dict[ClockPair, ClockResult]:
         """Clock offsets, from the fit where it estimates them."""
@@ -136,7 +135,7 @@ class FitAssessment:
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Standard deviations of each frame's position in its parent, by source [mm]."""
         budget = budget_mm(self.cell_fit, self.covariance_by_source)
-        return {self.versions[key].name: sigmas for key, sigmas in budget.items()}
+        return {self.versions[key]: sigmas for key, sigmas in budget.items()}
 
     @cached_property
     def intervals(self) -> FloatArray:
@@ -175,14 +174,15 @@ def assess_fit(
     part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     # A closed form is no minimum, which would pass for a misfit.
     is_fit = cell_fit.solver == "joint"
-    converged = fit if is_fit else fit_problem(part, fit.state)
     errors = {
         name: arm.errors
         for name, arm in cell_fit.arms.items()
         if not arm.is_modelled and arm.errors
     }
-    steps = likely_steps(part, converged, errors, joint_offsets(cell_fit.arms))
+    steps: tuple[Step, ...] = ()
     if not observed.is_misread:
+        converged = fit if is_fit else fit_problem(part, fit.state)
+        steps = likely_steps(part, converged, errors, joint_offsets(cell_fit.arms))
         cell_fit = replace(cell_fit, arms=with_errors_beside_step(cell_fit.arms, part, fit, steps))
     beside = covariance_from_other_sources(part, fit, cell_fit.arms, steps, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))

@@ -39,28 +39,17 @@ class PoseFault:
     short: str = ""  # The fault as a clause, for each of these; empty where the finding suffices.
 
 
-@dataclass(frozen=True)
-class Version:
-    """A frame during a part of the session, in which it did not move."""
+def versions(cell_fit: CellFit) -> dict[str, str]:
+    """Names in the result of all unknown frames over time, by their names in the problem.
 
-    frame: str  # The name of the frame.
-    name: str  # Its name in the result: the frame's own for the last.
-
-    @property
-    def is_last(self) -> bool:
-        """Whether the frame was there at the end of the session."""
-        return self.name == self.frame
-
-
-def versions(cell_fit: CellFit) -> dict[str, Version]:
-    """All unknown frames over time, by their names in the problem."""
-    versions_by_key = {}
+    Where a frame was at the end of the session, it has its own name.
+    """
+    names = {}
     for frame, parts in _parts(cell_fit).items():
-        for _, key in parts:
-            is_last = key == parts[-1][1]
-            until = "" if is_last else f"_until_stop_{_stops_of(cell_fit, key)[-1]}"
-            versions_by_key[key] = Version(frame, f"{frame}{until}")
-    return versions_by_key
+        for _, key in parts[:-1]:
+            names[key] = f"{frame}_until_stop_{_stops_of(cell_fit, key)[-1]}"
+        names[parts[-1][1]] = frame
+    return names
 
 
 def _parts(cell_fit: CellFit) -> dict[str, list[tuple[int, str]]]:
@@ -88,7 +77,7 @@ def movements(cell_fit: CellFit) -> tuple[Moved, ...]:
         for (_, before), (start, after) in pairwise(parts):
             last, first = _stops_of(cell_fit, before)[-1], _stops_of(cell_fit, after)[0]
             away = pose_difference(edges[before], edges[after])
-            moved.append((start, Moved(frame, named[before].name, last, first, *away)))
+            moved.append((start, Moved(frame, named[before], last, first, *away)))
     return tuple(move for _, move in sorted(moved, key=lambda item: item[0]))
 
 
@@ -117,10 +106,9 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
         for name, target in cell_fit.cell.session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
-    is_pair, mutual = cell_fit.cell.mount is not None, exchanged(agreed.problem, fitting)
-    faults = [] if is_pair else [*_exchanged_poses(cell_fit, mutual)]
-    faults += _exchanged_views(cell_fit, mutual, {row for fault in faults for row in fault.rows})
-    if not is_pair:
+    mutual = exchanged(agreed.problem, fitting)
+    faults = [*_exchanged(cell_fit, mutual)]
+    if cell_fit.cell.mount is None:
         faults += _wrong_poses(cell_fit, {row for fault in faults for row in fault.rows})
     elif not faults:
         faults += _moved_run(cell_fit)
@@ -206,20 +194,6 @@ def _moved_words(
     return ", or ".join(stood), advice
 
 
-def _exchanged_views(
-    cell_fit: CellFit, mutual: Mapping[int, int], explained: Collection[int]
-) -> Iterator[PoseFault]:
-    """Pairs of views of one camera, each of which fits the other's pose."""
-    for pair in sorted(mutual.items()):
-        if pair[0] < pair[1] and not {*pair} & {*explained}:
-            first, second = (cell_fit.cell.rows[row].view for row in pair)
-            words = (
-                f"Views {first} and {second} are exchanged: the image of each fits the pose in "
-                "the other's row. They were left out."
-            )
-            yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
-
-
 def _base_displacement(
     cell_fit: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
 ) -> str:
@@ -233,25 +207,31 @@ def _base_displacement(
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
-def _exchanged_poses(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
-    """Pairs of poses of one robot that are exchanged."""
+def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+    """Poses of one robot that are exchanged, and pairs of views that fit each other's pose."""
     rows, problem, used = cell_fit.cell.rows, cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    for robot, flange in problem.tree.flanges.items():
+    pairs = [pair for pair in sorted(mutual.items()) if pair[0] < pair[1]]
+    for robot, flange in problem.tree.flanges.items() if cell_fit.cell.mount is None else ():
         by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
-        pairs = Counter(
-            tuple(sorted((rows[at].station, rows[mutual[at]].station)))
-            for at in by_robot
-            if at in mutual
-        )
-        for stations, count in pairs.items():
+        through = [pair for pair in pairs if pair[0] in by_robot]
+        by_stops = Counter(tuple(sorted(rows[at].station for at in pair)) for pair in through)
+        for stations, count in by_stops.items():
             at_both = [at for at in by_robot if rows[at].station in stations]
             # One observation of a stop may itself be wrong.
-            if count < 4 or used[at_both].any():
+            if count < 2 or used[at_both].any():
                 continue
             first, second = (cell_fit.cell.stops[station] for station in stations)
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
             yield _fault(cell_fit, EXCHANGED, at_both, words, _EXCHANGE, short)
+            pairs = [pair for pair in pairs if pair[0] not in at_both]
+    for pair in pairs:
+        first, second = (rows[row].view for row in pair)
+        words = (
+            f"Views {first} and {second} are exchanged: the image of each fits the pose in "
+            "the other's row. They were left out."
+        )
+        yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
 
 
 def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:

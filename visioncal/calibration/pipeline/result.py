@@ -112,10 +112,8 @@ def _edge_names(run: RunState) -> dict[str, str]:
     if run.mount == "instrument":
         # Of the points that an instrument read, the first is the probe.
         return dict(zip(answer.problem.unknown, edge_names(run.mount), strict=False))
-    parents = {
-        version.name: answer.problem.tree.branches[key].parent
-        for key, version in answer.versions.items()
-    }
+    branches = answer.problem.tree.branches
+    parents = {name: branches[key].parent for key, name in answer.versions.items()}
     # The root of a pair's frames is the robot's base.
     root = CELL if run.mount is None else "base"
     return {

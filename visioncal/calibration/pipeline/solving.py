@@ -30,7 +30,7 @@ from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.joint import fit_jointly, target_sizes
+from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
     check_determined,
@@ -100,11 +100,10 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
     initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)
-    cell_fit = _fit_with_inliers(initial, observed)
     if misread:
-        # Misread poses determine neither the arm nor which views are outliers.
-        inliers = with_camera_levels(cell, poses, cell_fit.inlier_fit)
-        return replace(cell_fit, inlier_fit=with_repeats(inliers))
+        # Misread poses determine neither lens, board and arm nor which views are outliers.
+        return _of_misread(initial, observed)
+    cell_fit = _fit_with_inliers(initial, observed)
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
@@ -124,6 +123,20 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, problem, fit))
+
+
+def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
+    """One solve of the frames by all observations, whose lenses and boards stay as they are."""
+    cell_fit = cell_fit.with_arm_poses()
+    if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
+        model, views = cell_fit.frame_model, _views_by_camera(observed, cell_fit.poses)
+        corners = model.camera_parameters(observed.scenes, views).linearised()
+        problem = model.problem(corners)
+        start, noise = problem.start(cell_fit.frames), cell_fit.inlier_fit.fit.noise
+        state = solve_problem(problem, start, noise)[0]
+        fit = Solution(state, estimate_noise(problem, state, noise))
+        return cell_fit.with_joint_fit(model, ConvergedFit(corners, problem, fit))
+    return replace(cell_fit, inlier_fit=cell_fit.inlier_fit.refitted())
 
 
 def _without_misreported(
@@ -205,7 +218,7 @@ def _fit_with_inliers(start: CellFit, observed: Observed) -> CellFit:
         if any(arm.errors and arm.errors.is_significant for arm in cell_fit.arms.values()):
             cell_fit = replace(cell_fit, linearised_corners=None)
         cell_fit = _fit_lenses_and_frames(replace(cell_fit, arms=start.arms), observed)
-        if cell_fit.cell.mount is None or observed.is_misread:
+        if cell_fit.cell.mount is None:
             break
         before = cell_fit.inlier_fit.used
         cell_fit = replace(cell_fit, inlier_fit=refine_inliers(cell_fit.inlier_fit))
@@ -224,8 +237,6 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
         model, frames = cell_fit.frame_model, cell_fit.frames
         views = _views_by_camera(observed, cell_fit.poses)
         optics = model.camera_parameters(observed.scenes, views)
-        if observed.is_misread:
-            return cell_fit.with_joint_fit(model, fit_jointly(optics, model, frames))
         if (corners := cell_fit.linearised_corners) is not None:
             # Where other inliers are too far from the last fit, it starts anew.
             with suppress(ConvergenceError):

@@ -277,16 +277,19 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
         if size**2 < _LEAST_SHARE * total**2:
             continue
         kind, words, do = _SOURCES[name]
-        rest = worst.without(name)
-        without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
-        if need is not None:
-            without += f", and {percent(rest.probability(need))} within what is needed"
+        without = ""
+        if len(budget) > 1:
+            rest = worst.without(name)
+            without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
+            if need is not None:
+                without += f", and {percent(rest.probability(need))} within what is needed"
+            without += "."
         yield Finding(
             kind,
             f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come from "
             f"{words}.",
             correcting(need) if name == CONTROLLER else do or more,
             probability=size**2 / total**2,
-            without_it=f"{without}.",
+            without_it=without,
             until_mm=0.0,
         )
