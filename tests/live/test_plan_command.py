@@ -186,7 +186,7 @@ def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
     refused = visioncal("calibrate", one_axis, "-o", tmp_path / "out")
     assert refused.status == 2
-    assert f"Let visioncal plan '{one_axis}' --add 5 propose them." in refused.err
+    assert f"Run: visioncal plan '{one_axis}' --add 5" in refused.err
     out = tmp_path / "plan"
     done = visioncal("plan", one_axis, "--add", 2, "-o", out, "--candidates", 60)
     assert done.status == 0, done.err
@@ -347,7 +347,7 @@ def test_advice_names_no_command_that_refuses_for_want_of_a_robot(one_axis, tmp_
     refused = visioncal("calibrate", bare, "-o", tmp_path / "out")
     assert refused.status == 2
     assert "Let visioncal plan" not in refused.err
-    assert "Once [robot] model in session.toml names the arm" in refused.err
+    assert "With [robot] model in session.toml, visioncal plan proposes them" in refused.err
     planned = visioncal("plan", bare, "--add", 5, "-o", tmp_path / "plan")
     assert planned.status == 2
     assert "([robot] model), or by --robot" in planned.err

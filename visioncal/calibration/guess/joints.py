@@ -30,8 +30,8 @@ _FITS, _FLOOR = 2e-3, 1e-4
 # Ratio to the best score within which readings are equivalent: those with the fewest mistakes are
 # chosen.
 _EQUIVALENT = 2.0
-# Rows of the first screening, readings refined, and the share of the declared score below which.
-_SCREENED, _REFINED, _REFINED_SHARE = 10, 6, 0.6
+# Rows by which zeros are sought.
+_FEW = 10
 # Steps of a joint's zero from afar to the finest. A shift of 180 degrees is left out: it looks like
 # an opposite sign of the joint before or behind it.
 _STEP_RAD, _FARTHEST_RAD, _FINEST_RAD = 0.25, 2.75, 1e-6
@@ -191,14 +191,9 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         (declared,) = _fitted([recorded], q, poses, rows, STARTS)
         if declared.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
             return JointGuess(declared, declared)
-        few = thinned(rows, _SCREENED)
-        start, *tried = _fitted([recorded, *joint_readings(robot)], q, poses, few)
-        tried.sort(key=lambda item: item.score * (1.0 + item.reading.cost))
-        tried = [*tried[:_REFINED], *_with_zeros(robot, q, poses, few)]
-        limit = min(_REFINED_SHARE * start.score, CLEAR_RATIO * _MODEL_DEVIATION)
-        near = [item.reading for item in tried if item.score < limit]
-        tried = _fitted(near, q, poses, rows, STARTS)
-    least = min((item.score for item in tried), default=np.inf)
+        readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, thinned(rows, _FEW))]
+        tried = _fitted(readings, q, poses, rows, STARTS)
+    least = min(item.score for item in tried)
     equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
     equivalent.sort(key=lambda item: (item.reading.cost, item.score))
     if least > _MODEL_DEVIATION or declared.score <= CLEAR_RATIO * equivalent[0].score:
@@ -210,7 +205,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
 
 def _with_zeros(
     robot: Robot, q: FloatArray, poses: FloatArray, rows: IntArray
-) -> list[FittedJoints]:
+) -> list[JointReading]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
     step = _STEP_RAD
     grid = np.arange(-_FARTHEST_RAD, _FARTHEST_RAD + step, step)
@@ -225,15 +220,13 @@ def _with_zeros(
         best = [item for item in best if item.score < _MODEL_DEVIATION + step]
         zeros = {item.reading.columns[0]: float(item.reading.zeros.sum()) for item in best}
         step, grid = step / 4.0, np.arange(-4.0, 5.0) * step / 4.0
-    return best
+    return [item.reading for item in best]
 
 
 def _fitted(
     tried: Sequence[JointReading], q: FloatArray, poses: FloatArray, rows: IntArray, starts: int = 0
 ) -> list[FittedJoints]:
     """Fits both constant transforms by some rows; residuals are of all rows where these are few."""
-    if not tried:
-        return []
     flange_from_base = invert(poses)
     by_joints = np.array([reading.poses(q[rows]) for reading in tried])
     fits = robust_fits(np.broadcast_to(flange_from_base[rows], by_joints.shape), by_joints, starts)

@@ -6,11 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.pipeline.misread_poses import (
-    misread_pose_finding,
-    misreadings,
-    turned_boards,
-)
+from visioncal.calibration.pipeline.misread_poses import misreadings, turned_boards
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
@@ -109,12 +105,8 @@ def _run_stages(run: RunState) -> tuple[RunState, VisioncalError | None]:
 
 def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     cause = unseen_cause(run) if error is not None or run.reasons else None
-    hint, read = None, list[Finding]()
-    if error is None and run.mount is not None:
-        hint = misread_pose_finding(run)
-        read += [] if hint is None else [hint]
-    elif error is None:
-        read += misreadings(run)
+    read = [] if error is not None else [*misreadings(run)]
+    hint = " ".join(finding.words for finding in read)
     if error is None and not read:
         read += turned_boards(run)
     if cause is not None:
@@ -127,11 +119,11 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
         for warning in run.warnings
         if warning.kind != "unused"
         and (cause is None or warning.kind != cause.kind)
-        and (hint is None or warning.words not in hint.words)
+        and warning.words not in hint
     ]
     yield from sorted(warnings, key=lambda value: value.do is None)
     if error is None:
-        if hint is None and run.mount is not None:
+        if not hint and run.mount is not None:
             yield from _motion(run, run.mount)
         yield from _lost(run)
 

@@ -1,7 +1,6 @@
 """Input of the search for misread poses: the camera's poses by images, the robot's numbers."""
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
@@ -39,9 +38,9 @@ def guess_from_camera_poses(
     # Misread joints say nothing about the poses.
     joint_poses = None
     if matched is None or not matched.misread:
-        joint_poses = chain_poses(run.session, None if matched is None else matched.robot)
+        joint_poses = chain_poses(run.timed, None if matched is None else matched.robot)
     if robot is None:
-        robot = _from_stream(run) if run.clocks else numbers_in(run.session, POSE)
+        robot = numbers_in(run.timed, POSE)
         if joint_poses is not None and not robot.present.any():
             robot = PoseNumbers.of_poses(joint_poses, robot.places)
     return guess_reading(
@@ -76,16 +75,6 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     cells = [[view.numbers.get(name, np.nan) for name in columns] for view in session.views]
     numbers = np.array(cells, dtype=float)
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places_of(session))
-
-
-def _from_stream(run: RunState) -> PoseNumbers:
-    """The robot's poses at the views as quaternions; NaN where it has none."""
-    numbers = PoseNumbers.empty(_places_of(run.session))
-    for at, view in enumerate(run.session.views):
-        if view.number in run.base_from_flange:
-            pose = RigidTransform.from_matrix(run.base_from_flange[view.number])
-            numbers.positions[at], numbers.rotations[at] = pose.translation, pose.rotation.as_quat()
-    return numbers
 
 
 def with_camera_poses(run: RunState) -> RunState:

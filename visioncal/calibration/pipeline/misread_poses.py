@@ -9,13 +9,12 @@ from visioncal.calibration.guess.fit import robust_fits
 from visioncal.calibration.guess.search import FEWEST_ROWS, relative_angles, thinned
 from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
-from visioncal.core.types import FloatArray, Mount
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 
@@ -44,25 +43,53 @@ _UNRECORDED = Remedy(
 )
 
 
-def misread_pose_finding(run: RunState) -> Finding | None:
-    """Finding on the reading of the poses that closes the chain, if any; after the stage `pnp`."""
+def misreadings(run: RunState) -> Iterator[Finding]:
+    """Findings on misread poses; after the stage `pnp`.
+
+    Of a whole cell, each robot is tested with one camera and one target alone, those of most views
+    first, where their chain does not close.
+    """
+    if run.mount is not None:
+        yield from _misread_poses(run)
+        return
+    for robot in run.session.robots:
+        for pair in pairs_of(run, robot):
+            part = _of_pair(run, robot, pair)
+            hint = None if closes(part) else next(_misread_poses(part), None)
+            if hint is None:
+                continue
+            if hint.do is not None and hint.do.command:
+                # The command that writes a copy takes one camera and one robot only.
+                step = (
+                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
+                    "quaternion x, y, z, w), and calibrate again."
+                )
+                hint = replace(hint, do=Remedy(step))
+            yield replace(hint, words=f"Robot {robot}: {hint.words}")
+            # All cameras would show the same.
+            break
+
+
+def _misread_poses(run: RunState) -> Iterator[Finding]:
+    """The finding on the reading of one robot's poses that closes the chain, if any."""
     try:
         guess = guess_from_camera_poses(run)
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
-        return None
-    if not guess.stands_out:
-        return None if guess.declared.fit.closes else _unrecorded(run)
-    step = _MIRRORED if guess.best.hypothesis.robot.mirrored else READ_AGAIN
-    return Finding(_MISREAD, guess.sentence, step)
+        return
+    if guess.stands_out:
+        step = _MIRRORED if guess.best.hypothesis.robot.mirrored else READ_AGAIN
+        yield Finding(_MISREAD, guess.sentence, step)
+    elif not guess.declared.fit.closes:
+        yield from _unrecorded(run)
 
 
-def _unrecorded(run: RunState) -> Finding | None:
-    """Finding that the robot's poses are not those of the images: shuffled rows fit as well."""
+def _unrecorded(run: RunState) -> Iterator[Finding]:
+    """The finding that the robot's poses are not those of the images: shuffled rows fit as well."""
     both = _both_sides(run.base_from_flange, run.poses_of_one_board)
     both = both[thinned(np.arange(len(both)))]
     if len(both) < FEWEST_ROWS:
-        return None
+        return
     # Both turn by the same angle between two views, whatever the unknown frames.
     by_robot, by_camera = (relative_angles(both[:, side, :3, :3]) for side in (0, 1))
     share = float(np.mean(np.abs(by_robot - by_camera) < _ALIKE_RAD))
@@ -76,18 +103,8 @@ def _unrecorded(run: RunState) -> Finding | None:
             f"{percent(by_chance)} if rows are shuffled."
         )
     else:
-        return None
-    return Finding(_MISREAD, words, _UNRECORDED)
-
-
-def misreadings(run: RunState) -> Iterator[Finding]:
-    """Findings on misread poses, where chains do not close as declared; after the stage `pnp`."""
-    if run.mount is None:
-        yield from _misreadings_in_cell(run)
         return
-    closes = _is_closed(run.base_from_flange, run.poses_of_one_board, run.session.mount)
-    if not closes and (hint := misread_pose_finding(run)) is not None:
-        yield hint
+    yield Finding(_MISREAD, words, _UNRECORDED)
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:
@@ -118,49 +135,25 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
             )
 
 
-def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:
-    """Findings on the robots and cameras of a whole cell whose rows are misread.
-
-    Each camera is tested with one target and one robot alone, those of most views first.
-    """
-    for robot in run.session.robots:
-        for pair in pairs_of(run, robot):
-            if _is_closed(run.robots[robot].base_from_flange, pair.poses, pair.mount):
-                continue
-            hint = _misread_in_pair(run, robot, pair)
-            if hint is None:
-                continue
-            if hint.do is not None and hint.do.command:
-                # The command that writes a copy takes one camera and one robot only.
-                step = (
-                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
-                    "quaternion x, y, z, w), and calibrate again."
-                )
-                hint = replace(hint, do=Remedy(step))
-            yield replace(hint, words=f"Robot {robot}: {hint.words}")
-            # All cameras would show the same.
-            break
+def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
+    """A cell's run as that of one robot, camera and target alone."""
+    cameras = {name: look for name, look in run.cameras.items() if name == pair.camera}
+    return replace(
+        run,
+        session=run.session.of(pair.camera, robot, pair.target),
+        robots={robot: run.robots[robot]},
+        cameras=cameras,
+        poses=pair.poses,
+    )
 
 
-def _misread_in_pair(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
-    try:
-        part = RunState(run.session.of(pair.camera, robot, pair.target), None, run.threads)
-        for stage in stages_before("solve"):
-            part = stage.run(part)
-    except VisioncalError:
-        # Too few views of this pair.
-        return None
-    return next(misreadings(part), None)
-
-
-def _is_closed(
-    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
-) -> bool:
-    """Whether a chain closes as declared; true with too few views to show it."""
-    robot, camera = np.moveaxis(_both_sides(base_from_flange, seen), 1, 0)
+def closes(run: RunState) -> bool:
+    """Whether the chain of one robot closes as declared; true with too few views to show it."""
+    both = _both_sides(run.base_from_flange, run.poses_of_one_board)
+    robot, camera = np.moveaxis(both, 1, 0)
     return (
         len(robot) < FEWEST_ROWS
-        or robust_fits(robot_part(robot, mount)[None], camera[None])[0].closes
+        or robust_fits(robot_part(robot, run.session.mount)[None], camera[None])[0].closes
     )
 
 

@@ -3,7 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,13 +26,6 @@ from visioncal.session.kinds import (
 _FARTHEST_M = 160.0
 
 
-class Reading(NamedTuple):
-    """One reading of an instrument."""
-
-    pose: FloatArray  # (4, 4) `instrument_from_probe`; with the identity for a position alone.
-    point: int  # Index of the point.
-
-
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Readings of an instrument."""
@@ -41,14 +33,14 @@ class Readings:
     instrument: Instrument  # Its noise.
     # The points in the order in which they first appear; a single one may have no name.
     names: tuple[str, ...]
-    views: Mapping[int, Reading]  # The readings, by view.
+    views: Mapping[int, View]  # The rows that are of use, by view.
     are_poses: bool  # Whether the probe's rotation was read, too.
     rejections: tuple[Rejection, ...]  # Rows that are of no use.
 
     @property
     def sigma_m(self) -> float:
         """Median noise of a coordinate [m]."""
-        places = np.array([reading.pose[:3, 3] for reading in self.views.values()])
+        places = np.array([view.reading_m for view in self.views.values()])
         return float(np.median(self.instrument.sigmas_m(places)))
 
 
@@ -90,8 +82,8 @@ def read_instrument(session: Session) -> Readings:
             used.append(view)
             continue
         rejections.append(Rejection(view.number, reason.strip()))
-    readings = {view.number: Reading(_probe(view), names.index(view.point)) for view in used}
-    return Readings(instrument, names, readings, are_poses, tuple(rejections))
+    views = {view.number: view for view in used}
+    return Readings(instrument, names, views, are_poses, tuple(rejections))
 
 
 def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
@@ -101,16 +93,17 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     empty with fewer than three points.
     """
     if readings.are_poses:
-        return {view: reading.pose for view, reading in readings.views.items()}
-    stop_of, count = _stops(session), len(readings.names)
-    stops: dict[Hashable, dict[int, int]] = defaultdict(dict)
-    for view, reading in readings.views.items():
-        stops[stop_of[view]][reading.point] = view
-    views = [[stop[at] for at in range(count)] for stop in stops.values() if len(stop) == count]
-    if count < 3 or not views:
+        return {number: _probe(view) for number, view in readings.views.items()}
+    stop_of, names = _stops(session), readings.names
+    stops: dict[Hashable, dict[str, View]] = defaultdict(dict)
+    for number, view in readings.views.items():
+        stops[stop_of[number]][view.point] = view
+    stopped = [[stop[name] for name in names] for stop in stops.values() if len(stop) == len(names)]
+    if len(names) < 3 or not stopped:
         return {}
-    positions = np.array([[readings.views[view].pose[:3, 3] for view in group] for group in views])
-    return {view[0]: align(at, positions[0]) for view, at in zip(views, positions, strict=True)}
+    positions = np.array([[view.reading_m for view in group] for group in stopped])
+    pairs = zip(stopped, positions, strict=True)
+    return {group[0].number: align(at, positions[0]) for group, at in pairs}
 
 
 def _stops(session: Session) -> dict[int, Hashable]:
