@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.pages import Page
+from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
@@ -71,8 +72,7 @@ def test_the_tip_comes_as_near_as_predicted(proved, located):
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
     assert evaluate_gaps(points, away_mm).passed
     assert not evaluate_gaps(points, [5.0] * 5).passed
-    with pytest.raises(DataError, match="5 of 0 mm and more"):
-        evaluate_gaps(points, [0.1])
+    raised(DataError, "5 of 0 mm and more", evaluate_gaps, points, [0.1])
 
 
 def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):
@@ -81,8 +81,7 @@ def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):
     lens_m = known.transforms["flange_from_cam"].translation[2]
     # The lens, and what is before its centre: the box of a camera is 0.1 m long, 0.03 behind it.
     assert lens_m < extent_m < lens_m + 0.1
-    with pytest.raises(DataError, match="which tool touches is not known"):
-        touch_targets(look, known)
+    raised(DataError, "which tool touches is not known", touch_targets, look, known)
     for clearance_m in (0.0, extent_m - 1e-3):
         with pytest.raises(DataError, match="would be in the board"):
             touch_targets(look, known, clearance_m=clearance_m)
@@ -111,14 +110,12 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
 def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     folder, look, _ = proved
     out = folder / "out"
-    done = visioncal("touch-test", look, "-c", out, *GAUGE)
-    assert done.status == 0
+    done = visioncal("touch-test", look, "-c", out, *GAUGE).good()
     assert done.out.count("hover:") == done.out.count("touch:") == 5
     targets = json.loads(visioncal("touch-test", look, "-c", out, *GAUGE, "--json").out)["points"]
     lifted = np.array(targets[0]["hover"][:3]) - targets[0]["touch"][:3]
     assert np.linalg.norm(lifted) == pytest.approx(0.05)
-    done = visioncal("touch-test", look, "-c", out, *GAUGE, "--gaps-mm", "0.1,0,0.1,0.1,0.05")
-    assert done.status == 0
+    visioncal("touch-test", look, "-c", out, *GAUGE, "--gaps-mm", "0.1,0,0.1,0.1,0.05").good()
     known = Calibration.load(out)
     assert known.touch_test.passed
     assert [point.gap_mm for point in known.touch_test.points] == [0.1, 0.0, 0.1, 0.1, 0.05]
@@ -133,18 +130,13 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     typed = io.StringIO("0.1\nnothing\n0,2\n-1\n0.1\n0.1\n0.1\n")
     typed.isatty = lambda: True
     monkeypatch.setattr("sys.stdin", typed)
-    done = visioncal("touch-test", look, "-c", out, *GAUGE)
-    assert done.status == 0
-    assert done.err.count("gap [mm]:") == 7
+    assert visioncal("touch-test", look, "-c", out, *GAUGE).good().err.count("gap [mm]:") == 7
     gaps_mm = [point.gap_mm for point in Calibration.load(out).touch_test.points]
     assert gaps_mm == [0.1, 0.2, 0.1, 0.1, 0.1]
-    ended = visioncal("touch-test", look, "-c", out, *GAUGE)
-    assert ended.status == 2
-    assert "nothing was kept" in ended.err
-    done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
-    assert done.status == 2
-    assert "the calibration has no tool" in done.err
-    assert f"visioncal tcp TOUCHES -c {out} --name gripper" in done.err
+    visioncal("touch-test", look, "-c", out, *GAUGE).refused("nothing was kept")
+    visioncal("touch-test", look, "-c", out, "--tool", "gripper").refused(
+        "the calibration has no tool", f"visioncal tcp TOUCHES -c {out} --name gripper"
+    )
 
 
 def test_what_touches_is_the_only_tool_or_the_flange(proved):

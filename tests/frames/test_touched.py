@@ -1,0 +1,827 @@
+"""Tools and fixtures from touches: the answer and its sigma, what is refused, and the commands."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from support import placed as made
+from support.commands import turned_poses, visioncal, write_poses, write_table
+from support.marks import slow
+from support.parts import away, placed, some_frame
+from support.refusals import raised
+from support.samples import made_up
+from support.touched import TIP, Job, error_of, slipped, touched
+
+from visioncal.calibration.run import run
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.estimation.problem_parts import Noise
+from visioncal.frames.fixture import FitSettings, drawn_fixture, touched_fixture
+from visioncal.frames.touches import NominalPoints, Tool, TouchRows, touched_points
+from visioncal.interchange.outputs import write_outputs
+from visioncal.present.recording import read_calibration
+from visioncal.results import Calibration, Edge, FrameFile, Verdict
+from visioncal.robot import load_robot
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate, write_session
+
+TOOL_TIP = made.FLANGE_FROM_TOOL[:3, 3]
+GOOD = Verdict("good")
+# A tip that is known worst along the tool's z [m].
+TIP_SIGMA = np.diag([5e-5, 5e-5, 4e-4])
+FRAME = some_frame(np.random.default_rng(5))
+NAMES = ("P1", "P2", "P3", "P4", "P5", "P6", "P7", "P8")
+CAD_MM = np.array(
+    [
+        [0, 0, 0],
+        [300, 0, 0],
+        [300, 200, 0],
+        [0, 200, 0],
+        [150, 60, 40],
+        [80, 20, 25],
+        [250, 180, 25],
+        [20, 150, 10],
+    ]
+)
+FLAT_MM = np.array([[0, 0, 0], [300, 0, 0], [260, 200, 0], [0, 150, 0], [120, 40, 0]])
+KINDS = ("origin", "x", "x", "xy", "xy", "origin", "xy")
+ON_FEATURES = 1e-3 * np.array(
+    [[0, 0, 0], [250, 0, 0], [300, 0, 0], [100, 200, 0], [200, 150, 0], [0, 0, 0], [-50, 180, 0]]
+)
+NOISE_M = 1e-4
+
+
+def tool(sigma=None, verdict=GOOD):
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = np.zeros((3, 3)) if sigma is None else sigma @ sigma
+    return Tool("flange_from_tool", Edge(made.FLANGE_FROM_TOOL, covariance), True, verdict)
+
+
+def touch_rows(poses, kinds=None, points=None):
+    blank = ("",) * len(poses)
+    labels = tuple(str(index) for index in range(1, len(poses) + 1))
+    places = tuple(f"touches.csv, line {index + 1}" for index in range(1, len(poses) + 1))
+    return TouchRows("touches.csv", labels, places, poses, None, kinds or blank, points or blank)
+
+
+def drawing(points_m, names=NAMES):
+    return NominalPoints("cad.csv", names[: len(points_m)], points_m, np.zeros(len(points_m)))
+
+
+def touching(points_m, rng, noise_m=0.0, tip=TOOL_TIP):
+    """Poses that touch points (n, 3) of the fixture, each tilted its way."""
+    met = placed(FRAME, points_m) + noise_m * rng.normal(size=points_m.shape)
+    return turned_poses(rng, met, tip, FRAME[:3, :3])
+
+
+def drawn(points_mm, names, *, seed=1, noise_m=NOISE_M, cad_mm=CAD_MM, cad_names=NAMES, **options):
+    rng = np.random.default_rng(seed)
+    poses = touching(1e-3 * np.asarray(points_mm, dtype=float), rng, noise_m)
+    cad = drawing(1e-3 * np.asarray(cad_mm, dtype=float), cad_names)
+    return touched_fixture(touch_rows(poses, points=tuple(names)), tool(), cad, **options)
+
+
+# --- The answer.
+
+
+def test_exact_touches_give_the_exact_fixture():
+    rng = np.random.default_rng(0)
+    by_features = touched_fixture(touch_rows(touching(ON_FEATURES, rng), kinds=KINDS), tool())
+    by_points = drawn(CAD_MM, NAMES, noise_m=0.0)
+    for frame in (by_features, by_points):
+        # Rounding of lengths near a metre, over levers of 0.1 m.
+        assert np.abs(frame.edge.matrix - FRAME).max() < 1e-13
+        assert frame.oriented
+        assert frame.rms_mm < 1e-10
+        assert frame.verdict.status == "good"
+    assert by_points.details["scale"]["value"] == pytest.approx(1.0, abs=1e-12)
+    assert by_features.method == "2 origin, 2 x, 3 xy touches"
+    assert by_points.method == "best fit of 8 points to cad.csv"
+
+
+@pytest.mark.parametrize("features", [False, True])
+def test_the_tips_error_is_a_pure_offset_where_all_touches_stand_alike(features):
+    rng = np.random.default_rng(2)
+    local = ON_FEATURES if features else 1e-3 * CAD_MM
+    met = placed(FRAME, local) + NOISE_M * rng.normal(size=local.shape)
+    turn = Rotation.from_rotvec([3.0, 0.3, -0.2]).as_matrix()
+    poses = compose(np.tile(turn, (len(met), 1, 1)), met - turn @ TOOL_TIP)
+    rows = touch_rows(poses, KINDS) if features else touch_rows(poses, points=NAMES)
+    cad = None if features else drawing(local)
+    exact, unsure = (touched_fixture(rows, tool(item), cad) for item in (None, TIP_SIGMA))
+    assert np.array_equal(exact.edge.matrix, unsure.edge.matrix)
+    more = unsure.edge.covariance - exact.edge.covariance
+    turned = unsure.edge.matrix[:3, :3].T @ turn @ made.FLANGE_FROM_TOOL[:3, :3] @ TIP_SIGMA
+    # Of variances of 1e-7, through inverses of 1e8.
+    assert np.abs(more[3:, 3:] - turned @ turned.T).max() < 1e-12
+    assert np.abs(more[:3]).max() < 1e-12
+
+
+@pytest.mark.parametrize("features", [slow(False), slow(True)])
+def test_the_error_over_its_sigma_is_as_it_should_be(features):
+    squares = []
+    noise = Noise.of_robot(1e-4, 3e-5)
+    local = np.tile(ON_FEATURES, (2, 1)) if features else 1e-3 * CAD_MM
+    kinds = KINDS * 2 if features else ("",) * len(local)
+    known = {"robot_rotation_deg": np.rad2deg(noise.robots[0, 0]), "robot_translation_mm": 0.03}
+    calibration = replace(made_up(5).calibration, noise=known)
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        off = made.FLANGE_FROM_TOOL[:3, :3] @ TIP_SIGMA @ rng.normal(size=3)
+        poses = touching(local, rng, NOISE_M, TOOL_TIP + off)
+        sigmas = np.repeat(noise.robots[0], 3)
+        poses = poses @ exp(sigmas * rng.normal(size=(len(poses), 6)))
+        frame = touched_fixture(
+            touch_rows(poses, kinds, () if features else NAMES),
+            tool(TIP_SIGMA),
+            None if features else drawing(local),
+            calibration,
+        )
+        error = away(frame.edge.matrix, FRAME)
+        squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
+    # Six, a little more since the noise's level is estimated from some 20 residuals; the mean of
+    # 50 has a standard deviation of 0.5.
+    assert 4.6 < np.mean(squares) < 8.2
+
+
+def test_three_touches_say_what_their_sigma_rests_on():
+    poses = touching(ON_FEATURES[[0, 1, 3]], np.random.default_rng(3))
+    rows = touch_rows(poses, ("origin", "x", "xy"))
+    assumed, stated = (touched_fixture(rows, tool(), touch_noise_m=item) for item in (None, 3e-4))
+    assert assumed.verdict.status == "check"
+    assert "0.1 mm, which is assumed" in assumed.verdict.reasons[0]
+    assert "assumed" not in stated.verdict.reasons[0]
+    assert assumed.noise_mm == pytest.approx(0.1)
+    assert np.allclose(stated.edge.covariance, 9 * assumed.edge.covariance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("chosen", [[0, 1, 3, 4], slow([0, 1, 3, 4, 6, 6])], ids=["four", "six"])
+def test_few_touches_that_agree_by_chance_are_not_believed(chosen):
+    kinds = tuple(KINDS[index] for index in chosen)
+    squares = []
+    for seed in range(100):
+        poses = touching(ON_FEATURES[chosen], np.random.default_rng(seed), NOISE_M)
+        frame = touched_fixture(touch_rows(poses, kinds), tool())
+        error = away(frame.edge.matrix, FRAME)
+        squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
+    # Chi-square of six stays under 41, five sigmas, in all but one case of a million.
+    assert max(squares) < 41.0
+    exact = touching(ON_FEATURES[chosen], np.random.default_rng(0))
+    (reason,) = touched_fixture(touch_rows(exact, kinds), tool()).verdict.reasons
+    assert "0.1 mm, which is assumed" in reason
+
+
+# --- What is wrong is named.
+
+
+def test_a_wrong_point_is_left_out_and_named():
+    points = CAD_MM.astype(float)
+    points[4] += [2.0, 0.0, 1.0]
+    frame = drawn(points, NAMES)
+    (reason,) = frame.verdict.reasons
+    assert reason.startswith("Point P5 (touches.csv, line 6) was left out: 2.")
+    assert frame.verdict.status == "check"
+    assert [observation.name for observation in frame.observations if not observation.used] == [
+        "P5"
+    ]
+    # Of eight points with a noise of 0.1 mm, the others place it to 0.05 mm.
+    assert np.abs(frame.edge.matrix - FRAME).max() < 5e-4
+
+
+def test_two_exchanged_names_are_named():
+    names = ("P1", "P2", "P7", *NAMES[3:6], "P3", "P8")
+    frame = drawn(CAD_MM, names)
+    words = " ".join(frame.verdict.reasons)
+    assert "it is where P3 is drawn: is its name exchanged?" in words
+    assert "it is where P7 is drawn: is its name exchanged?" in words
+    (step,) = {finding.do.words for finding in frame.verdict.findings if finding.kind == "left_out"}
+    assert step.startswith("Correct the names of what is named")
+    assert {observation.name for observation in frame.observations if not observation.used} == {
+        "P3",
+        "P7",
+    }
+    few = (0, 1, 4, 5)
+    with pytest.raises(DataError, match="P5 and P6 are exchanged"):
+        drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[index] for index in few])
+
+
+def test_a_point_that_was_touched_several_times_counts_as_one():
+    frame = drawn(np.vstack([CAD_MM, CAD_MM[:4]]), NAMES + NAMES[:4])
+    assert frame.method == "best fit of 12 touches of 8 points to cad.csv"
+    assert [observation.name for observation in frame.observations[-2:]] == ["P3, 11", "P4, 12"]
+    assert frame.observations[4].name == "P5"
+    assert frame.verdict.status == "good"
+    twice = ("P1", "P2", "P6", "P5") * 3
+    with pytest.raises(DataError, match=r"P6 and P5 are exchanged|P5 and P6 are exchanged"):
+        drawn(np.tile(CAD_MM[[0, 1, 4, 5]], (3, 1)), twice)
+    raised(DataError, "2 measured points", drawn, np.tile(CAD_MM[:2], (3, 1)), NAMES[:2] * 3)
+
+
+def test_a_part_of_another_size_is_told_and_not_absorbed():
+    frame = drawn(1.002 * CAD_MM, NAMES)
+    (reason,) = frame.verdict.reasons
+    assert reason.startswith("The part is 1.00")
+    assert "full scale" in reason
+    scale = frame.details["scale"]
+    assert abs(scale["value"] - 1.002) < 4 * scale["sigma"]
+    warm = drawn(1.0005 * CAD_MM, NAMES, noise_m=1e-5)
+    assert "warm" in warm.verdict.reasons[0]
+    # Without the scale the middle is where it was: 0.2 % over 200 mm are 0.4 mm at the origin.
+    centre = placed(frame.edge.matrix, np.mean(1e-3 * CAD_MM, axis=0)[None])
+    meant = placed(FRAME, np.mean(1.002e-3 * CAD_MM, axis=0)[None])
+    assert np.linalg.norm(centre - meant) < 2e-4
+
+
+def test_a_plane_has_a_hand_by_the_side_that_it_was_touched_from():
+    flat = {"cad_mm": FLAT_MM, "cad_names": NAMES[:5]}
+    right = drawn(FLAT_MM, NAMES[:5], **flat)
+    assert right.verdict.status == "good"
+    assert right.details["coplanar"]
+    (wrong,) = drawn(FLAT_MM * [1, -1, 1], NAMES[:5], **flat).verdict.reasons
+    assert "a mirrored drawing looks like this" in wrong
+    # The poses of the tip itself are known by their positions alone.
+    poses = np.full((5, 4, 4), np.nan)
+    poses[:, :3, 3] = placed(FRAME, 1e-3 * FLAT_MM) + NOISE_M * np.random.default_rng(1).normal(
+        size=FLAT_MM.shape
+    )
+    cad = drawing(1e-3 * FLAT_MM)
+    alone = touched_fixture(touch_rows(poses, points=NAMES[:5]), None, cad)
+    assert "a mirrored drawing would fit them as well" in alone.verdict.reasons[0]
+
+
+def test_a_symmetric_pattern_is_told():
+    frame = drawn(CAD_MM[:4], NAMES[:4], cad_mm=CAD_MM[:4], cad_names=NAMES[:4])
+    assert "in 4 orders alike" in " ".join(frame.verdict.reasons)
+    assert frame.verdict.status == "check"
+
+
+def test_few_noisy_or_uncertain_points_are_doubted():
+    words = " ".join(drawn(CAD_MM[:3], NAMES[:3]).verdict.reasons)
+    assert "Only 3 points are used" in words
+    noisy = drawn(CAD_MM, NAMES, noise_m=1e-3)
+    assert "mm only (per axis; doubt begins at 0.5)" in " ".join(noisy.verdict.reasons)
+    stated = drawn(CAD_MM, NAMES, noise_m=3e-4, touch_noise_m=5e-5)
+    assert "scatter by more than they are stated to" in " ".join(stated.verdict.reasons)
+    rng = np.random.default_rng(1)
+    rows = touch_rows(touching(1e-3 * CAD_MM, rng, NOISE_M), points=NAMES)
+    unsure = touched_fixture(rows, tool(1e-3 * np.eye(3)), drawing(1e-3 * CAD_MM))
+    assert "is known to 1 mm only" in unsure.verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("tools", "fixtures"), [("check", "check"), ("bad", "bad")])
+def test_a_tool_in_doubt_makes_its_fixture_doubtful(tools, fixtures):
+    rows = touch_rows(touching(1e-3 * CAD_MM, np.random.default_rng(1), NOISE_M), points=NAMES)
+    doubtful = tool(verdict=Verdict.of(tools, "The tip wobbles."))
+    frame = touched_fixture(rows, doubtful, drawing(1e-3 * CAD_MM))
+    assert frame.verdict.status == fixtures
+    assert "flange_from_tool, is in doubt itself" in frame.verdict.reasons[0]
+    assert "The tip wobbles." in frame.verdict.reasons[0]
+
+
+def test_errors_that_points_share_are_carried_to_the_answer():
+    # As a camera's: another covariance than a tip's, for all points together.
+    rng = np.random.default_rng(8)
+    rows = touch_rows(touching(1e-3 * CAD_MM, rng), points=NAMES)
+    measured = touched_points(rows, tool(), Noise.of_robot(0.0, 1e-6), None)
+    # As if the whole set were turned about the base, and shifted.
+    sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
+    jacobian = np.concatenate([sigmas * _turning(point) for point in measured.points])
+    shared = replace(measured, common=jacobian @ jacobian.T)
+    found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), FitSettings()).edge
+    moves = []
+    for step in np.diag(sigmas):
+        moved = [placed(exp(sign * step), measured.points) for sign in (1.0, -1.0)]
+        ahead, behind = (
+            drawn_fixture(
+                replace(measured, points=array), drawing(1e-3 * CAD_MM), FitSettings()
+            ).edge
+            for array in moved
+        )
+        moves.append(0.5 * away(behind.matrix, ahead.matrix))
+    # What is each point's own is a hundredth of it: 1e-4 of the variance.
+    expected = np.array(moves).T @ np.array(moves)
+    assert np.abs(found.covariance - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def _turning(point):
+    """How a point (3,) of the base moves with a small (6,) motion of the whole base."""
+    x, y, z = point
+    cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    return np.hstack([cross, np.eye(3)])
+
+
+# --- The command.
+
+
+@pytest.fixture
+def tool_file(tmp_path):
+    path = tmp_path / "frames.json"
+    made.alone(made.tool()).save(path)
+    return path
+
+
+def cad_file(path, points=CAD_MM, names=NAMES, columns=("x_mm", "y_mm", "z_mm")):
+    return write_table(path, columns, list(points), {"point": names})
+
+
+def touches_file(path, points_mm=CAD_MM, names=NAMES, seed=1, scale=1.0):
+    rng = np.random.default_rng(seed)
+    poses = touching(1e-3 * np.asarray(points_mm, dtype=float), rng, NOISE_M)
+    poses[:, :3, 3] *= scale
+    return write_poses(path, poses, {"view": range(len(poses)), "point": names})
+
+
+def fixture(folder, tool_file, *more, cad=True, **changes):
+    touches = touches_file(folder / "touches.csv", **changes)
+    drawn_at = ("--cad", cad_file(folder / "cad.csv")) if cad else ()
+    return visioncal("fixture", touches, "--tool", tool_file, *drawn_at, *more)
+
+
+def test_the_fixture_goes_into_a_file_beside_the_tool(tmp_path, tool_file):
+    done = fixture(tmp_path, tool_file, "-o", tool_file, "--name", "jig").good()
+    assert done.out.startswith("good  base_from_jig")
+    frames = FrameFile.load(tool_file).frames
+    assert list(frames) == ["flange_from_tool", "base_from_jig"]
+    # The tip's sigma, 0.2 mm, is most of it.
+    assert np.abs(frames["base_from_jig"].edge.matrix - FRAME).max() < 5e-4
+    assert frames["base_from_jig"].details["tool"]["name"] == "flange_from_tool"
+    fixture(tmp_path, tool_file, "-o", tool_file, "--name", "jig").refused(
+        "already has base_from_jig"
+    )
+    assert fixture(tmp_path, tool_file, "-o", tool_file, "--name=jig", "--force").status == 0
+
+
+MIRRORED = CAD_MM * [1, -1, 1]
+LINE = np.outer(np.arange(8), [50, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"points_mm": MIRRORED}, "mirror image of the drawing"),
+        ({"points_mm": LINE[:6], "names": NAMES[:6]}, "the points do not fit the drawing"),
+        ({"points_mm": CAD_MM[:2], "names": NAMES[:2]}, "at least 3 are needed"),
+        ({"scale": 1000.0}, "these look like millimetres. "),
+        ({"scale": 0.001}, "metres read as millimetres"),
+        ({"names": NAMES[::-1]}, "in another order"),
+        ({"names": ("p1", "P22", *NAMES[2:])}, "cad.csv has no point P22; it has P1, P2"),
+        ({"names": ("", *NAMES[1:])}, "touches.csv, line 2: which point was touched is not said"),
+        ({"names": ("",) * 8}, "touches.csv: which point was touched is not said"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path, tool_file, changes, words):
+    fixture(tmp_path, tool_file, "-o", tmp_path / "new.json", **changes).refused(words)
+    assert not (tmp_path / "new.json").exists()
+
+
+def test_features_need_their_kinds(tmp_path, tool_file):
+    poses = touching(ON_FEATURES, np.random.default_rng(1), NOISE_M)
+
+    def run(kinds, *more):
+        touches = write_poses(tmp_path / "touches.csv", poses[: len(kinds)], {"kind": kinds})
+        return visioncal("fixture", touches, "--tool", tool_file, *more)
+
+    run(KINDS).good()
+    run(("",) * 7).refused("there is no kind; one of origin, x, xy is needed", "--cad")
+    run(("orgin", *KINDS[1:])).refused("line 2: kind is 'orgin'", "Did you mean origin?")
+    run(KINDS[:3]).refused("no touch of kind xy")
+    run(KINDS, "--cad", cad_file(tmp_path / "cad.csv")).refused("Leave --cad away")
+
+
+def test_touches_on_a_line_are_refused_with_the_rotation_that_is_open(tmp_path, tool_file):
+    line = 1e-3 * np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [300.0, 0.0, 0.0]])
+    poses = touching(line, np.random.default_rng(2), NOISE_M)
+    touches = write_poses(tmp_path / "touches.csv", poses, {"kind": ["origin", "x", "xy"]})
+    visioncal("fixture", touches, "--tool", tool_file).refused(
+        "the fixture's rotation about its x has a predicted sigma of", "at a noise of 0.1 mm"
+    )
+
+
+def test_units_of_the_drawing(tmp_path, tool_file):
+    touches = touches_file(tmp_path / "touches.csv")
+
+    def run(columns, *more):
+        cad = cad_file(tmp_path / "cad.csv", columns=columns)
+        return visioncal("fixture", touches, "--tool", tool_file, "--cad", cad, *more)
+
+    run(("X_mm", "Y_mm", "Z_mm")).good()
+    # Who says a unit has seen that the names are wrong.
+    run(("x_m", "y_m", "z_m"), "--cad-unit", "mm").good()
+    run(("x_m", "y_m", "z_m")).refused("times as large as drawn")
+    run(("x", "y", "z")).refused("x, y, z are in no unit that is named")
+
+
+def test_a_drawings_own_sigma_counts(tmp_path, tool_file):
+    touches = touches_file(tmp_path / "touches.csv")
+    sigmas = {"point": NAMES, "sigma_um": [50] * 7 + [5000]}
+    cad = write_table(tmp_path / "cad.csv", ("x_mm", "y_mm", "z_mm"), list(CAD_MM), sigmas)
+    # What is drawn to 5 mm says nothing against the others, wherever it is.
+    text = cad.read_text().replace("20,150,10", "24,155,12")
+    cad.write_text(text)
+    done = visioncal("fixture", touches, "--tool", tool_file, "--cad", cad, "--json")
+    found = json.loads(done.out)["base_from_fixture"]
+    assert all(value["used"] for value in found["observations"])
+    # Seven points of 0.1 mm with a tip of 0.2 mm; the eighth would turn them by 10 mrad.
+    assert np.abs(np.array(found["matrix"]) - FRAME).max() < 2e-3
+    cad.write_text(text.replace(",50,", ",-50,"))
+    assert "sigma_um is negative" in visioncal("fixture", touches, "--cad", cad, "--tool=none").err
+
+
+def test_which_tool_touched(tmp_path, tool_file):
+    cad, touches = cad_file(tmp_path / "cad.csv"), touches_file(tmp_path / "touches.csv")
+    two = tmp_path / "two.json"
+    made.alone({"flange_from_gripper": made.frame(made.FLANGE_FROM_TOOL), **made.tool()}).save(two)
+
+    def run(*more):
+        return visioncal("fixture", touches, "--cad", cad, *more)
+
+    run("--tool", f"{two}:gripper").good()
+    run("--tool", f"{tool_file}:flange_from_tool").good()
+    run().refused("The tool that touched the points is not said", "--tool none")
+    run("--tool", two).refused("has 2 tools: flange_from_gripper, flange_from_tool")
+    run("--tool", f"{two}:griper").refused("Did you mean flange_from_gripper")
+
+
+def test_positions_of_the_tip_itself_are_enough(tmp_path, tool_file):
+    rng = np.random.default_rng(2)
+    met = placed(FRAME, 1e-3 * CAD_MM) + NOISE_M * rng.normal(size=CAD_MM.shape)
+    cad, touches = cad_file(tmp_path / "cad.csv"), tmp_path / "touches.csv"
+
+    def run(names, *more):
+        write_table(touches, names, (1e3 * met).round(4).tolist(), {"point": NAMES})
+        return visioncal("fixture", touches, "--cad", cad, "--json", *more)
+
+    none = ("--tool", "none")
+    for done in (
+        run(("x_mm", "y_mm", "z_mm"), *none),
+        run(("X", "Y", "Z"), *none, "--robot-form", "kuka"),
+        run(("a", "b", "c"), *none, "--robot-columns", "a,b,c", "--robot-unit", "mm"),
+    ):
+        found = json.loads(done.out)["base_from_fixture"]
+        # Eight points of 0.1 mm over 0.3 m.
+        assert np.abs(np.array(found["matrix"]) - FRAME).max() < 5e-4
+    run(("X", "Y", "Z"), *none).refused("are in no unit that is named")
+    run(("x_m", "y_m", "z_m"), *none).refused("these look like millimetres")
+    run(("x_mm", "y_mm", "z_mm"), "--tool", tool_file).refused("say --tool none")
+
+
+# Ten touches, 45 degrees, 0.1 mm: the tip is known to some 0.05 mm per axis.
+NEAR_MM = 0.3
+
+
+def file_of(path, touches, **columns):
+    more = {"view": range(1, len(touches) + 1), "kind": touches.kinds}
+    if len(touches.names) > 1:
+        more["point"] = [touches.names[index] for index in touches.points]
+    return write_poses(path, touches.base_from_flange, more | columns)
+
+
+def tcp(folder, touches, *more):
+    return visioncal("tcp", file_of(folder / "touches.csv", touches), *more)
+
+
+def _meeting(robot, rng):
+    """Joint angles (8, 6) at which the tip is at one point, each another way."""
+    home = np.array([0.4, -1.3, 1.5, -1.75, -1.57, 0.3])
+
+    def tip(joints):
+        return robot.base_from_flange(joints[None])[0, :3] @ np.append(TIP, 1.0)
+
+    point = tip(home)
+    starts = home + rng.uniform(-0.4, 0.4, (8, 6))
+    return np.array([least_squares(lambda value: tip(value) - point, start).x for start in starts])
+
+
+def found(done):
+    assert done.status == 0, done.err
+    return next(iter(json.loads(done.out).values()))
+
+
+def off_mm(document):
+    return 1e3 * np.linalg.norm(np.array(document["translation_m"]) - TIP)
+
+
+# --- What it finds.
+
+
+def test_five_real_touches(real_data):
+    done = visioncal("tcp", real_data / "tcp_pivot_rvbust/poses.csv", "--json")
+    tool = found(done)
+    # Figures of a plain linear fit by others, as they round them.
+    assert 1e3 * np.array(tool["translation_m"]) == pytest.approx([33.78, 0.97, 76.79], abs=0.006)
+    assert tool["rms_mm"] == pytest.approx(0.219, abs=0.001)
+    # Each axis is known to about 0.1 mm by five touches of 0.16 mm per axis.
+    assert tool["sigma_mm"] == pytest.approx(0.18, abs=0.02)
+    assert tool["verdict"]["status"] == "good"
+    assert not tool["oriented"]
+
+
+def test_the_tip_and_its_rotation(tmp_path):
+    made = touched(Job(axes=3), 1)
+    done = tcp(tmp_path, made.touches, "--json")
+    tool = found(done)
+    assert tool["oriented"]
+    assert tool["verdict"]["status"] == "good"
+    error = error_of(np.array(tool["matrix"]))
+    # 0.1 mm over levers of 100 mm, with three touches of each kind.
+    assert np.linalg.norm(error[:3]) < 4 * np.deg2rad(tool["sigma_deg"]) < np.deg2rad(0.5)
+    assert 1e3 * np.linalg.norm(error[3:]) < NEAR_MM
+    assert tool["method"] == (
+        "pivot of 10 touches of one point; rotation from 3 along z and 3 in the xz plane"
+    )
+    assert {value["kind"] for value in tool["observations"]} == {"point", "z", "xz"}
+
+
+def test_poses_of_a_tool_that_was_active_are_doubted(tmp_path):
+    made = touched(Job(), 1)
+    of_tip = made.touches.base_from_flange.copy()
+    of_tip[:, :3, 3] += of_tip[:, :3, :3] @ TIP
+    tool = found(tcp(tmp_path, replace(made.touches, base_from_flange=of_tip), "--json"))
+    assert tool["verdict"]["status"] == "check"
+    assert "active in the controller" in tool["verdict"]["reasons"][0]
+
+
+def test_several_points_need_fewer_touches_of_each(tmp_path):
+    tool = found(tcp(tmp_path, touched(Job(tips=4, points=3), 2).touches, "--json"))
+    assert off_mm(tool) < NEAR_MM
+    assert set(tool["details"]["points_m"]) == {"A", "B", "C"}
+
+
+def test_poses_in_other_forms(tmp_path):
+    poses = touched(Job(), 3).touches.base_from_flange
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    path, mm = tmp_path / "touches.csv", 1e3 * poses[:, :3, 3]
+    kuka = np.hstack([mm, turns.as_euler("ZYX", degrees=True)])
+    write_table(path, ("X", "Y", "Z", "A", "B", "C"), kuka.tolist())
+    assert off_mm(found(visioncal("tcp", path, "--robot-form", "kuka", "--json"))) < NEAR_MM
+    abb = np.hstack([mm, np.roll(turns.as_quat(), 1, axis=1)])
+    write_table(path, ("x", "y", "z", "q1", "q2", "q3", "q4"), abb.tolist())
+    assert off_mm(found(visioncal("tcp", path, "--robot-unit", "mm", "--json"))) < NEAR_MM
+    back = invert(poses)
+    write_poses(path, back)
+    done = visioncal("tcp", path)
+    assert "--robot-inverse" in done.out
+    assert done.out.startswith("check")
+    assert off_mm(found(visioncal("tcp", path, "--robot-inverse", "--json"))) < NEAR_MM
+
+
+def test_joint_angles_go_through_the_robots_model(tmp_path):
+    robot, rng = load_robot("ur10e"), np.random.default_rng(4)
+    joints = _meeting(robot, rng)
+    names = [f"q{index}_rad" for index in range(1, 7)]
+    path = write_table(tmp_path / "touches.csv", names, joints.tolist())
+    done = visioncal("tcp", path, "--robot-model", "ur10e", "--json")
+    # Exact touches, but for the digits of the joints' angles.
+    assert off_mm(found(done)) < 1e-3
+    visioncal("tcp", path).refused("--robot-model")
+    degrees = write_table(tmp_path / "deg.csv", names, np.rad2deg(joints).tolist())
+    visioncal("tcp", degrees, "--robot-model", "ur10e").refused("--joint-unit deg")
+    done = visioncal("tcp", degrees, "--robot-model", "ur10e", "--joint-unit", "deg", "--json")
+    assert off_mm(found(done)) < 1e-3
+    visioncal("tcp", path, "--robot-model", "panda").refused("6 joint angles, but")
+
+
+def test_the_rows_of_a_session_are_touches(tmp_path):
+    touches = touched(Job(), 12).touches
+    head = 'schema = 1\nname = "touches"\nmount = "eye-in-hand"\n'
+    (tmp_path / "session.toml").write_text(head)
+    columns = {"view": range(20, 30), "point": ["A"] * 10}
+    write_poses(tmp_path / "views.csv", touches.base_from_flange, columns)
+    tool = found(visioncal("tcp", tmp_path, "--json"))
+    assert off_mm(tool) < NEAR_MM
+    assert [value["name"] for value in tool["observations"]] == [
+        str(index) for index in range(20, 30)
+    ]
+    assert tool["source"] == "touches"
+
+
+# --- What is wrong is named.
+
+
+def test_one_wrong_touch_in_ten_is_named(tmp_path):
+    made = touched(Job(), 5)
+    wrong = slipped(made.touches, 3, np.array([0.0012, -0.0009, 0.0]))
+    done = tcp(tmp_path, wrong, "--json")
+    tool = found(done)
+    (reason,) = tool["verdict"]["reasons"]
+    assert reason.startswith("Touch 4 (touches.csv, line 5) was left out: 1.")
+    assert "the tip had slipped" in reason
+    assert tool["verdict"]["status"] == "check"
+    assert [value["name"] for value in tool["observations"] if not value["used"]] == ["4"]
+    assert off_mm(tool) < NEAR_MM
+
+
+def test_few_or_noisy_touches_are_doubted(tmp_path):
+    words = tcp(tmp_path, touched(Job(tips=3), 7).touches).out
+    assert "Only 3 touches of a point are used" in words
+    noisy = tcp(tmp_path, touched(Job(tips=12, contact_m=1e-3), 8).touches).out
+    assert "mm only (per axis; doubt begins at 0.5)" in noisy
+    flat = tcp(tmp_path, touched(Job(cone_deg=4.0), 9).touches).out
+    assert "Add touches tilted by 30 to 45 degrees" in flat
+    stated = tcp(tmp_path, touched(Job(), 10).touches, "--touch-noise-mm", "0.02").out
+    assert "scatter by more than they are stated to" in stated
+
+
+def test_another_order_of_the_quaternion_is_a_bad_tool(tmp_path):
+    poses = touched(Job(), 11).touches.base_from_flange
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rows = np.hstack([poses[:, :3, 3], np.roll(turns, 1, axis=1)]).tolist()
+    path = write_table(
+        tmp_path / "touches.csv", ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), rows
+    )
+    done = visioncal("tcp", path)
+    assert done.status == 3
+    assert "poses that are read wrongly (--robot-form, --robot-inverse)" in done.out
+
+
+# --- What cannot be is refused.
+
+
+def test_too_few_touches_are_refused(tmp_path):
+    tcp(tmp_path, touched(Job(tips=2), 1).touches, "-o", tmp_path / "frames.json").refused(
+        "2 touches of kind point", "at least 3 of one point", "tilted by 20 to 45"
+    )
+    assert not (tmp_path / "frames.json").exists()
+
+
+def test_touches_from_one_orientation_are_refused(tmp_path):
+    poses = touched(Job(), 1).touches.base_from_flange.copy()
+    poses[:, :3, :3] = poses[0, :3, :3]
+    # Where the robot stands is told to 1 mm, so that no two are copies.
+    poses[:, :3, 3] = poses[0, :3, 3] + 1e-3 * np.random.default_rng(1).normal(size=(10, 3))
+    visioncal("tcp", write_poses(tmp_path / "touches.csv", poses)).refused(
+        "the tip's offset from the flange is not determined at all", "differ in position only"
+    )
+
+
+def test_touches_that_turn_about_one_axis_name_what_is_open(tmp_path):
+    poses = touched(Job(), 1).touches.base_from_flange.copy()
+    spins = Rotation.from_rotvec(np.outer(np.linspace(-1.5, 1.5, 10), [0, 0, 1.0])).as_matrix()
+    met = poses[0, :3, :3] @ TIP + poses[0, :3, 3]
+    poses[:, :3, :3] = poses[0, :3, :3] @ spins
+    poses[:, :3, 3] = met - poses[:, :3, :3] @ TIP
+    visioncal("tcp", write_poses(tmp_path / "touches.csv", poses)).refused(
+        "the tip's offset along the flange's z is not determined at all"
+    )
+
+
+def test_wrong_rows_are_refused_by_their_place(tmp_path):
+    touches = touched(Job(), 1).touches
+    path = file_of(tmp_path / "touches.csv", touches)
+    lines = path.read_text().splitlines()
+
+    def run(text):
+        path.write_text(text)
+        return visioncal("tcp", path)
+
+    run("\n".join([*lines, lines[3].replace("3,", "11,", 1)])).refused(
+        "touches.csv, line 4 and touches.csv, line 12 have the very same pose"
+    )
+    run("\n".join(lines).replace("2,point", "2,pint")).refused(
+        "touches.csv, line 3: kind is 'pint'", "Did you mean point?"
+    )
+    run("\n".join(lines).replace("2,point", "2,origin")).refused(
+        "kind is 'origin'", "point, z, xz or nothing"
+    )
+    run("\n".join(lines).replace(lines[2].split("point")[1], "," * 7)).refused(
+        "touches.csv, line 3: no pose of the robot"
+    )
+    run("x,y\n1,2\n").refused("which of its fields are the robot's poses is not known")
+    visioncal("tcp", tmp_path / "nowhere.csv").refused("nowhere.csv does not exist")
+
+
+# --- What it writes.
+
+
+def test_a_file_of_frames_is_made_extended_and_kept(tmp_path):
+    touches, path = touched(Job(), 1).touches, tmp_path / "frames.json"
+    assert f"wrote {path}" in tcp(tmp_path, touches, "-o", path).good().err
+    first = FrameFile.load(path).frames["flange_from_tool"]
+    assert tcp(tmp_path, touches, "-o", path, "--name", "gripper").status == 0
+    assert list(FrameFile.load(path).frames) == ["flange_from_tool", "flange_from_gripper"]
+    other = touched(Job(), 2).touches
+    tcp(tmp_path, other, "-o", path).refused("already has flange_from_tool", "--force")
+    kept = FrameFile.load(path).frames["flange_from_tool"]
+    assert np.array_equal(kept.edge.matrix, first.edge.matrix)
+    assert tcp(tmp_path, other, "-o", path, "--force").status == 0
+    replaced = FrameFile.load(path).frames["flange_from_tool"]
+    assert not np.array_equal(replaced.edge.matrix, first.edge.matrix)
+    path.write_text("{}")
+    tcp(tmp_path, touches, "-o", path).refused("not frames that this version can read")
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calibrated")
+    write_session(simulate(CellOptions(views=10, seed=3)), folder / "cell", images=False)
+    session = Session.load(folder / "cell")
+    write_outputs(folder / "out", session, run(session))
+    return folder / "out"
+
+
+@pytest.fixture
+def out(calibrated, tmp_path):
+    return Path(shutil.copytree(calibrated, tmp_path / "out"))
+
+
+def test_a_tool_joins_its_calibration(out, tmp_path):
+    before = Calibration.load(out)
+    touches = touched(Job(axes=3), 1).touches
+    done = tcp(tmp_path, touches, "-c", out, "--name", "gripper").good()
+    assert all(f"wrote {out / name}" in done.err for name in ("calibration.json", "recording.rrd"))
+    after = Calibration.load(out)
+    assert list(after.frames) == ["flange_from_gripper"]
+    for name, edge in before.edges.items():
+        assert np.array_equal(after.edges[name].matrix, edge.matrix)
+    assert "flange_from_gripper" in (out / "report.html").read_text(encoding="utf-8")
+    recorded = read_calibration(out / "recording.rrd").frames["flange_from_gripper"]
+    matrix = after.frames["flange_from_gripper"].edge.matrix
+    assert np.array_equal(recorded.edge.matrix, matrix)
+    exported = visioncal("export", out, "--to", "ur-tcp").good()
+    numbers = exported.out.partition("set_tcp(p[")[2].partition("]")[0].split(",")
+    # Nanometres are written.
+    assert np.array(numbers[:3], dtype=float) == pytest.approx(matrix[:3, 3], abs=1e-8)
+    tcp(tmp_path, touches, "-c", out, "--name", "gripper").refused("already has")
+    again = tcp(tmp_path, touches, "-c", out, "--name", "gripper", "--force")
+    assert "it replaces the one of" in again.err
+    # A fixture of the same name would hang the frame in two places.
+    visioncal("fixture", tmp_path / "touches.csv", "-c", out, "--name", "gripper").refused(
+        "'gripper' is taken: flange_from_gripper is there already"
+    )
+    whole = (out / "calibration.json").read_bytes()
+    tcp(tmp_path, touches, "-o", out / "calibration.json").refused("is a calibration", "-c")
+    assert (out / "calibration.json").read_bytes() == whole
+    elsewhere = tmp_path / "frames.json"
+    assert tcp(tmp_path, touches, "-c", out, "-o", elsewhere).status == 0
+    assert list(Calibration.load(out).frames) == ["flange_from_gripper"]
+
+
+def test_a_fixture_is_touched_with_the_calibrations_tool(out, tmp_path):
+    touches = touched(Job(axes=3), 1).touches
+    path = file_of(tmp_path / "touches.csv", touches)
+    visioncal("fixture", path, "-c", out).refused("The calibration has no tool", "--tool none")
+    assert tcp(tmp_path, touches, "-c", out).status == 0
+    kinds = ["origin", "x", "xy"] * 2
+    poses = np.tile(touches.base_from_flange[0], (6, 1, 1))
+    poses[:, :2, 3] += [[0, 0], [0.2, 0], [0.1, 0.2], [0.0, 1e-4], [0.3, 0], [0.0, 0.3]]
+    path = write_poses(tmp_path / "fixture.csv", poses, {"kind": kinds})
+    visioncal("fixture", path, "-c", out).good()
+    fixture = Calibration.load(out).frames["base_from_fixture"]
+    assert fixture.details["tool"]["name"] == "flange_from_tool"
+    # Along the base's axes by construction, to 0.1 mm over 0.3 m.
+    assert np.abs(fixture.edge.matrix[:3, :3] - np.eye(3)).max() < 1e-3
+    assert "base_from_fixture" in (out / "report.html").read_text(encoding="utf-8")
+    assert "PERS wobjdata" in visioncal("export", out, "--to", "abb-wobjdata").good().out
+
+
+def test_a_bad_tool_is_shown_and_does_not_join(out, tmp_path):
+    before = (out / "calibration.json").read_bytes()
+    touches = touched(Job(), 1).touches
+    # Of anything else: the flange is anywhere within centimetres.
+    scattered = replace(
+        touches, base_from_flange=touches.base_from_flange + _shifted(len(touches), 0.03)
+    )
+    done = tcp(tmp_path, scattered, "-c", out, "--name", "gripper")
+    assert done.status == 3
+    assert done.out.startswith("bad")
+    assert "does not join" in done.err
+    assert tcp(tmp_path, scattered, "-c", out, "--name", "gripper", "--json").status == 3
+    assert (out / "calibration.json").read_bytes() == before
+    # A file of frames keeps it, and what would use it refuses.
+    file = tmp_path / "frames.json"
+    assert tcp(tmp_path, scattered, "-o", file, "--name", "gripper").status == 3
+    assert visioncal("export", file, "--to", "ur-tcp").status == 3
+    assert visioncal("export", file, "--to", "ur-tcp", "--force").status == 0
+
+
+def _shifted(count, sigma_m):
+    shifts = np.zeros((count, 4, 4))
+    shifts[:, :3, 3] = sigma_m * np.random.default_rng(3).standard_normal((count, 3))
+    return shifts
+
+
+def test_a_tool_is_removed_by_its_name(out, tmp_path):
+    touches = touched(Job(axes=3), 1).touches
+    for name in ("gripper", "needle"):
+        assert tcp(tmp_path, touches, "-c", out, "--name", name).status == 0
+    visioncal("export", out, "--to", "ur-tcp").refused("flange_from_needle")
+    visioncal("tcp", "-c", out, "--remove", "needle").good()
+    assert list(Calibration.load(out).frames) == ["flange_from_gripper"]
+    assert list(read_calibration(out / "recording.rrd").frames) == ["flange_from_gripper"]
+    assert visioncal("export", out, "--to", "ur-tcp").status == 0
+    visioncal("tcp", "-c", out, "--remove", "needle").refused("has no tool 'needle'")
+    visioncal("fixture", "-c", out, "--remove", "gripper").refused("has no fixture 'gripper'")
+    visioncal("tcp", "-c", out).refused("touches of it")
+    visioncal("tcp", "--remove", "gripper").refused("from where")
+    visioncal("tcp", tmp_path / "touches.csv", "-c", out, "--remove", "gripper").refused(
+        "--remove measures nothing"
+    )
+    file = tmp_path / "frames.json"
+    assert tcp(tmp_path, touches, "-o", file, "--name", "gripper").status == 0
+    assert visioncal("tcp", "-o", file, "--remove", "gripper").status == 0
+    assert not FrameFile.load(file).frames
