@@ -151,5 +151,5 @@ def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
         found = load_calibration(path)
         expected = CELL.between("base_b", "cam_top")
         np.testing.assert_allclose(found.edges["base_from_cam"].matrix, expected.matrix)
-    with pytest.raises(DataError, match="a and b part them"):
+    with pytest.raises(DataError, match="no one robot parts"):
         load_calibration(tmp_path, Choice("hand"))

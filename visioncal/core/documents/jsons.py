@@ -122,6 +122,13 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
             or too large for squares; the message has its path.
     """
     text = decode_text(text, label) if isinstance(text, bytes) else text
+    if Path(label).suffix != ".json" and not (begin := text.lstrip()[:40]).startswith("{"):
+        raise DataError(
+            f"{label} begins with {shown(begin)}; a JSON document that visioncal wrote is needed.",
+            culprits=[label],
+            next_step="Name its file, as calibration.json, or its folder; nothing need be changed "
+            "in this one.",
+        )
     document = parse_json(text, label, _LARGEST)
     if not isinstance(document, dict):
         raise DataError(f"{label} is {shown(document)}; a table is needed.", culprits=[label])
