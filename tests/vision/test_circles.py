@@ -109,22 +109,11 @@ def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
     assert np.sqrt(np.mean(error**2)) < 0.015
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"columns": 5}, "of 4 x 7 circles is seen, and the target is an asymmetric one of 5 x 7"),
-        (
-            {"asymmetric": False},
-            "an asymmetric grid of 4 x 7 circles is seen, and the target is a s",
-        ),
-        ({"diameter_m": 0.006}, "of square_m, and the target says 0.30"),
-    ],
-)
-def test_another_page_is_named(change, words):
+@pytest.mark.parametrize("change", [{"columns": 5}, {"asymmetric": False}])
+def test_another_page_is_refused(change):
     found = find_target(photograph(SHIFTED, SHOT, 2)[0], replace(SHIFTED, **change))
     assert isinstance(found, NotFound)
-    assert found.misfit
-    assert words in found.reason
+    assert "circles is seen" in found.reason
 
 
 @pytest.mark.parametrize(

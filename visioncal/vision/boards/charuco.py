@@ -8,7 +8,6 @@ from typing import Any, ClassVar, TypeAlias
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
@@ -39,14 +38,6 @@ from visioncal.vision.boards.template import Print
 # A homography has eight unknowns and a marker gives eight equations: three are a check.
 _LAYOUT_MARKERS = 3
 
-# Points on a marker's side to which distances are measured.
-_ALONG = 7
-# Distance of a window from a marker's side: its blur, and a pixel for gradients.
-_CLEAR_PX = 2.0
-# Half-widths of the windows of corner refinement: smaller ones have too few gradients, and in
-# larger ones lens distortion bends the squares' sides.
-_WINDOWS_PX = (2, 10)
-_ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 # Thresholding window of a quick search: of 7 to 31, it detected most markers at squares of 20 to 70
 # px.
 _QUICK_PX = 7
@@ -204,9 +195,7 @@ class Charuco(Board):
             return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
         order = np.argsort(ids.ravel())
         detected = px.reshape(-1, 2)[order].astype(np.float64)
-        return DetectedCorners(
-            ids.ravel()[order].astype(np.int64), _refined(image, detected, marker_px)
-        )
+        return DetectedCorners(ids.ravel()[order].astype(np.int64), detected)
 
     def identify(self, image: Image, markers: Sequence[Marker]) -> list[Identity]:
         """Boards by the markers of each family."""
@@ -240,24 +229,6 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     )
     board.setLegacyPattern(target.legacy)
     return board
-
-
-def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArray:
-    """Refines (n, 2) corners [px] in windows that exclude the markers."""
-    # OpenCV's windows depend on the distance of a marker's corner only: in small, slanted or bent
-    # squares they include a marker's sides, which bias the corner by up to half a pixel.
-    corners = np.reshape(np.array(marker_px, dtype=float), (-1, 4, 2))
-    sides = np.roll(corners, -1, axis=1) - corners
-    side_points = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]
-    distances, _ = KDTree(side_points.reshape(-1, 2)).query(px, p=np.inf)
-    windows = np.clip(distances - _CLEAR_PX, *_WINDOWS_PX).astype(int)
-    refined = px.astype(np.float32)
-    for window in np.unique(windows).tolist():
-        mask = windows == window
-        start = refined[mask].reshape(-1, 1, 2).copy()
-        refined_px = cv2.cornerSubPix(image, start, (window, window), (-1, -1), _ENDS)
-        refined[mask] = refined_px.reshape(-1, 2)
-    return refined.astype(np.float64)
 
 
 def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's

@@ -43,8 +43,6 @@ _ALIKE = 1.6
 _SEEDS, _OFF, _NEAREST = 16, 0.3, 8
 # Minimum number of blobs.
 _LEAST = 9
-# Tolerance of the stated diameter: relative, plus pixels, as ink and light spread.
-_DIAMETER, _SPREAD_PX = 0.2, 3.0
 # Transformations between bases of one lattice.
 _BASES = np.array(
     [
@@ -55,18 +53,6 @@ _BASES = np.array(
 ).reshape(-1, 2, 2)
 # Basis of a staggered grid: circles lie where column and row are both even or both odd.
 _STAGGER = np.array([[1, 1], [1, -1]])
-
-
-@dataclass(frozen=True, eq=False)
-class Circles:
-    """A grid of circles in an image."""
-
-    columns: int  # Number of circles in each row.
-    rows: int  # Number of rows.
-    asymmetric: bool  # Whether every second row is shifted by half a step.
-    px: FloatArray  # (n, 2) approximate centres, row by row [px].
-    share: float  # Diameter over the spacing of neighbouring columns or rows.
-    diameter_px: float  # Median diameter [px].
 
 
 class CircleGrid(Board):
@@ -183,32 +169,12 @@ class CircleGrid(Board):
         grid, the numbering with the least rotation in the image is used.
         """
         del quick
-        seen = _seen_grids(image) or _seen_grids(255 - image)
-        for circles in seen:
-            if (circles.columns, circles.rows, circles.asymmetric) == (
-                target.columns,
-                target.rows,
-                target.asymmetric,
-            ):
-                share = target.diameter_m / target.square_m
-                if abs(circles.share / share - 1.0) > _DIAMETER + _SPREAD_PX / circles.diameter_px:
-                    return NotFound(
-                        f"the circles' diameter is {circles.share:.2f} of square_m, and the target "
-                        f"says {share:.2f}",
-                        misfit=True,
-                    )
-                return DetectedCorners(np.arange(len(circles.px)), circles.px)
-        layout = "asymmetric" if target.asymmetric else "symmetric"
-        requested = f"{layout} grid of {target.columns} x {target.rows} circles"
-        if not seen:
-            return NotFound(f"no board: no {requested} is seen")
-        best = seen[0]
-        return NotFound(
-            f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
-            f"and the target is {_article(target.asymmetric)} one of "
-            f"{target.columns} x {target.rows}",
-            misfit=True,
-        )
+        for picture in (image, 255 - image):
+            px = _centres(picture, target)
+            if px is not None:
+                return DetectedCorners(np.arange(len(px)), px)
+        size = f"{target.columns} x {target.rows}"
+        return NotFound(f"no board: no {self.words(target, size)} is seen")
 
 
 def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
@@ -217,38 +183,26 @@ def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
     return np.stack([2 * column + row % 2 if asymmetric else column, row], axis=1)
 
 
-def _article(asymmetric: bool) -> str:
-    return "an asymmetric" if asymmetric else "a symmetric"
+def _centres(image: Image, target: Target) -> FloatArray | None:
+    """(n, 2) centres of a grid's dark circles in a (h, w) grey image [px]; None where none is seen.
 
-
-def _seen_grids(image: Image) -> tuple[Circles, ...]:
-    """A grid of dark circles in a (h, w) grey image, in each order that forms a grid, or nothing.
-
-    The least rotated order comes first.
+    Of the orders that form the grid, the least rotated one.
     """
     blobs = find_blobs(image)
     if len(blobs.px) < _LEAST:
-        return ()
+        return None
     lattice, members = _lattice(blobs)
     if len(members) < _LEAST or np.median(blobs.fill[members]) < _ROUND:
-        return ()
-    px, diameters = blobs.px[members], blobs.diameters[members]
-    grids = []
-    for basis, asymmetric in product(_BASES, (False, True)):
-        grid = _grid(lattice @ (basis @ _STAGGER if asymmetric else basis), px, asymmetric)
-        if grid is not None:
-            columns, rows, order = grid
-            places = circle_places(columns, rows, asymmetric=asymmetric)
-            share = _share(places, px[order], diameters[order])
-            width = float(np.median(diameters))
-            if share > 0.0:
-                grids.append(Circles(columns, rows, asymmetric, px[order], share, width))
+        return None
+    px, turns = blobs.px[members], _BASES @ _STAGGER if target.asymmetric else _BASES
+    orders = (_order(lattice @ turn, px, target) for turn in turns)
+    grids = [px[order] for order in orders if order is not None]
 
-    def turn_rad(grid: Circles) -> float:
-        first_row = grid.px[grid.columns - 1] - grid.px[0]
+    def turn_rad(grid: FloatArray) -> float:
+        first_row = grid[target.columns - 1] - grid[0]
         return abs(float(np.arctan2(first_row[1], first_row[0])))
 
-    return tuple(sorted(grids, key=turn_rad))
+    return min(grids, key=turn_rad, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,28 +324,12 @@ def _grown(blobs: Blobs, tree: cKDTree, seed: int, steps: FloatArray) -> dict[tu
     return places
 
 
-def _grid(places: IntArray, px: FloatArray, asymmetric: bool) -> tuple[int, int, IntArray] | None:
-    """Columns, rows and order of points whose (n, 2) coordinates fill a right-handed grid."""
-    places = places - places.min(axis=0)
-    width, rows = (places.max(axis=0) + 1).tolist()
-    columns = width // 2 if asymmetric else width
-    if columns * rows != len(places) or columns < 2 or rows < 2:
-        return None
-    expected = circle_places(columns, rows, asymmetric=asymmetric)
+def _order(places: IntArray, px: FloatArray, target: Target) -> IntArray | None:
+    """Order of points whose (n, 2) coordinates fill the target's grid, right-handed; else None."""
     order = np.lexsort((places[:, 0], places[:, 1]))
-    if not np.array_equal(places[order], expected):
+    expected = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
+    if not np.array_equal(places[order] - places.min(axis=0), expected):
         return None
-    x, y = px[order[columns - 1]] - px[order[0]], px[order[-columns]] - px[order[0]]
-    return (columns, rows, order) if x[0] * y[1] - x[1] * y[0] > 0 else None
-
-
-def _share(places: IntArray, px: FloatArray, diameters: FloatArray) -> float:
-    """Median diameter over the neighbours' spacing, from areas; 0 without a homography."""
-    homography = np.asarray(cv2.findHomography(places.astype(float), px)[0], dtype=float)
-    if homography.shape != (3, 3):
-        return 0.0
-    ends = places[:, None] + 0.25 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    ends_px = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography)[0].reshape(-1, 4, 2)
-    step_x, step_y = 2.0 * (ends_px[:, 0] - ends_px[:, 1]), 2.0 * (ends_px[:, 2] - ends_px[:, 3])
-    areas = np.abs(step_x[:, 0] * step_y[:, 1] - step_x[:, 1] * step_y[:, 0])
-    return float(np.median(diameters / np.sqrt(areas)))
+    x = px[order[target.columns - 1]] - px[order[0]]
+    y = px[order[-target.columns]] - px[order[0]]
+    return order if x[0] * y[1] - x[1] * y[0] > 0 else None
