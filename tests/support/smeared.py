@@ -11,9 +11,6 @@ from visioncal.session import MemoryImages, Session
 from visioncal.simulation import SimulatedCell, prepare_scene
 from visioncal.simulation.render import developed, encode, light_on
 
-# So fine that edges are where they are to some thousandths of a pixel.
-SAMPLES = 6
-
 
 def smeared(cell: SimulatedCell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Session:
     """The session of a cell, its images rendered, blurred further, and read out with noise.
@@ -26,7 +23,7 @@ def smeared(cell: SimulatedCell, *, disc_px: float = 0.0, motion_px: float = 0.0
     """
     scene, session, files = prepare_scene(cell), session_of(cell), {}
     for at, pose in enumerate(cell.cam_from_target):
-        light = light_on(scene, pose, samples=SAMPLES)
+        light = light_on(scene, pose)
         rng = np.random.default_rng([cell.options.seed, at])
         along = rng.uniform(0, np.pi)
         half = 0.5 * motion_px * np.array([np.cos(along), np.sin(along)])

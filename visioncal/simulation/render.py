@@ -2,7 +2,7 @@
 
 Rays are traced at the knots of a grid: over a hundredth of a radian perspective and distortion are
 so smooth that a cubic spline through them is accurate to far below a thousandth of a pixel, at a
-fraction of the cost. `LiveView` takes images while the arm stands or moves.
+fraction of the cost. `LiveView` takes images for any posture of the arm.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,9 +42,6 @@ _BLACK_LEVEL, _FLOOR = 4.0, 118.0
 _LEAST_COSINE = 0.1
 # Image shift below the accuracy of corner detection [px].
 _STILL_PX = 0.003
-# Most moments of an exposure whose images make up its motion blur, and up to which blur they are as
-# fine as at rest [px]: shorter blur may count as standstill.
-_MOST_PARTS, _SHORT_PX = 8, 2.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class Raster:
         return np.asarray(self.down @ (varying @ self.across.T) + np.float32(mean))
 
 
-def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
+def trace(camera: Camera, patch: Patch, samples: int = _SAMPLES) -> Raster:
     """Traces rays over a patch, with `samples` sub-pixels along a pixel's side."""
     knot_px = _KNOT_RAD * float(camera.matrix[0])
     x, across = _spline(patch.left, patch.right, knot_px, samples)
@@ -181,7 +178,6 @@ def light_on(
     scene: RenderScene,
     cam_from_target: FloatArray,
     *,
-    samples: int = _SAMPLES,
     shows_board: bool = True,
 ) -> Float32Array:
     """Light on the sensor.
@@ -189,7 +185,6 @@ def light_on(
     Args:
         scene: Prepared scene.
         cam_from_target: (4, 4) pose of the board.
-        samples: Sub-pixels along a pixel's side.
         shows_board: Whether the board's face is visible, at least in part.
 
     Returns:
@@ -199,7 +194,7 @@ def light_on(
     with one_blas_thread():
         light, whole, shade = _background(scene, cam_from_target)
         if shows_board:
-            _draw_board(light, scene, cam_from_target, samples)
+            _draw_board(light, scene, cam_from_target)
         light *= whole.between(shade)
     blur_px = scene.camera.blur_px
     if blur_px > 0.0:
@@ -263,9 +258,7 @@ def _background(
     return light, raster, lamp * (1.0 - scene.camera.vignetting * edge)
 
 
-def _draw_board(
-    light: Float32Array, scene: RenderScene, cam_from_target: FloatArray, samples: int
-) -> None:
+def _draw_board(light: Float32Array, scene: RenderScene, cam_from_target: FloatArray) -> None:
     """Draws the sheet over the background, in place."""
     sheet, camera = scene.sheet, scene.camera.camera
     patch = _board_patch(camera, scene.board, cam_from_target)
@@ -278,7 +271,7 @@ def _draw_board(
         light_cam = np.array([0.3, 0.6, 0.74])
         brightness = 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
     raster, board, target_from_cam = (
-        trace(camera, patch, samples),
+        trace(camera, patch),
         scene.board,
         invert(cam_from_target),
     )
@@ -293,7 +286,7 @@ def _draw_board(
     area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
     knot_px2 = float(np.prod(raster.px[1, 1] - raster.px[0, 0]))
     # Texture level that fits the sub-pixels best, over the whole board.
-    spacing = float(np.sqrt(np.median(area) / knot_px2)) / samples
+    spacing = float(np.sqrt(np.median(area) / knot_px2)) / _SAMPLES
     level = int(np.argmin(np.abs(np.log(np.array(sheet.texel_m) / spacing))))
     # Texel centres are half a texel from the texture's outer corner.
     texels = (flat - sheet.origin_m) / sheet.texel_m[level] - 0.5
@@ -304,7 +297,7 @@ def _draw_board(
     width, height = patch.size
     for top in range(0, height, _BAND_PX):
         rows = min(_BAND_PX, height - top)
-        band = slice(top * samples, (top + rows) * samples)
+        band = slice(top * _SAMPLES, (top + rows) * _SAMPLES)
         seen = cv2.remap(
             sheet.levels[level],
             raster.down[band] @ columns[0] + np.float32(middle[0]),
@@ -313,7 +306,7 @@ def _draw_board(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(0, 0),
         ).astype(np.float32)
-        # Each pixel is the mean of exactly `samples` squared sub-pixels.
+        # Each pixel is the mean of exactly `_SAMPLES` squared sub-pixels.
         pixels = cv2.resize(seen, (width, rows), interpolation=cv2.INTER_AREA)
         window = light[patch.top + top : patch.top + top + rows, patch.left : patch.right]
         window *= 1.0 - pixels[..., 1] / np.float32(255.0)
@@ -371,51 +364,31 @@ class LiveView:
         self._rest: tuple[FloatArray, Float32Array] | None = None
 
     def picture(self, joints: FloatArray) -> Image:
-        """A (height, width) grey image with motion blur and independent noise.
+        """A (height, width) grey image with independent noise, at the middle of the exposure.
 
         The true joint angles (k, n) [rad] are at equal intervals during the exposure; one row
         stands for a stationary arm.
         """
-        poses = self.cam_from_target(joints)
-        smear_px = float(self._moved_px(poses[:-1], poses[1:]).sum())
-        if smear_px < _STILL_PX:
-            pose = poses[len(poses) // 2]
-            if self._rest is None or self._moved_px(self._rest[0][None], pose[None]) > _STILL_PX:
-                self._rest = (pose, self._light(pose))
-            light = self._rest[1]
-        else:
-            light = self._smeared(joints, smear_px)
+        pose = self.cam_from_target(joints[len(joints) // 2, None])[0]
+        if self._rest is None or self._moved_px(self._rest[0], pose) > _STILL_PX:
+            shows_board = _faces(self._cell, pose)
+            self._rest = (pose, light_on(self._scene, pose, shows_board=shows_board))
         self._count += 1
         noise = self._cell.options.stream(RandomStream.IMAGES, 1, self._count)
-        return developed(light, self._cell.camera(), noise)
+        return developed(self._rest[1], self._cell.camera(), noise)
 
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
         """True board poses: (k, n) joints [rad] to (k, 4, 4)."""
         return self._before(forward(self._cell.robot.true_arm, joints))
 
-    def _light(self, pose: FloatArray, samples: int = _SAMPLES) -> Float32Array:
-        shows_board = _faces(self._cell, pose)
-        return light_on(self._scene, pose, samples=samples, shows_board=shows_board)
-
-    def _smeared(self, joints: FloatArray, smear_px: float) -> Float32Array:
-        """Mean light over equal parts of the exposure."""
-        parts = int(np.clip(np.ceil(smear_px), 3, _MOST_PARTS))
-        positions = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
-        steps = np.arange(len(joints))
-        postures = np.stack([np.interp(positions, steps, column) for column in joints.T], axis=1)
-        samples = _SAMPLES if smear_px < _SHORT_PX else 1
-        lights = [self._light(pose, samples) for pose in self.cam_from_target(postures)]
-        return np.asarray(np.mean(lights, axis=0))
-
-    def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """(k,) bounds of the image motion between board poses (k, 4, 4) [px]."""
-        centre = centre_m(self._cell.board())
-        before = first[:, :3, :3] @ centre + first[:, :3, 3]
-        after = second[:, :3, :3] @ centre + second[:, :3, 3]
-        distance = np.maximum(np.linalg.norm(before, axis=1), 0.1)
-        shift = np.linalg.norm(after - before, axis=1) / distance
-        rotation = rotation_angle(second @ invert(first))
-        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + rotation))
+    def _moved_px(self, first: FloatArray, second: FloatArray) -> float:
+        """Bound of the image motion between board poses (4, 4) [px]."""
+        centre = np.append(centre_m(self._cell.board()), 1.0)
+        before, after = (first @ centre)[:3], (second @ centre)[:3]
+        distance = max(float(np.linalg.norm(before)), 0.1)
+        shift = float(np.linalg.norm(after - before)) / distance
+        turn = float(rotation_angle(second @ invert(first)))
+        return float(self._cell.camera().camera.matrix[0]) * (shift + turn)
 
 
 def _faces(cell: SimulatedCell, cam_from_target: FloatArray) -> bool:
