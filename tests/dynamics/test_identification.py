@@ -43,7 +43,6 @@ from visioncal.robot import (
     robot_names,
     torque_regressor,
 )
-from visioncal.robot.torques import model_with_inertias
 from visioncal.robot.writing import small_urdf, urdf_with_inertias, with_inertias
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import (
@@ -81,7 +80,11 @@ def test_torques_are_those_of_newton_and_euler(name):
     import pinocchio as pin
 
     robot = load_robot(name)
-    model = model_with_inertias(robot, robot.inertias)
+    model, masses = robot.pinocchio_model.copy(), robot.inertias.masses
+    model.gravity.linear = robot.gravity
+    bodies = zip(masses.kg, masses.centres_m, robot.inertias.about_centres, strict=True)
+    for joint, body in enumerate(bodies, start=1):
+        model.inertias[joint] = pin.Inertia(*body)
     data = model.createData()
     wanted = [pin.rnea(model, data, *row) for row in zip(*states(robot), strict=True)]
     found = joint_torques(robot, robot.inertias, *states(robot))

@@ -110,32 +110,6 @@ def effective_states(
     return chain.effective(q), jacobian * dq, jacobian * ddq + chain.curvatures(q) * dq**2
 
 
-def model_with_inertias(robot: Robot, inertias: Inertias) -> "pin.Model":
-    """Pinocchio's model of an arm with given inertias.
-
-    Raises:
-        DataError: First moments have no mass.
-    """
-    import pinocchio as pin
-
-    masses = inertias.masses
-    inconsistent = (masses.kg == 0.0) & inertias.values[:, 1:4].any(axis=1)
-    if inconsistent.any():
-        names = [name for name, value in zip(robot.joint_names, inconsistent, strict=True) if value]
-        raise DataError(
-            f"robot {robot.name}: {', '.join(names)} have first moments and no mass.",
-            culprits=names,
-            next_step="Give inertias of bodies, as a physically consistent identification has "
-            "them.",
-        )
-    model = robot.pinocchio_model.copy()
-    model.gravity.linear = robot.gravity
-    bodies = zip(masses.kg, masses.centres_m, inertias.about_centres, strict=True)
-    for joint, (kg, centre, about) in enumerate(bodies, start=1):
-        model.inertias[joint] = pin.Inertia(kg, centre, about)
-    return model
-
-
 def _regressors(
     model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
 ) -> Iterator[FloatArray]:
