@@ -78,12 +78,11 @@ def test_a_camera_that_stands_still_is_recorded_likewise(tmp_path):
 )
 def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     arm, camera = fake_devices(plan, trembling_s=0.8, tremble_rad=4e-3, hidden=hidden)
-    steps = recorded(tmp_path / "live", plan, arm, camera, CaptureOptions())
+    recorded(tmp_path / "live", plan, arm, camera, CaptureOptions())
     session = Session.load(tmp_path / "live")
     assert len(session.views) == len(plan.stops)
     # It trembles by a millimetre and more at first, and the views waited for its end.
     assert max(errors_m(session, camera)) < REPEATABILITY_M
-    assert all(step.settled_s > 0.8 for step in steps)
 
 
 def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):

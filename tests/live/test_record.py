@@ -121,7 +121,6 @@ def test_json_sums_it_up(planned, cell, tmp_path):
     summary = json.loads(done.out)
     assert summary["views"] == [stop.view for stop in planned[1].stops]
     assert summary["predicted"]["sigma_mm"] > 0.0
-    assert {"view", "moved_s", "settled_s", "worked_s"} == summary["times_s"][0].keys()
     assert cell[0].moves >= 4
 
 

@@ -367,15 +367,6 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
         summary: dict[str, Any] = {
             "session": str(journal.folder),
             "views": [view.number for view in journal.views],
-            "times_s": [
-                {
-                    "view": step.view,
-                    "moved_s": round(step.moved_s, 3),
-                    "settled_s": round(step.settled_s, 3),
-                    "worked_s": round(step.worked_s, 3),
-                }
-                for step in steps
-            ],
         }
         if predicted:
             summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}

@@ -116,7 +116,7 @@ class Gate:
 
     def move(
         self, postures: Sequence[FloatArray], motion: str, look: Callable[[], None] = lambda: None
-    ) -> float:
+    ) -> None:
         """Drives through checked postures (n,) [rad], with consent, until it is at the last.
 
         The arm's state is monitored throughout. An exception leaves the arm moving;
@@ -126,9 +126,6 @@ class Gate:
             postures: The postures, as from `clear_path`.
             motion: What is about to happen, for the question.
             look: Called periodically on the way.
-
-        Returns:
-            How long the arm moved [s].
 
         Raises:
             DataError: There is no consent, or a posture is beyond the joints' limits.
@@ -144,7 +141,6 @@ class Gate:
             raise DriverError(
                 f"{name} cannot be driven.", culprits=[name], next_step="Guide it by hand."
             )
-        start = live.clock.now()
         for goal in postures:
             expected_s = self.pace.travel_s(live.joints(), goal)
             live.arm.start_move(goal, speed=self.pace.speed, acceleration=self.pace.acceleration)
@@ -160,7 +156,6 @@ class Gate:
                     next_step="Was it stopped on the pendant? Start it again there, and go on with "
                     "--resume.",
                 )
-        return live.clock.now() - start
 
     def _wait(self, arm: MovingArm, expected_s: float, look: Callable[[], None]) -> None:
         """Waits until a started arm has stopped, which it should after the expected time [s]."""

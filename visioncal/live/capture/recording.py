@@ -46,9 +46,6 @@ class CaptureEvent:
     covered: str  # Coverage so far, in words.
     accuracy: Accuracy | None  # Accuracy predicted so far; None while there is no prediction.
     advice: str  # What comes next, in words.
-    moved_s: float  # Duration of the motion to the stop [s].
-    settled_s: float  # Duration of settling there [s].
-    worked_s: float  # Duration of everything else [s].
 
     @property
     def line(self) -> str:
@@ -124,7 +121,7 @@ class Capture:
                 self._check.why_not(state)
 
     def view(
-        self, number: int, place: int, count: int, moved_s: float, next_view: int | None = None
+        self, number: int, place: int, count: int, next_view: int | None = None
     ) -> CaptureEvent:
         """Takes a view at the arm's present pose.
 
@@ -132,7 +129,6 @@ class Capture:
             number: Number of the view.
             place: Number of the stop, from 1 on.
             count: Number of stops; 0 where it is not known.
-            moved_s: Duration of the motion to the stop [s].
             next_view: Number of the next planned one, 0 after the last; None where a person
                 chooses it.
 
@@ -140,8 +136,7 @@ class Capture:
             DriverError: A device fails, or the arm is stopped.
             DataError: The view cannot be written, or too many stops in a row gave none.
         """
-        start = self.cell.clock.now()
-        result, settled_s = take(self.cell, self.target, number, self.options)
+        result = take(self.cell, self.target, number, self.options)
         if isinstance(result, TakenView):
             disagreement = self._check.why_not(result.state)
             if disagreement:
@@ -151,7 +146,6 @@ class Capture:
                 self.coach.add(result.corners)
         taken = [view.number for view in self.journal.views]
         accuracy = None if self.prediction is None else self.prediction(taken)
-        worked_s = self.cell.clock.now() - start - settled_s
         advice = f"view {next_view}" if next_view else ""
         if next_view is None:
             advice = self.coach.advice()
@@ -160,12 +154,7 @@ class Capture:
             if predicted is not None and not predicted.is_open:
                 advice += f", for {figure(predicted.mm)} mm"
         covered = self.coach.words()
-        self.steps.append(
-            CaptureEvent(
-                *(number, place, count, result, covered, accuracy, advice),
-                *(moved_s, settled_s, worked_s),
-            )
-        )
+        self.steps.append(CaptureEvent(number, place, count, result, covered, accuracy, advice))
         for watcher in self.watchers:
             watcher.stepped(self.steps[-1])
         self._check_missed_in_a_row()
@@ -293,10 +282,10 @@ def record(
     with capture.halting():
         for index, stop in enumerate(remaining):
             path = checked_path(plan, stop, cell.joints())
-            moved_s = gate.move(path, f"to view {stop.view}", look)
+            gate.move(path, f"to view {stop.view}", look)
             place = len(plan.stops) - len(remaining) + index + 1
             next_view = remaining[index + 1].view if index + 1 < len(remaining) else 0
-            capture.view(stop.view, place, len(plan.stops), moved_s, next_view)
+            capture.view(stop.view, place, len(plan.stops), next_view)
     return capture.steps
 
 
@@ -338,7 +327,7 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
     with capture.halting():
         try:
             while not count or len(capture.journal.views) < count:
-                start, first = cell.clock.now(), cell.state()
+                first = cell.state()
                 while True:
                     cell.clock.sleep(_POLL_S)
                     state = cell.state()
@@ -347,8 +336,7 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
                     elif state.stamp_s - first.stamp_s >= still.quiet_s and is_new(state):
                         break
                 visited.append(state.base_from_flange)
-                moved_s = cell.clock.now() - start
-                step = capture.view(*capture.next_numbers(), count, moved_s)
+                step = capture.view(*capture.next_numbers(), count)
                 if isinstance(step.found, TakenView):
                     # The arm may have been moved on while the rest was waited for.
                     visited.append(step.found.state.base_from_flange)
@@ -409,5 +397,5 @@ def ask_and_take(
                 # End of a file of answers, or of poses.
                 break
             capture.cell = replace(cell, arm=held)
-            capture.view(number, place, count, 0.0)
+            capture.view(number, place, count)
     return capture.steps

@@ -85,35 +85,28 @@ class _StillFrame:
         return f"the image moved by {figure(motion_px)} px (limit {still.image_px:g})", motion_px
 
 
-def take(
-    cell: LiveCell, target: Target, view: int, options: CaptureOptions
-) -> tuple[TakenView | Missed, float]:
+def take(cell: LiveCell, target: Target, view: int, options: CaptureOptions) -> TakenView | Missed:
     """Takes a view once arm and image are still.
 
     In all frames image and arm must be where they were when the rest began; otherwise the frames
     are discarded, and the next rest is waited for.
 
-    Returns:
-        The view, or why there is none; and how long the first rest was waited for [s].
-
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
-    begun, settled_s, reason = cell.clock.now(), 0.0, ""
-    for attempt in range(_ROUNDS):
+    reason = ""
+    for _ in range(_ROUNDS):
         rest = _settled(cell, options)
-        if not attempt:
-            settled_s = cell.clock.now() - begun
         if isinstance(rest, Missed):
-            return rest, settled_s
+            return rest
         first, last = rest
         frames, motion_px, reason = [last], 0.0, ""
         while not reason and len(frames) < options.frames:
             frames.append(_StillFrame.of(cell))
             reason, motion_px = first.why_moved(frames[-1], options.still)
         if not reason:
-            return _selected(frames, target, view, motion_px), settled_s
-    return Missed(f"something moved during every exposure: {reason}"), settled_s
+            return _selected(frames, target, view, motion_px)
+    return Missed(f"something moved during every exposure: {reason}")
 
 
 def _settled(cell: LiveCell, options: CaptureOptions) -> tuple[_StillFrame, _StillFrame] | Missed:
