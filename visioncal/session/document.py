@@ -248,7 +248,7 @@ def read_declaration(
     try:
         declaration = Declaration.model_validate(dict(document))
     except ValidationError as error:
-        problems = list(_type_errors(error.errors()))
+        problems = [(_dotted(entry["loc"]), _error_message(entry)) for entry in error.errors()]
     else:
         problems = list(_contradictions(declaration, observed))
         hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
@@ -259,20 +259,6 @@ def read_declaration(
             next_step=" ".join(hints),
         )
     return declaration
-
-
-def _type_errors(errors: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
-    """Messages for pydantic's errors by dotted path; one for each wrongly nested list."""
-    nested: set[str] = set()
-    for entry in errors:
-        place = tuple(entry["loc"])
-        at = next((at for at, value in enumerate(place) if value in ("matrix", "distortion")), None)
-        if at is None or not isinstance(entry["input"], list):
-            yield _dotted(place), _error_message(entry)
-        elif (field := _dotted(place[: at + 1])) not in nested:
-            nested.add(field)
-            form = "fx, fy, cx, cy" if place[at] == "matrix" else "coefficients"
-            yield field, f"must be one list of {form}, without further brackets"
 
 
 def _dotted(location: Sequence[int | str]) -> str:

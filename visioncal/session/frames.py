@@ -139,11 +139,6 @@ class _DeclaredTree:
         known = [CELL, *self.frames, *self.fixtures]
         declared: dict[str, str] = {}
         for child, parent in self.declaration.frames.items():
-            if isinstance(parent, list | tuple) and len(parent) > 1:
-                on = " and ".join(map(str, parent))
-                raise _contradiction(
-                    f"{child} hangs on {on}, but a frame hangs on one other", child
-                )
             for frame in (child, parent):
                 if frame not in known:
                     what = f"{frame!r}" if frame == child else f"{child} hangs on {frame!r}, which"

@@ -174,10 +174,9 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         unknown = {view: name for view, name in named.items() if name and name not in declared}
         if unknown:
             view, name = next(iter(unknown.items()))
-            others = len(unknown) - 1
             raise DataError(
                 f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
-                f"declares {known}{f' ({others} more such rows)' if others else ''}.",
+                f"declares {known}.",
                 culprits=[f"views.csv: view {index}" for index in unknown],
                 next_step=did_you_mean(name, declared)
                 or f"Add [{kind}s.{name}], or correct the row.",
@@ -386,22 +385,9 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
         ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
     ):
         if with_image and declared is None:
-            for key, value in (declaration.model_extra or {}).items():
-                if key.lower()[:3] == field[:3] or did_you_mean(key, (field,)):
-                    raise DataError(
-                        f"session.toml: {key} is no known name; {field} is needed.",
-                        culprits=[f"session.toml: {key}"],
-                        next_step=f"In session.toml, replace {_as_written(key, value)} by "
-                        f"{_as_written(field, value)}.",
-                    )
             raise DataError(
                 f"session.toml: {field} is missing, but view {with_image[0].number} has "
                 f"{'an image' if with_image[0].image else 'rows in corners.csv'}.",
                 culprits=[f"session.toml: {field}"],
                 next_step=f"Add {example}.",
             )
-
-
-def _as_written(key: str, value: object) -> str:
-    """A key as written in session.toml: that of a table in brackets."""
-    return f"[{key}]" if isinstance(value, Mapping) else key

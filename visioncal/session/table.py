@@ -167,13 +167,6 @@ def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, .
     """
     columns = table.columns
     cols.check_header(columns, f"{table.label or 'views.csv'}, header")
-    if table.rows and not any(name.isdigit() for cell in table.rows[0] for name in cell):
-        raise DataError(
-            f"{table.place(0)} has no number, but {', '.join(table.rows[0])[:80]!r}: units or "
-            "names below the header?",
-            culprits=[table.place(0)],
-            next_step=f"Delete {table.place(0)}; the header is one line.",
-        )
     reader = TableReader(table)
     numbers = reader.read("view", as_whole, "a whole number")
     stops = reader.read("stop", as_whole)
@@ -301,15 +294,15 @@ def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
     far = [norm for norm in norms if norm > _FAR_M]
     if 2 * len(far) <= len(norms):
         return ""
-    size, share = float(np.median(far)), ""
-    if len(far) < len(norms):
-        share = f" in {len(far)} of {len(norms)} rows"
     unit = (
-        f"It looks like millimetres: multiply these columns by 0.001{share and ' there'}."
-        if size > _SURELY_MM
+        "It looks like millimetres: multiply these columns by 0.001."
+        if np.median(far) > _SURELY_MM
         else "Metres are needed, and these are inches, centimetres or millimetres."
     )
-    return f"views.csv: the median length of ({', '.join(names)}) is {size:.4g} m{share}. {unit}"
+    return (
+        f"views.csv: the median length of ({', '.join(names)}) is {np.median(far):.4g} m in "
+        f"{len(far)} of {len(norms)} rows. {unit}"
+    )
 
 
 def view_warnings(views: Sequence[View]) -> Iterator[str]:
