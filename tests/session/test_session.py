@@ -390,7 +390,7 @@ CSV_REFUSALS = [
     ('"first, ""dark"""', '"first', r"views\.csv, line 2"),
     (",note", ",", "column 13 has no name"),
     ("view,", "number,", "header: the column view, .*, is missing"),
-    ("note\n", "note\n-,,,,s,m,m,m,,,,,\n", "line 2 has no number, but .* below the header"),
+    ("note\n", "note\n-,,,,s,m,m,m,,,,,\n", "line 2, column view"),
 ]
 
 
