@@ -23,7 +23,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 # most of the time of writing a result. A module that looks at them says `DRAWS = True`.
 UNDRAWN = {
     "calibration", "cli", "core", "dynamics", "frames", "interchange", "live", "results", "session",
-    "simulation",
+    "simulation", "tests",
 }  # fmt: skip
 
 # The same examples everywhere, and none fails because a computer is busy.
@@ -96,14 +96,8 @@ def figures(request):
 @pytest.fixture
 def patient(monkeypatch) -> None:
     """Lets a UR's driver wait for a simulated controller as long as a busy computer makes it."""
-    for module, name in (
-        (ur, "_CALL_S"),
-        (ur, "_BEGIN_S"),
-        (ur_net, "_CONNECT_S"),
-        (ur_net, "_ANSWER_S"),
-        (ur_net, "_WAIT_S"),
-        (ur, "_SILENCE_S"),
-    ):
-        monkeypatch.setattr(module, name, 10.0)
+    for module, names in ((ur, "_CALL _BEGIN _SILENCE"), (ur_net, "_CONNECT _ANSWER _WAIT")):
+        for name in names.split():
+            monkeypatch.setattr(module, f"{name}_S", 10.0)
     monkeypatch.setattr(ur_net.Dashboard.__init__, "__defaults__", (10.0,))
     monkeypatch.setattr(ur, "_LEAST_HZ", 0.1)

@@ -109,9 +109,7 @@ def test_views_without_corners_keep_their_place():
     ("corners", "words"),
     [
         (SEEN[:2], r"^2 corners and 3 poses"),
-        (SEEN * 2, r"^6 corners and 3 poses"),
         ([SEEN[0], (SEEN[0][0][1:], SEEN[0][1]), SEEN[2]], r"corners\[1\]: 7 ids and .*\(8, 2\)"),
-        ([SEEN[0], (SEEN[0][0], SEEN[0][1].T), SEEN[2]], r"corners\[1\]: 8 ids and .*\(2, 8\)"),
         ([(np.arange(8) + 0.5, SEEN[0][1]), *SEEN[1:]], r"corners\[0\]: its ids are no whole"),
         ([(np.arange(8) + 99, SEEN[0][1]), *SEEN[1:]], r"^corners\[0\], ids\[0\]: .*no point 99"),
         (
@@ -119,10 +117,6 @@ def test_views_without_corners_keep_their_place():
             r"^corners\[1\], ids\[7\]: .*ids\[0\]",
         ),
         ([SEEN[0], (np.arange(8), SEEN[0][1] * np.nan), SEEN[2]], r"corners\[1\]: px\[0\].*7 more"),
-        (
-            [SEEN[0], (np.arange(8), SEEN[0][1] + np.inf), SEEN[2]],
-            r"corners\[1\]: px\[0\], of id 0",
-        ),
     ],
 )
 def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
@@ -139,7 +133,6 @@ def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
         (POSES * [[[1.05]] * 3 + [[1]]], r"\[0\] .* scaled by 1.05", "Divide"),
         ([POSES[0], 0.0 * POSES[0], POSES[0]], r"\[1\] .* entries are zero", "never filled"),
         ([POSES[0], POSES[0] * np.nan, POSES[0]], r"\[1\] .* not finite", "reported"),
-        ([POSES[0], POSES[0] + np.eye(4)[3], POSES[0]], r"\[1\] .* last row is", "0, 0, 0, 1"),
         ([POSES[0], POSES[0] + 0.1 * np.eye(4, k=1), POSES[0]], r"\[1\] .* right angles", "3 x 3"),
         (POSES[:, :3], r"\[0\] has the shape \(3, 4\)", ""),
     ],

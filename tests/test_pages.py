@@ -228,12 +228,8 @@ def test_the_front_page_shows_what_recipes_print():
     "words",
     [
         "calibrate session --neeed-mm 0.3",
-        "calibrate",
-        "correct targets.csv",
-        "simulate folder --board chess",
         "simulate folder --views many",
         "calibate session",
-        "export out --to ros extra",
     ],
 )
 def test_a_wrong_command_line_is_noticed(words):

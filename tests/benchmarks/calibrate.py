@@ -1,4 +1,4 @@
-"""Time of a whole calibration against detection alone with OpenCV, and of what surrounds it.
+"""Time of a whole calibration against detection alone with OpenCV.
 
 Both sides work on the same 40 five-megapixel images with the same number of threads, one after the
 other in turns. The peer reads each file and calls OpenCV's ChArUco detector. visioncal is the
@@ -21,17 +21,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from results import few, first, wished, write_section
-from support.cells import calibrated
+from results import few, wished, write_section
 
 import visioncal
-from visioncal.calibration.pipeline.result import result_of, view_evidence
-from visioncal.calibration.run import Run
-from visioncal.interchange.outputs import write_outputs
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 from visioncal.vision.boards.charuco import charuco_board
 
-VIEWS, MANY = few((40, 1000), (5, 10))
+VIEWS = few(40, 5)
 # As many as are wished on the command line.
 REPEATS = wished(3)
 THREADS = [name for name in (1, 2, 4) if name <= (os.cpu_count() or 1)]
@@ -89,7 +85,7 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
     files, board = sorted((session / "images").iterdir()), charuco_board(options.target)
     asked = "hand-eye" if level == "hand-eye" else "auto"
     rows = []
-    for threads in first(THREADS):
+    for threads in few(THREADS, THREADS[:1]):
         command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
         command += ["--threads", str(threads), "--level", asked]
         times = medians(
@@ -106,54 +102,6 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
     return rows
 
 
-def started() -> list[list[str]]:
-    """Processor time of what is typed first, over that of importing typer."""
-    python = [sys.executable, "-c"]
-    commands = {
-        "--version": [*COMMAND, "--version"],
-        "--help": [*COMMAND, "--help"],
-        "calibrate --help": [*COMMAND, "calibrate", "--help"],
-        "import typer": [*python, "import typer"],
-        "nothing": [*python, "pass"],
-    }
-    found = medians(*(lambda number=command: of_program(number) for command in commands.values()))[
-        :, 1
-    ]
-    *_, typer, _ = found
-    return [[name, f"{number:.2f}", f"{number / typer:.1f}"]
-            for name, number in zip(commands, found, strict=True)]  # fmt: skip
-
-
-def small(folder: Path) -> list[list[str]]:
-    """Processor time of a small session, by what is drawn."""
-    session = write_session(simulate(CellOptions(seed=1, views=few(20, 6))), folder / "small")
-    command = [*COMMAND, "calibrate", str(session), "-o", str(folder / "small_out")]
-    kinds = {
-        "all": [],
-        "--no-recording": ["--no-recording"],
-        "--no-report --no-recording": ["--no-report", "--no-recording"],
-    }
-    kinds = dict(first(list(kinds.items())))
-    found = medians(
-        *(lambda number=kind: of_program([*command, *number]) for kind in kinds.values())
-    )[:, 1]
-    return [[name, f"{number:.2f}"] for name, number in zip(kinds, found, strict=True)]
-
-
-def outputs(folder: Path) -> float:
-    """Processor time of report and recording of many views, a view [ms]."""
-    options = CellOptions(views=MANY, camera=fine_camera(), pixel_sigma_px=0.1)
-    known = calibrated(simulate(options))
-    done = Run(result_of(known), view_evidence(known))
-
-    def write() -> None:
-        # A result keeps its text once that is written.
-        fresh = replace(done, calibration=replace(done.calibration))
-        write_outputs(folder / "many", known.session, fresh)
-
-    return float(1e3 * medians(lambda: seconds(write))[0, 1] / MANY)
-
-
 def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join(
         "| " + " | ".join(group) + " |" for group in [head, ["---"] * len(head), *rows]
@@ -167,7 +115,7 @@ def main() -> None:
     ]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]
+        rows = [row for kind in few(kinds, kinds[:1]) for row in rows_of(*kind, folder)]
         text = (
             f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
             "interleaved runs, processor time of all threads together. The command includes "
@@ -179,11 +127,6 @@ def main() -> None:
                 "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
                 "API / OpenCV, wall"]  # fmt: skip
         text += f"\n\n{table(head, rows)}"
-        text += "\n\nProcessor time of the first commands:\n\n"
-        text += table(["", "s", "over import typer"], started())
-        text += "\n\nProcessor time of a small session, 20 views of 1280 x 800:\n\n"
-        text += table(["calibrate", "s"], small(folder))
-        text += f"\n\nReport and recording of {MANY} views: {outputs(folder):.1f} ms a view.\n"
     print(text)
     write_section(
         "A whole calibration", "PYTHONPATH=tests python tests/benchmarks/calibrate.py", text

@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
 from support import kept_answers, later, touched, wrong_arms
 from support.commands import QUATERNIONS, visioncal, write_poses, write_table
-from support.fuzz import mistakes, varied_cells
+from support.fuzz import mistakes, varied
 from support.paired import Outcome
 
 from visioncal.estimation.workspace import postures
@@ -258,16 +258,10 @@ EVERYTHING = {
 }
 
 
-def various(seed: int, folder: Path) -> Made | None:
+def various(seed: int, folder: Path) -> Made:
     """A rendered cell that nobody chose."""
-    cell = varied_cells.cell(seed)
-    session = varied_cells.write(cell, folder).folder
-
-    def judge(document, *_):
-        ways = [errors(document, truth) for truth in cell.turned()]
-        return min(ways, key=lambda way: way["nees"])
-
-    return Made(session, judge)
+    cell = varied.cell(seed)
+    return Made(varied.write(cell, folder), lambda document, *_: errors(document, cell.truth))
 
 
 def posed(folder: Path, mount: str, robot: np.ndarray, camera: np.ndarray, **more: object) -> Path:

@@ -14,19 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 
 import cv2
 import numpy as np
-from results import QUICK, few, first, write_section
+from results import QUICK, few, write_section
 from support.boards import aprilgrid, charuco, checkerboard, circles
 from support.rendered import Shot, photograph
 
-from visioncal.calibration.stages.detect import image_of
 from visioncal.core.types import FloatArray, Image, Target
-from visioncal.session import Session
 from visioncal.vision.boards import DetectedCorners, find_target, kind_of
-from visioncal.vision.targets import corner_positions
 
 PICTURES, REPEATS = few((2, 7), (1, 1))
 # Columns and rows of corners differ by an odd number: the checkerboard has one numbering.
@@ -36,16 +32,6 @@ CIRCLES = circles(5, 9, asymmetric=True, diameter_m=0.014)
 # What a side is in pixels: of tags and of rows of circles not all that squares are.
 SIDES = {"aprilgrid": (30, 50, 80), "circles": (12, 20, 40)}
 WINDOWS = (3, 5, 9)
-DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
-REAL = (
-    "ur_checkerboard_in_hand_1710",
-    "ur_checkerboard_in_hand_1716",
-    "ur_checkerboard_in_hand_1723",
-    "ur_checkerboard_in_hand_1734",
-    "kuka_checkerboard_in_hand",
-    "visp_franka_eye_in_hand",
-    "rendered_by_others_in_hand",
-)
 # Farther off, a corner counts as an outlier [px].
 OUTLIER_PX = 0.1
 
@@ -221,58 +207,6 @@ def speed() -> str:
     return "\n".join(lines)
 
 
-def of_others() -> str:
-    """What corners in other people's images leave, and how it follows the grid of the pixels.
-
-    Cameras with a colour mosaic sharpen pixels by turns: corners are then off by a wave of two
-    pixels' length. Each set of corners has its own lens, of five numbers of distortion.
-    """
-    lines = [
-        "| session | views | OpenCV: px, wave | template: px, wave | wave by chance |",
-        "| --- | ---: | ---: | ---: | ---: |",
-    ]
-    for name in first(REAL):
-        session = Session.load(DATA / name)
-        target, found = session.target, {"OpenCV": [], "template": []}
-        places = corner_positions(target).astype(np.float32)
-        for view in session.views:
-            image = image_of(session, view)
-            for kind, seen in zip(
-                found, (detected(image, target), find_target(image, target)), strict=True
-            ):
-                if isinstance(seen, DetectedCorners):
-                    found[kind].append((places[seen.ids], seen.px.astype(np.float32)))
-        size, cells = image.shape[::-1], []
-        for views in found.values():
-            noise, wave, chance = wave_px(views, size)
-            cells.append(f"{noise:.3f}, {wave:.4f}")
-        lines.append(f"| {name} | {len(views)} | {' | '.join(cells)} | {chance:.4f} |")
-    return "\n".join(lines)
-
-
-def wave_px(
-    views: list[tuple[FloatArray, FloatArray]], size: tuple[int, int]
-) -> tuple[float, float, float]:
-    """Root mean square of a coordinate's residuals, the wave's amplitude, and that by chance."""
-    objects, images = [item for item, _ in views], [item for _, item in views]
-    _, matrix, distortion, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None)
-    residuals = np.concatenate([
-        px - cv2.projectPoints(places, turn, shift, matrix, distortion)[0][:, 0]
-        for places, px, turn, shift in zip(objects, images, turns, shifts, strict=True)
-    ])  # fmt: skip
-    phase = np.pi * np.concatenate(images)
-    noise = float(np.sqrt(np.mean(residuals**2)))
-    # Corners that are wrong say nothing of a wave.
-    sound = np.all(np.abs(residuals) < 4.0 * 1.4826 * np.median(np.abs(residuals)), axis=1)
-    residuals, phase = residuals[sound], phase[sound]
-    waves = [
-        np.linalg.lstsq(np.stack([np.cos(angle), np.sin(angle)], axis=1), left, rcond=None)[0]
-        for angle, left in zip(phase.T, residuals.T, strict=True)
-    ]
-    wave = float(np.sqrt(np.sum(np.square(waves)) / len(waves)))
-    return noise, wave, 2.0 * float(np.std(residuals)) / len(residuals) ** 0.5
-
-
 def main() -> None:
     """Prints the tables and keeps them."""
     cv2.setNumThreads(1)
@@ -299,13 +233,6 @@ def main() -> None:
     )
     print(text, flush=True)
     text += f"\n\nImages of 2448 x 2048 px, median processor time of one thread:\n\n{speed()}\n"
-    if DATA.is_dir():
-        text += (
-            "\nImages from other sources: root mean square of a coordinate's residuals, with a "
-            "lens estimated from each set of corners, and the amplitude of their component "
-            "with a period of two pixels, which colour mosaics and sharpening cause:"
-            f"\n\n{of_others()}\n"
-        )
     write_section("Corners", "PYTHONPATH=tests python tests/benchmarks/corners.py", text)
 
 

@@ -446,7 +446,7 @@ def two_cameras(cell):
     ("mount", "seen", "motion"),
     [
         ("eye-in-hand", one_camera, "one_axis"),
-        ("eye-to-hand", one_camera, "translation"),
+        slow("eye-to-hand", one_camera, "translation"),
         slow("eye-to-hand", two_cameras, "one_axis"),
         slow("eye-to-hand", two_cameras, "translation"),
     ],

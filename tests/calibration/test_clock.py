@@ -126,7 +126,7 @@ def x_error(cell, result) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("seed", "mount", "ahead_s"),
-    [(2, "eye-to-hand", -0.61), (3, "eye-in-hand", 0.0)],
+    [(2, "eye-to-hand", -0.61), slow(3, "eye-in-hand", 0.0)],
 )
 def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     cell = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.marks import slow
 
 import visioncal
 from visioncal.core.errors import DataError
@@ -39,7 +40,7 @@ def renumbered(order, target, mount="eye-in-hand"):
     ("order", "target", "mount"),
     [
         (bottom_up, load_target("checkerboard_9x6_25mm"), "eye-to-hand"),
-        (by_column, SQUARE, "eye-in-hand"),
+        slow(by_column, SQUARE, "eye-in-hand"),
     ],
 )
 def test_numbers_that_turn_the_board_over_are_named(order, target, mount):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from support.commands import visioncal as run_command
+from support.marks import slow
 
 import visioncal
 
@@ -197,7 +198,7 @@ def test_an_autofocus_is_no_lens_that_changed_midway(tmp_path):
     assert first.words.startswith("The lens changes its focal length by")
 
 
-@pytest.mark.parametrize(("since", "size"), [(9, 1.01), (14, 25 / 30)])
+@pytest.mark.parametrize(("since", "size"), [slow(9, 1.01), (14, 25 / 30)])
 def test_a_board_that_was_exchanged_midway_is_no_thing_that_moved(tmp_path, size, since):
     stops = looks(19)
     stops[since:] = [replace(stop, size=size) for stop in stops[since:]]

@@ -11,14 +11,24 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.cells import known_of
 from support.commands import visioncal as visioncal_command
-from support.fuzz.mistakes import MISTAKES, OTHER, guessed, is_named, numbers, seen_in, sound
+from support.fuzz.mistakes import (
+    HALF_TURNS,
+    MISTAKES,
+    OTHER,
+    Poses,
+    numbers,
+    sound,
+)
 from support.marks import slow
 
 import visioncal
-from visioncal.calibration.guess import guess_reading
+from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.pipeline.guess_inputs import chain_poses
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation
@@ -28,8 +38,55 @@ from visioncal.interchange.formats import DoubtfulSession
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.simulation import CellOptions, project, simulate, wide_camera
+from visioncal.simulation import CellOptions, SimulatedCell, project, simulate, wide_camera
 from visioncal.vision.targets import corner_positions, load_target
+
+
+def measured(cell: SimulatedCell) -> RunState:
+    """What is known of a cell once the target's poses are."""
+    known = known_of(cell)
+    for stage in STAGES:
+        if stage.name in ("intrinsics", "pnp"):
+            known = stage.run(known)
+    return known
+
+
+def seen_in(cell: SimulatedCell) -> Poses:
+    """The poses of a simulated cell: the camera's are measured from corners, lens included."""
+    known = measured(cell)
+    views = sorted(known.poses)
+    camera = np.array([known.poses[view].cam_from_target[0] for view in views])
+    return sound(cell.robot.base_from_flange[views], camera, cell.options.mount)
+
+
+def guessed(poses: Poses) -> Guess:
+    """What the guess makes of the poses."""
+    return guess_reading(
+        poses.robot,
+        poses.camera,
+        poses.mount,
+        chain=poses.chain,
+        is_measured=poses.is_measured,
+    )
+
+
+def is_named(guess: Guess, poses: Poses) -> bool:
+    """Whether the right reading is named: it stands out and gives the true poses back.
+
+    They may differ by half turns of both frames where an axis was mirrored: no view tells which.
+    """
+    best = guess.best
+    if not guess.stands_out or best.hypothesis.mount != poses.true_mount:
+        return False
+    if not np.isclose(best.board_scale, poses.true_scale):
+        return False
+    found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
+    there = np.isfinite(true).all(axis=(1, 2))
+    turns = HALF_TURNS if best.hypothesis.robot.mirrored else HALF_TURNS[:1]
+    # Numbers are rewritten without loss, but for the rounding of a few conversions.
+    return any(
+        np.allclose(a @ found[there] @ b, true[there], atol=1e-7) for a in turns for b in turns
+    )
 
 
 @lru_cache(maxsize=2)
@@ -163,7 +220,7 @@ def of_tag(told, px):
     ).needing(20.0, None)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 4))])
 def test_inverse_poses_of_a_hobby_arm_are_the_first_cause_and_undone(seed, tmp_path):
     told, px = hobby_arm(seed)
     inverse = of_tag(invert(told), px)
@@ -396,7 +453,7 @@ def test_rotations_that_were_never_recorded_are_named(whole):
     assert "how the poses were recorded" in caught.value.next_step
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_positions_that_were_never_recorded_are_named(mount):
     poses = cell_poses(mount)
     told = poses.robot.poses()

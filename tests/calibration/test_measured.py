@@ -151,7 +151,7 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
 
 
 # Ten sigma, and so many that noise beside the priors would explain them.
-@pytest.mark.parametrize("off_m", [0.005, 0.04])
+@pytest.mark.parametrize("off_m", [slow(0.005), 0.04])
 def test_only_the_components_that_views_contradict_are_left_out(off_m):
     height = float(X[2, 3])
     prior = {"x_m": float(X[0, 3]) + off_m, "y_m": float(X[1, 3]) - off_m, "z_m": height}
@@ -239,7 +239,7 @@ def test_measured_distances_of_another_scale_are_named(mount, scale):
     assert factor == pytest.approx(scale, abs=4e-4)
 
 
-@pytest.mark.parametrize("seed", [0, 1, slow(2), slow(3)])
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2), slow(3)])
 def test_an_arm_that_is_off_is_no_board_of_another_size(seed):
     arm = CellOptions(views=10, dh_sigma_m=2e-3, seed=seed)
     verdict = calibrate(cell_session(simulate(arm), "measured", seen="poses")).verdict

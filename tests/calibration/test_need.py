@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import calibrated, reporting, showing
+from support.marks import slow
 from support.sound_findings import SOUND, changed, directions
 
 from visioncal.calibration.pipeline.judging import findings_of
@@ -60,7 +61,7 @@ def test_round_errors_have_the_closed_form() -> None:
     assert radius_within(np.zeros((1, 6, 6)), 0.95) == 0.0
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_picks_err_as_the_chain_does(mount: str) -> None:
     """Against errors that are drawn and put through the chain, by no slope of ours."""
     # Of this cell the images and the motion raise no doubt about the lens that is given.
@@ -160,7 +161,7 @@ def test_what_an_arm_does_again_moves_no_pick() -> None:
     )
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_errors_that_last_are_others_at_a_pick(mount: str) -> None:
     """Against drawn ones: those of the session move the fit, and a pick has its own."""
     known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))

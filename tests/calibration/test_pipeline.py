@@ -114,7 +114,7 @@ def test_a_matrix_off_by_many_of_its_sigmas_is_refined_without_its_prior_and_nam
     ("table", "is_refused"),
     [
         ({}, False),
-        ({"matrix_sigma_px": 6.0, "intrinsics": "hold"}, False),
+        slow({"matrix_sigma_px": 6.0, "intrinsics": "hold"}, False),
         ({"intrinsics": "refine"}, True),
     ],
     ids=["no prior", "held", "refined without a prior"],
@@ -156,7 +156,7 @@ def test_a_closed_form_is_diagnosed_too():
     assert noise[1] == pytest.approx(noise[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("solver", ["joint", "park"])
+@pytest.mark.parametrize("solver", ["joint", slow("park")])
 def test_views_held_back_may_be_ambiguous(solver):
     cell = simulate(AMBIGUOUS)
     told = session_of(cell)

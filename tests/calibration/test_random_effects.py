@@ -71,8 +71,8 @@ def effects_of(known):
     ("change", "kind", "true"),
     [
         (tilted, "base_tilts", TILT_RAD_M),
-        (crept, "base_creeps", np.array([0.0, 0.0, 0.0, 2e-4, -1e-4, 3e-4])),
-        (bent, "bracket_bends", None),
+        slow(crept, "base_creeps", np.array([0.0, 0.0, 0.0, 2e-4, -1e-4, 3e-4])),
+        slow(bent, "bracket_bends", None),
         (warmed, "lens_grows", np.array([1.5e-3])),
     ],
     ids=["tilt", "creep", "bracket", "lens"],
@@ -91,7 +91,7 @@ def test_what_grows_is_named_and_recovered(mount, change, kind, true):
     ("mount", "joints", "wrong_m"),
     [
         (MOUNTS[0], True, 0.0),
-        (MOUNTS[1], False, 0.0),
+        slow(MOUNTS[1], False, 0.0),
         (MOUNTS[0], False, 2e-4),
         slow(MOUNTS[1], False, 2e-4),
     ],

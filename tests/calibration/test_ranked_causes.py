@@ -326,7 +326,7 @@ def crosswise(rng):
 @pytest.mark.parametrize(
     ("mount", "mixed", "named"),
     [
-        ("eye-to-hand", lambda rng: rng.permutation(18), True),
+        slow("eye-to-hand", lambda rng: rng.permutation(18), True),
         # Where the other half is as it should be, that is not said.
         ("eye-in-hand", lambda rng: [*rng.permutation(9), *range(9, 18)], False),
         slow("eye-to-hand", crosswise, True),
@@ -384,7 +384,7 @@ def test_views_left_out_after_a_bump_name_it_before_the_errors_of_the_arm(mount,
     ("since", "which", "mount"),
     [
         (12, "tool", "eye-in-hand"),
-        (6, "base", "eye-to-hand"),
+        slow(6, "base", "eye-to-hand"),
     ],
 )
 def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named(mount, which, since):

@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.fuzz.copied import copied, session_of_kind
 from support.marks import slow
 from support.whole_cells import misfit
 
@@ -16,6 +15,49 @@ from visioncal.session import MemoryImages, Session, target_document
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE, pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import BOARDS, CellOptions, cell_session, read_cell, simulate
+from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
+
+_PLACES = tuple(f"{of}{axis}_m" for of in ("", "cft_", "meas_") for axis in "xyz")
+
+
+def copied(
+    session: Session, times: int, jitter_m: float = 0.0, *, seed: int = 0, interleaved: bool = False
+) -> Session:
+    """A session with every row so many times; all positions of the copies jitter.
+
+    Interleaved copies follow their rows; others follow the whole session.
+    """
+    rng, step = np.random.default_rng(seed), 1 + max(view.number for view in session.views)
+    views = []
+    for copy in range(times):
+        for at, view in enumerate(session.views):
+            moved = {
+                name: value + jitter_m * rng.standard_normal()
+                for name, value in view.numbers.items()
+                if copy and name in _PLACES
+            }
+            number = view.number + copy * step
+            row = replace(view, number=number, numbers={**view.numbers, **moved})
+            views.append(((at, copy) if interleaved else (copy, at), row))
+    table = session.corner_table
+    if table is not None:
+        table = CornerTable(
+            np.concatenate([table.views + copy * step for copy in range(times)]),
+            np.tile(table.points, times),
+            np.tile(table.px, (times, 1)),
+            table.targets * times,
+        )
+    rows = [row for _, row in sorted(views, key=lambda item: item[0])]
+    return Session.assemble(
+        session.document,
+        session.columns,
+        [[row.cell(column) for column in session.columns] for row in rows],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=table,
+    ).with_streams(session.streams)
+
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.
@@ -118,7 +160,7 @@ def one_image_a_stop():
     return calibrate(of_one_camera(1, stops=True)[1])
 
 
-@pytest.mark.parametrize(("stops", "trembling_m"), [(True, 2e-6), (False, 1e-5)])
+@pytest.mark.parametrize(("stops", "trembling_m"), [slow(True, 2e-6), (False, 1e-5)])
 def test_images_of_a_stop_share_the_robots_error(stops, trembling_m):
     cell, session = of_one_camera(6, stops=stops, trembling_m=trembling_m)
     found = calibrate(session)
@@ -191,7 +233,7 @@ def test_rows_of_a_cell_in_which_the_robot_stands_still_are_of_one_stop():
         assert other.edges[name].sigma_mm == pytest.approx(edge.sigma_mm, rel=1e-3), name
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, slow(3)])
 def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike(seed):
     """The bias is within the noise of one view, and clear in fourteen that count as one."""
     cell, session = of_a_cell(1, stops=True, seed=seed, bias_px=SIGMA_PX)
@@ -200,10 +242,23 @@ def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike(seed):
         assert off(cell, found, name) < 22.5, name
 
 
-def count_once(seed, times, jitter_m, *, interleaved):
-    _, session = session_of_kind(seed)
+KINDS = {
+    "poses": lambda: cell_session(simulate(CellOptions(views=12)), "cell", seen="poses"),
+    "corners": lambda: cell_session(
+        simulate(CellOptions(views=12, seed=3)), "cell", seen="corners"
+    ),
+    "readings": lambda: session_of(tracked(InstrumentOptions(stops=24, seed=18, points=THREE))),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "jitter_m", "interleaved"),
+    [("poses", 1e-4, False), ("corners", 0.0, True), slow("readings", 1e-4, True)],
+)
+def test_copies_of_rows_change_nothing(kind, jitter_m, interleaved):
+    session = KINDS[kind]()
     before = calibrate(session)
-    more = copied(session, times, jitter_m, seed=seed, interleaved=interleaved)
+    more = copied(session, 2, jitter_m, interleaved=interleaved)
     after = calibrate(more)
     assert before.edges.keys() == after.edges.keys()
     for name, edge in before.edges.items():
@@ -216,15 +271,6 @@ def count_once(seed, times, jitter_m, *, interleaved):
     originals = {view.number for view in session.views}
     assert originals.isdisjoint(found.views)
     assert originals.union(found.views) >= {view.view for view in after.views}
-
-
-@pytest.mark.parametrize(
-    ("seed", "jitter_m"),
-    [(0, 1e-4), (3, 0.0), slow(18, 1e-4)],
-)
-def test_copies_of_rows_change_nothing(seed, jitter_m):
-    """Poses with joints, poses alone, corners, points of a tracker."""
-    count_once(seed, 2, jitter_m, interleaved=bool(seed))
 
 
 def measured(rows):

@@ -10,6 +10,7 @@ import pytest
 from support.advice import printed_commands
 from support.commands import visioncal as typed
 from support.foreign_samples import easy_handeye_file
+from support.marks import slow
 from typer.testing import CliRunner
 
 import visioncal
@@ -114,7 +115,7 @@ def test_a_sound_session_is_not_accused_and_stays_what_it_is(cell, tmp_path):
     assert Session.load(tmp_path / "same").digest() == Session.load(cell).digest()
 
 
-@pytest.mark.parametrize("corners", [False, True], ids=["poses", "corners"])
+@pytest.mark.parametrize("corners", [slow(False), True], ids=["poses", "corners"])
 def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path, corners):
     cell = simulate(CellOptions(views=18, seed=3))
     flange, width = cell.robot.base_from_flange, cell.stated[""].resolution[0]

@@ -157,7 +157,7 @@ def printed_anew(cell, change):
     ("mount", "change", "words"),
     [
         (MOUNTS[0], np.diag([-5e-4, 5e-4, 0.0]), "longer along its y than along its x, by 0.1 %"),
-        (
+        slow(
             MOUNTS[1],
             [[0, 7.5e-4, 0], [7.5e-4, 0, 0], [0, 0, 0]],
             "rows and columns meet at 89.91",
@@ -188,7 +188,7 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused():
 @pytest.mark.parametrize(
     ("joints", "scale", "mount"),
     [
-        (True, 0.97, "eye-to-hand"),
+        slow(True, 0.97, "eye-to-hand"),
         (False, 0.97, "eye-in-hand"),
         slow(False, 1.01, "eye-to-hand"),
     ],

@@ -1,16 +1,56 @@
 """A fixture's frame from touches of its origin, x axis and xy plane."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest
-from support.parts import away, even, feature_bound, jacobian, placed, some_frame, some_touches
+from support.parts import away, even, jacobian, moved, pairs_of, placed, some_frame
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.estimation.pointfit import fit_features, fixture_problem
+from visioncal.core.types import FloatArray
+from visioncal.estimation.pointfit import PointPairs, fit_features, fixture_problem
 from visioncal.estimation.points import Placement, fit_groups
+
+
+def some_touches(rng: np.random.Generator, frame: FloatArray, kinds: Sequence[str]) -> PointPairs:
+    """Exact touches of a fixture's features, named 0, 1 ..."""
+    ranges = {
+        "origin": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+        "x": ([0.2, 0.0, 0.0], [0.4, 0.0, 0.0]),
+        "xy": ([-0.1, 0.1, 0.0], [0.3, 0.3, 0.0]),
+    }
+    local = np.array([rng.uniform(*ranges[kind]) for kind in kinds])
+    names = tuple(str(at) for at in range(len(kinds)))
+    return replace(
+        pairs_of(np.zeros_like(local), placed(frame, local)), labels=names, kinds=tuple(kinds)
+    )
+
+
+def feature_bound(frame: FloatArray, touches: PointPairs, sigma_m: float) -> FloatArray:
+    """Least covariance (6, 6) of a frame from touches with even noise.
+
+    Where a touch lies on the axis or in the plane is unknown beside the frame.
+    """
+    local = placed(np.linalg.inv(frame), touches.measured)
+    free = {"origin": 0, "x": 1, "xy": 2}
+    total = np.zeros((6, 6))
+    for point, kind in zip(local, touches.kinds, strict=True):
+        size = 6 + free[kind]
+
+        def touched(step, point=point):
+            return placed(
+                moved(frame, step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
+            )
+
+        by_step = jacobian(touched, size)[0] / sigma_m
+        whole = by_step.T @ by_step
+        across = whole[:6, 6:]
+        total += whole[:6, :6] - across @ np.linalg.solve(whole[6:, 6:], across.T)
+    return np.linalg.inv(total)
+
 
 NOISE_M = 1e-4
 ONE_EACH = ("origin", "x", "xy")

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from support.marks import slow
 
 from visioncal.estimation.group_outliers import distances, find_inlier_groups
 from visioncal.estimation.points import Groups, fit_groups
@@ -67,7 +68,7 @@ def test_exact_groups_give_the_exact_answer():
     assert fit.sigma < 1e-9
 
 
-@pytest.mark.parametrize("partial", [False, True])
+@pytest.mark.parametrize("partial", [slow(False), True])
 def test_the_covariance_is_the_scatter(partial):
     squared, levels = [], []
     for seed in range(200):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.cells import calibrated, error_of, reporting, showing
 from support.edges import inliers_of
+from support.marks import slow
 
 from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
@@ -73,7 +74,7 @@ def with_measured(problem, measured):
     return replace(problem, observations=replace(problem.observations, measured=measured))
 
 
-@pytest.mark.parametrize(("times", "measured"), [(2, True), (3, False)])
+@pytest.mark.parametrize(("times", "measured"), [slow(2, True), (3, False)])
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
     problem = looked_at_again(known.assessment.problem.with_effects([]), times)

@@ -12,7 +12,6 @@ from support.touched import (
     TIP,
     TURN,
     Job,
-    bound,
     error_of,
     relabelled,
     slipped,
@@ -116,8 +115,8 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
         *(slow(job) for job in (Job(noise=ROBOT), Job(tips=4, points=3))),
     ],
 )
-def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
-    squared, errors, least = [], [], []
+def test_error_and_covariance_agree(job):
+    squared = []
     for seed in range(30):
         made = touched(job, seed)
         fit = fit_pivot(made.touches, job.noise)
@@ -127,14 +126,10 @@ def test_error_and_covariance_agree_with_each_other_and_with_the_bound(job):
             error[3:] = fit.flange_from_tool[:3, 3] - TIP
         covariance = fit.covariance[np.ix_(free, free)]
         squared.append(error[free] @ np.linalg.solve(covariance, error[free]))
-        errors.append(error[3:] @ error[3:])
-        least.append(np.trace(bound(made)[3:, 3:]))
     size = len(free)
     # An F distribution over 24 degrees of freedom or more: 9 % over its size on average, and its
     # standard deviation is at most 1.2 sqrt(2 size); four standard errors of the mean.
     assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 30)
-    # The mean of 30 squared errors of three components: 15 % standard error, taken four times.
-    assert abs(np.mean(errors) / np.mean(least) - 1) < 0.6
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -10,19 +10,33 @@ from support.parts import (
     away,
     even,
     jacobian,
+    moved,
     noise_of,
     pairs_of,
     placed,
-    point_bound,
     some_drawing,
     some_frame,
-    uneven,
 )
 
 from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray
 from visioncal.estimation.pointfit import fit_points, fixture_problem
 from visioncal.estimation.points import Placement, fit_groups
 from visioncal.estimation.procrustes import align
+
+
+def uneven(rng: np.random.Generator, count: int) -> FloatArray:
+    """Covariances (n, 3, 3) of points that a camera saw: ten times worse along some direction."""
+    root = 5e-5 * np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    root[:, :, 0] *= 10.0
+    return root @ np.swapaxes(root, 1, 2)
+
+
+def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
+    """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
+    by_step = jacobian(lambda array: placed(moved(frame, array), nominal), 6)
+    return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
+
 
 NOISE_M = 1e-4
 

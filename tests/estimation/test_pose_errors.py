@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.marks import slow
 
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation.arm import SIGNIFICANT, misfit_covariance
@@ -56,7 +57,7 @@ def fitted(errors, seed, stops=22):
     return problem, fit_problem(problem, state)
 
 
-@pytest.mark.parametrize("errors", [white, lasting, drifting, smooth])
+@pytest.mark.parametrize("errors", [white, slow(lasting), slow(drifting), smooth])
 def test_errors_are_as_large_as_the_covariance_says(errors):
     before, after = [], []
     for seed in range(12):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated
+from support.marks import slow
 
 from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
@@ -82,7 +83,7 @@ def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
         np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=allowed)
 
 
-@pytest.mark.parametrize("views", [6, 20])
+@pytest.mark.parametrize("views", [6, slow(20)])
 def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom(views):
     # Corners know poses far better than the robot stands.
     problem, fit = answered(True, views=views, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)
@@ -100,7 +101,9 @@ def test_a_level_that_may_be_zero_is_expected_to_be_what_the_corners_hide():
     assert 1e-6 < expected < 1e-4
 
 
-@pytest.mark.parametrize("kind", ["one a stop", "two a stop", "places", "combined"])
+@pytest.mark.parametrize(
+    "kind", [slow("one a stop"), slow("two a stop"), slow("places"), "combined"]
+)
 def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
     problem, fit = answered(False, views=8, seed=6)
     seen = problem.observations
@@ -129,7 +132,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     assert found == pytest.approx(values, abs=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["one a stop", "two a stop", "combined"])
+@pytest.mark.parametrize("kind", [slow("one a stop"), slow("two a stop"), "combined"])
 def test_the_likelihood_of_levels_that_grow_together_is_that_of_each(kind):
     problem, fit = answered(True, views=8, seed=6)
     if kind == "two a stop":

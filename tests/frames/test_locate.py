@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,27 +14,64 @@ from support.imaged import Shot, calibrated_cell, picture, shots
 from support.imaged import session_of as pictured
 from support.later import ANYHOW, FITTED, lot
 from support.marks import slow
-from support.picks import (
-    before_camera,
-    calibration_of,
-    pick_by_plane,
-    pick_by_target,
-    seen_corners,
-    seen_point,
-    stand,
-)
+from support.picks import before_camera, calibration_of, seen_corners, seen_point, stand
 from support.refusals import raised
 from support.samples import fixture_frame
 
 from visioncal import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.results import Calibration, Edge, FrameFile, Verdict, to_document
 from visioncal.session import Session
-from visioncal.simulation import BOARDS, CellOptions, project, simulate, write_session
+from visioncal.simulation import (
+    BOARDS,
+    CellOptions,
+    SimulatedCell,
+    project,
+    simulate,
+    write_session,
+)
 from visioncal.vision.camera import intrinsics
+from visioncal.vision.targets import corner_positions
+
+
+@dataclass(frozen=True, eq=False)
+class Pick:
+    """The true place (3,) in the true base, what was found, and how long that took [s]."""
+
+    truth: FloatArray
+    located: Located
+
+
+def pick_by_plane(cell: SimulatedCell, calibration: Calibration, rng: np.random.Generator) -> Pick:
+    """A point of a plane that is declared, in half of the cases to 0.2 mm only."""
+    at = stand(cell, rng)
+    place, px = seen_point(cell, at, rng)
+    normal = -at.base_from_cam[:3, 2] + 0.4 * rng.standard_normal(3)
+    normal = normal / np.linalg.norm(normal)
+    sigma_m = float(rng.choice([0.0, 2e-4]))
+    declared = Plane.through(normal, place + sigma_m * rng.standard_normal() * normal, sigma_m)
+    (found,) = locate(calibration, px, declared, at.base_from_flange)
+    return Pick(place, found)
+
+
+def pick_by_target(
+    cell: SimulatedCell, calibration: Calibration, target: Target, rng: np.random.Generator
+) -> Pick:
+    """A point beside a target's middle, by the target's corners."""
+    at = stand(cell, rng)
+    cam_from_target = before_camera(cell, target, rng)
+    # What was printed differs from what is stated by as much as that is known to.
+    scale = 1.0 + target.square_sigma_m / target.square_m * rng.standard_normal()
+    corners = seen_corners(cell, cam_from_target, target, rng, scale)
+    point = corner_positions(target).mean(axis=0) + np.array([0.01, -0.02, 0.005])
+    found = locate_target(calibration, corners, target, at.base_from_flange, point)
+    base_from_target = at.base_from_cam @ cam_from_target
+    return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found)
+
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 BOARD = BOARDS["charuco"]
@@ -479,8 +516,8 @@ def test_one_image_needs_a_target_and_a_pose(cell, tmp_path):
     assert found["image"] == "shot.png"
     np.testing.assert_allclose(found["p_base_m"], same["p_base_m"], atol=1e-9)
     refused("--target is needed", "locate", image, calibration=calibration)
-    other = wanted | {"target": "checkerboard_9x6_25mm"}
-    refused(r"shot\.png: target checkerboard", "locate", **other, pose=pose)
+    other = wanted | {"target": "aprilgrid_6x4_32mm"}
+    refused(r"shot\.png: target aprilgrid", "locate", **other, pose=pose)
     if pose is not None:
         assert "--pose" in refused("robot's pose at the image is missing", "locate", **wanted)
 

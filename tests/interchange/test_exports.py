@@ -68,7 +68,9 @@ def test_what_is_read_back_is_the_transform(name, kind):
         tolerance = 2.1e-7
     for at, matrix in enumerate(poses(kind)):
         mount = ("eye-in-hand", "eye-to-hand")[at % 2]
-        assert off(export(calibration(matrix, mount), name), name, matrix) < tolerance
+        # What a lens would be warned of takes longer than all else.
+        found = calibration(matrix, mount, camera=None)
+        assert off(export(found, name), name, matrix) < tolerance
 
 
 @pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye", "easy-handeye2"}))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.live_cell import FakeClock
+from support.marks import slow
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers.protocols import CameraDevice
@@ -30,7 +31,7 @@ def errors_px(image, exact):
     return found.px[mine] - exact.px[theirs]
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
     cell = a_cell(mount=mount)
     scene, live = prepare_scene(cell), LiveView(cell)

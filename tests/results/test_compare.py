@@ -6,16 +6,49 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support.cells import reporting
 from support.commands import visioncal
 from support.marks import slow
-from support.pairs import calibrated_cell, halves, with_moved_board, with_moved_camera
+from support.picks import calibration_of
 from support.samples import made_up
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Camera
 from visioncal.results import Calibration, CameraResult, Edge, ViewResult
 from visioncal.results.compare import FALSE_ALARMS, compare, to_document
-from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
+
+
+def halves(cell: SimulatedCell) -> tuple[SimulatedCell, SimulatedCell]:
+    """Two cells with the same mountings: the first half of the views, and the second."""
+    middle = len(cell.corners) // 2
+    return cell.only(range(middle)), cell.only(range(middle, 2 * middle))
+
+
+def with_moved_camera(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
+    """The cell with its camera's edge moved on the right, its images as they were.
+
+    The robot stands where the moved camera sees what the camera saw before.
+    """
+    x, z = cell.transforms.values()
+    moved = x @ exp(twist)
+    if cell.options.mount == "eye-in-hand":
+        flanges = cell.robot.base_from_flange @ x @ invert(moved)
+    else:
+        flanges = moved @ invert(x) @ cell.robot.base_from_flange
+    return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": moved, "target": z})
+
+
+def with_moved_board(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
+    """The cell with its target's edge moved on the right, its images as they were."""
+    x, z = cell.transforms.values()
+    moved = z @ exp(twist)
+    if cell.options.mount == "eye-in-hand":
+        flanges = moved @ invert(z) @ cell.robot.base_from_flange
+    else:
+        flanges = cell.robot.base_from_flange @ z @ invert(moved)
+    return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": x, "target": moved})
+
 
 PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
@@ -31,7 +64,7 @@ def cells(mount, seed):
 @cache
 def pair(mount, seed):
     first, second = cells(mount, seed)
-    return calibrated_cell(first), calibrated_cell(second)
+    return calibration_of(first), calibration_of(second)
 
 
 @pytest.mark.slow
@@ -59,7 +92,7 @@ def test_a_camera_moved_by_five_sigma_is_found(mount):
     for seed in range(2):
         reference, second = pair(mount, seed)[0], cells(mount, seed)[1]
         sigma_m = 1e-3 * compare(*pair(mount, seed)).edges[0].sigma_mm
-        moved = calibrated_cell(with_moved_camera(second, 5 * sigma_m * SHIFT))
+        moved = calibration_of(with_moved_camera(second, 5 * sigma_m * SHIFT))
         comparison = compare(reference, moved)
         camera, board = comparison.edges
         assert camera.translation.is_change
@@ -71,7 +104,7 @@ def test_a_camera_moved_by_five_sigma_is_found(mount):
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_a_moved_board_is_no_moved_camera(mount):
-    moved = calibrated_cell(with_moved_board(cells(mount, 0)[1], 2e-3 * SHIFT))
+    moved = calibration_of(with_moved_board(cells(mount, 0)[1], 2e-3 * SHIFT))
     comparison = compare(pair(mount, 0)[0], moved)
     assert [edge.is_change for edge in comparison.edges] == [False, True]
     assert comparison.findings[0].startswith("The board was moved")
@@ -167,7 +200,7 @@ def test_a_calibration_does_not_differ_from_itself():
 def test_command_prints_to_stdout_and_ends_well_either_way(tmp_path):
     first, second = pair("eye-in-hand", 0)
     first.save(tmp_path / "calibration.json")
-    moved = calibrated_cell(with_moved_camera(cells("eye-in-hand", 0)[1], 2e-3 * SHIFT))
+    moved = calibration_of(with_moved_camera(cells("eye-in-hand", 0)[1], 2e-3 * SHIFT))
     moved.save(tmp_path / "moved.json")
     second.save(tmp_path / "same.json")
     for name, words in (("same", "No transform changed"), ("moved", "The camera moved")):

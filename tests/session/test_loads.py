@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.loaded import HUNG, NOMINAL, postures
+from support.loaded import HUNG, NOMINAL, loaded_postures
 from support.refusals import raised
 from support.tracked import known_of
 
@@ -56,11 +56,11 @@ def test_what_can_be_no_load_is_refused(cells, words):
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
     options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
     with pytest.raises(DegenerateError, match="views are all from one pose of the robot"):
-        known_of(hung(options, np.repeat(postures(1)[:1], 12, axis=0)))
+        known_of(hung(options, np.repeat(loaded_postures(1)[:1], 12, axis=0)))
 
 
 def test_views_of_one_stop_share_its_load():
-    session = hung(InstrumentOptions(robot=NOMINAL.name, payloads=HUNG), postures(6))
+    session = hung(InstrumentOptions(robot=NOMINAL.name, payloads=HUNG), loaded_postures(6))
     views = tuple(replace(view, stop=view.stop // 4) for view in session.views)
     with pytest.raises(DataError, match="views 0 and 1 are of stop 0 and differ in payload"):
         known_of(replace(session, views=views))

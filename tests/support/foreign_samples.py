@@ -58,6 +58,10 @@ def _write(path: Path, text: str) -> Path:
     return path
 
 
+def _in_hand(path: Path, text: str) -> Recording:
+    return Recording(_write(path, text), ImportOptions(mount="eye-in-hand"))
+
+
 def _keyed(row) -> str:
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     return "".join(f"{name}: {value!r}\n" for name, value in zip(names, row.tolist(), strict=True))
@@ -135,19 +139,9 @@ def easy_handeye(folder: Path) -> Recording:
     return Recording(source, ImportOptions(mount="eye-in-hand"))
 
 
-def moveit_yaml(folder: Path) -> Recording:
-    text = ""
-    for robot, camera in zip(BASE_FROM_FLANGE, CAM_FROM_TARGET, strict=True):
-        text += f"- effector_wrt_world: {robot.reshape(-1).tolist()}\n"
-        text += f"  object_wrt_sensor: {camera.reshape(-1).tolist()}\n"
-    return Recording(_write(folder / "samples.yaml", text), ImportOptions(mount="eye-in-hand"))
-
-
 def moveit_json(folder: Path) -> Recording:
     pairs = np.stack([BASE_FROM_FLANGE, CAM_FROM_TARGET], axis=1).tolist()
-    return Recording(
-        _write(folder / "pairs.json", json.dumps(pairs)), ImportOptions(mount="eye-in-hand")
-    )
+    return _in_hand(folder / "pairs.json", json.dumps(pairs))
 
 
 def views_json(folder: Path) -> Recording:
@@ -184,7 +178,7 @@ def opencv_matrices(folder: Path) -> Recording:
             data = ", ".join(map(repr, pose.reshape(-1).tolist()))
             text += f"{name}_{at}: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
             text += f"   data: [ {data} ]\n"
-    return Recording(_write(folder / "poses.yml", text), ImportOptions(mount="eye-in-hand"))
+    return _in_hand(folder / "poses.yml", text)
 
 
 def kuka_csv(folder: Path) -> Recording:
@@ -218,10 +212,6 @@ def _matrices_in_files(folder: Path, join: Callable[[np.ndarray], np.ndarray]) -
     return Recording(folder / "robot.csv", requested)
 
 
-def matrices_beside(folder: Path) -> Recording:
-    return _matrices_in_files(folder, np.hstack)
-
-
 def matrices_below(folder: Path) -> Recording:
     return _matrices_in_files(folder, np.vstack)
 
@@ -238,24 +228,21 @@ def numbered_yaml(folder: Path) -> Recording:
     for name, poses in both.items():
         rows = poses.reshape(-1, 16).tolist()
         text += f"{name}:\n" + "".join(f"  '{at}': {row}\n" for at, row in enumerate(rows, 1))
-    return Recording(_write(folder / "log.yml", text), ImportOptions(mount="eye-in-hand"))
+    return _in_hand(folder / "log.yml", text)
 
 
 def lettered_quaternions(folder: Path) -> Recording:
     """Records whose names say the unit and the order of quaternions."""
+    both = (quaternions(poses).tolist() for poses in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
     rows = [
         {
             "robot": {"position_m": robot[:3], "quaternion_wxyz": [robot[6], *robot[3:6]]},
             "target": {"position_m": target[:3], "quaternion_xyzw": target[3:]},
         }
-        for robot, target in zip(
-            quaternions(BASE_FROM_FLANGE).tolist(),
-            quaternions(CAM_FROM_TARGET).tolist(),
-            strict=True,
-        )
+        for robot, target in zip(*both, strict=True)
     ]
     document = json.dumps({"samples": rows})
-    return Recording(_write(folder / "log.json", document), ImportOptions(mount="eye-in-hand"))
+    return _in_hand(folder / "log.json", document)
 
 
 def printed_lists(folder: Path) -> Recording:
@@ -283,32 +270,19 @@ def headed_units(folder: Path) -> Recording:
 
 def ros_poses(folder: Path) -> Recording:
     """Two lists of messages."""
-    lists = {
-        name: [
+    lists = {}
+    for name, poses, place, turn in (
+        ("robot_poses", BASE_FROM_FLANGE, "position", "orientation"),
+        ("marker_transforms", CAM_FROM_TARGET, "translation", "rotation"),
+    ):
+        lists[name] = [
             {
-                first: dict(zip("xyz", quaternion[:3], strict=True)),
-                second: dict(zip("xyzw", quaternion[3:], strict=True)),
+                place: dict(zip("xyz", row, strict=False)),
+                turn: dict(zip("xyzw", row[3:], strict=True)),
             }
-            for quaternion in quaternions(poses).tolist()
+            for row in quaternions(poses).tolist()
         ]
-        for name, poses, first, second in (
-            ("robot_poses", BASE_FROM_FLANGE, "position", "orientation"),
-            ("marker_transforms", CAM_FROM_TARGET, "translation", "rotation"),
-        )
-    }
-    return Recording(
-        _write(folder / "log.json", json.dumps({"count": COUNT, **lists})),
-        ImportOptions(mount="eye-in-hand"),
-    )
-
-
-def numbers_first(folder: Path) -> Recording:
-    """Matrices and images of which the number stands first."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for at, pose in enumerate(BASE_FROM_FLANGE):
-        np.savetxt(folder / f"{at:03d}_pose.csv", pose, "%.17g")
-        picture(folder / f"{at:03d}_image.png")
-    return Recording(folder, ImportOptions(mount="eye-in-hand", target=CHARUCO))
+    return _in_hand(folder / "log.json", json.dumps({"count": COUNT, **lists}))
 
 
 def visp_seen(folder: Path) -> Recording:
@@ -334,21 +308,11 @@ def stacked_npz(folder: Path) -> Recording:
 
 
 def keyed_json(folder: Path) -> Recording:
+    angles = Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("xyz").tolist()
+    places = [dict(zip("xyz", place, strict=True)) for place in BASE_FROM_FLANGE[:, :3, 3].tolist()]
     rows = [
-        {
-            "robot_pose": {"position": dict(zip("xyz", value[:3], strict=True)), "rpy": value[3:]},
-            "b": b,
-        }
-        for value, b in zip(
-            np.hstack(
-                [
-                    BASE_FROM_FLANGE[:, :3, 3],
-                    Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("xyz"),
-                ]
-            ).tolist(),
-            invert(CAM_FROM_TARGET).tolist(),
-            strict=True,
-        )
+        {"robot_pose": {"position": place, "rpy": rpy}, "b": b}
+        for place, rpy, b in zip(places, angles, invert(CAM_FROM_TARGET).tolist(), strict=True)
     ]
     names = tuple(f"robot_pose.position.{name}" for name in "xyz")
     return Recording(
@@ -398,35 +362,14 @@ def separate_lens(folder: Path) -> Recording:
 
 
 RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
-    recording.__name__: recording
-    for recording in (
-        industrial,
-        kinematics,
-        visp,
-        zivid,
-        easy_handeye,
-        moveit_yaml,
-        moveit_json,
-        views_json,
-        views_npz,
-        opencv_matrices,
-        kuka_csv,
-        plain_table,
-        stacked_npz,
-        keyed_json,
-        images_and_table,
-        matrices_beside,
-        matrices_below,
-        matrices_in_rows,
-        numbered_yaml,
-        lettered_quaternions,
-        printed_lists,
-        headed_units,
-        ros_poses,
-        numbers_first,
-        visp_seen,
+    make.__name__: make
+    for make in (
+        industrial, kinematics, visp, zivid, easy_handeye, moveit_json, views_json,
+        views_npz, opencv_matrices, kuka_csv, plain_table, stacked_npz, keyed_json,
+        images_and_table, matrices_below, matrices_in_rows, numbered_yaml,
+        lettered_quaternions, printed_lists, headed_units, ros_poses, visp_seen,
     )
-}
+}  # fmt: skip
 
 # Those whose poses are not the world's, or are in several files.
 MORE_RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {

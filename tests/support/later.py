@@ -17,7 +17,7 @@ from visioncal.simulation.boards import corners_m
 
 # Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
 ANYHOW = replace(WRONG_LINKS, roll_rad=np.pi, branches=True)
-FITTED = 60
+FITTED = 40
 
 
 @dataclass(frozen=True, eq=False)

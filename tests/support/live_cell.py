@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from support.planned import true_cell
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, CameraMount, FloatArray
+from visioncal.estimation.problem_parts import Noise
 from visioncal.live.drivers.protocols import ArmState, Frame, Safety
 from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.plan import Stop
@@ -241,6 +241,29 @@ class FakeCamera:
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+def true_cell(options: CellOptions) -> PlanCell:
+    """The cell as it is, but for the arm's errors."""
+    x, z = simulate(replace(options, views=1, motion="free")).transforms.values()
+    return PlanCell(
+        options.mount,
+        load_robot(options.robot),
+        options.camera,
+        options.target,
+        x,
+        z,
+        0.0,
+        0.0,
+        Noise.of_robot(options.robot_sigma_rad, options.robot_sigma_m),
+        options.pixel_sigma_px,
+    )
+
+
+def postures_in_view(options: CellOptions, count: int) -> FloatArray:
+    """(k, n) random postures from which the simulated camera sees the whole board [rad]."""
+    free = replace(options, views=count, motion="free", branches=True, roll_rad=np.pi)
+    return simulate(replace(free, cut_views=0.0)).robot.joints
 
 
 def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand") -> PlanFile:

@@ -1,7 +1,6 @@
 """Parts with known places: points of a drawing and touches of features, with noise as asked for."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import expm
@@ -54,13 +53,6 @@ def even(count: int, sigma_m: float) -> FloatArray:
     return np.tile(sigma_m**2 * np.eye(3), (count, 1, 1))
 
 
-def uneven(rng: np.random.Generator, count: int) -> FloatArray:
-    """Covariances (n, 3, 3) of points that a camera saw: ten times worse along some direction."""
-    root = 5e-5 * np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-    root[:, :, 0] *= 10.0
-    return root @ np.swapaxes(root, 1, 2)
-
-
 def pairs_of(
     nominal: FloatArray, measured: FloatArray, covariances: FloatArray | None = None
 ) -> PointPairs:
@@ -75,50 +67,7 @@ def pairs_of(
     )
 
 
-def some_touches(rng: np.random.Generator, frame: FloatArray, kinds: Sequence[str]) -> PointPairs:
-    """Exact touches of a fixture's features, named 0, 1 ..."""
-    ranges = {
-        "origin": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
-        "x": ([0.2, 0.0, 0.0], [0.4, 0.0, 0.0]),
-        "xy": ([-0.1, 0.1, 0.0], [0.3, 0.3, 0.0]),
-    }
-    local = np.array([rng.uniform(*ranges[kind]) for kind in kinds])
-    names = tuple(str(at) for at in range(len(kinds)))
-    return replace(
-        pairs_of(np.zeros_like(local), placed(frame, local)), labels=names, kinds=tuple(kinds)
-    )
-
-
 def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
     """Derivatives (..., size) of a function of (size,) numbers at zero, by central differences."""
     steps = _STEP * np.eye(size)
     return np.stack([(function(step) - function(-step)) / (2 * _STEP) for step in steps], axis=-1)
-
-
-def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
-    """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
-    by_step = jacobian(lambda array: placed(moved(frame, array), nominal), 6)
-    return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
-
-
-def feature_bound(frame: FloatArray, touches: PointPairs, sigma_m: float) -> FloatArray:
-    """Least covariance (6, 6) of a frame from touches with even noise.
-
-    Where a touch lies on the axis or in the plane is unknown beside the frame.
-    """
-    local = placed(np.linalg.inv(frame), touches.measured)
-    free = {"origin": 0, "x": 1, "xy": 2}
-    total = np.zeros((6, 6))
-    for point, kind in zip(local, touches.kinds, strict=True):
-        size = 6 + free[kind]
-
-        def touched(step, point=point):
-            return placed(
-                moved(frame, step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
-            )
-
-        by_step = jacobian(touched, size)[0] / sigma_m
-        whole = by_step.T @ by_step
-        across = whole[:6, 6:]
-        total += whole[:6, :6] - across @ np.linalg.solve(whole[6:, 6:], across.T)
-    return np.linalg.inv(total)

@@ -10,10 +10,8 @@ import numpy as np
 from support.cells import calibrated
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp
 from visioncal.core.types import Corners, FloatArray, Target
-from visioncal.frames.camera_chain import Plane
-from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.results import Calibration
 from visioncal.simulation import SimulatedCell, project, rays
 from visioncal.simulation.boards import Sheet, corners_m
@@ -28,44 +26,9 @@ class Stand:
     base_from_cam: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Pick:
-    """The true place (3,) in the true base, what was found, and how long that took [s]."""
-
-    truth: FloatArray
-    located: Located
-
-
 def calibration_of(cell: SimulatedCell, **changes) -> Calibration:
     """The result that the session of a simulated cell gives."""
     return result_of(calibrated(cell, **changes))
-
-
-def pick_by_plane(cell: SimulatedCell, calibration: Calibration, rng: np.random.Generator) -> Pick:
-    """A point of a plane that is declared, in half of the cases to 0.2 mm only."""
-    at = stand(cell, rng)
-    place, px = seen_point(cell, at, rng)
-    normal = -at.base_from_cam[:3, 2] + 0.4 * rng.standard_normal(3)
-    normal = normal / np.linalg.norm(normal)
-    sigma_m = float(rng.choice([0.0, 2e-4]))
-    declared = Plane.through(normal, place + sigma_m * rng.standard_normal() * normal, sigma_m)
-    (found,) = locate(calibration, px, declared, at.base_from_flange)
-    return Pick(place, found)
-
-
-def pick_by_target(
-    cell: SimulatedCell, calibration: Calibration, target: Target, rng: np.random.Generator
-) -> Pick:
-    """A point beside a target's middle, by the target's corners."""
-    at = stand(cell, rng)
-    cam_from_target = before_camera(cell, target, rng)
-    # What was printed differs from what is stated by as much as that is known to.
-    scale = 1.0 + target.square_sigma_m / target.square_m * rng.standard_normal()
-    corners = seen_corners(cell, cam_from_target, target, rng, scale)
-    point = corner_positions(target).mean(axis=0) + np.array([0.01, -0.02, 0.005])
-    found = locate_target(calibration, corners, target, at.base_from_flange, point)
-    base_from_target = at.base_from_cam @ cam_from_target
-    return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found)
 
 
 def stand(cell: SimulatedCell, rng: np.random.Generator) -> Stand:
@@ -124,17 +87,6 @@ def seen_corners(
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     px = px[ids] + cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
     return Corners(0, ids, px, cell.options.blur_px)
-
-
-def corners_at(
-    cell: SimulatedCell,
-    at: Stand,
-    base_from_target: FloatArray,
-    target: Target,
-    rng: np.random.Generator,
-) -> Corners:
-    """The noisy corners of a target that stands in the base."""
-    return seen_corners(cell, invert(at.base_from_cam) @ base_from_target, target, rng)
 
 
 def _distances(cell: SimulatedCell) -> tuple[float, float]:

@@ -3,7 +3,6 @@
 import sys
 from pathlib import Path
 
-import numpy as np
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
 from visioncal.live.capture.cell import LiveCell
@@ -13,7 +12,6 @@ from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import CaptureEvent, Watcher, record
 from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.plan_file import PlanFile
-from visioncal.session import Session
 
 # A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.
 REPEATABILITY_M = 5e-5
@@ -53,19 +51,6 @@ def recorded(
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
     cell = LiveCell(arm, (camera,), arm.clock)
     return record(cell, plan, journal, options, Consent(None), watchers)
-
-
-def errors_m(session: Session, camera: FakeCamera) -> list[float]:
-    """How far each view's pose is from where the flange was at its exposure [m]."""
-    found = []
-    for view in session.views:
-        stamp = view.stamp_s - camera.arm.clock.unix_offset_s()
-        at = min(camera.exposures, key=lambda exposure: abs(exposure - stamp))
-        # Stamps are written to the microsecond.
-        assert abs(at - stamp) < 2e-6
-        away = camera.exposures[at][:3, 3] - view.base_from_flange().as_matrix()[:3, 3]
-        found.append(float(np.linalg.norm(away)))
-    return found
 
 
 class _Acknowledged:

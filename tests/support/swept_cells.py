@@ -16,7 +16,7 @@ from visioncal.simulation import (
 AHEAD_S = 0.037
 # At its stops it takes no image.
 SIDE = CameraAt("side", place_m=(0.9, 0.1, 1.3), at_stops=False)
-HOW = Swept("side", "b", "plate_b", camera_minus_robot_s=AHEAD_S, frames_hz=30.0)
+HOW = Swept("side", "b", "plate_b", camera_minus_robot_s=AHEAD_S, frames_hz=20.0)
 
 
 def cell_of(options: NetworkOptions, how: Swept = HOW) -> SimulatedCell:

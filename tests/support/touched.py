@@ -1,6 +1,5 @@
-"""Touches of a simulated tool, and their Cramer-Rao bound, by arithmetic of their own."""
+"""Touches of a simulated tool, by arithmetic of their own."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,41 +82,6 @@ def error_of(flange_from_tool: np.ndarray) -> np.ndarray:
     """How far off an answer is: (6,) rotation [rad] and translation [m] in the tool's frame."""
     turn = (TURN.inv() * Rotation.from_matrix(flange_from_tool[:3, :3])).as_rotvec()
     return np.concatenate([turn, TURN.inv().apply(flange_from_tool[:3, 3] - TIP)])
-
-
-def bound(made: Made) -> np.ndarray:
-    """Least covariance (6, 6) of rotation and tip, in the tool's frame, by central differences."""
-    job, kinds, which = made.job, made.touches.kinds, made.touches.points
-    size = 6 + 3 * job.points
-    sigmas = np.repeat([*job.noise.robots[0], job.contact_m], 3)
-    place = POINTS[which] - made.truly.apply(TURN.apply(made.reached) + TIP)
-
-    def seen(change: np.ndarray, slack: np.ndarray) -> np.ndarray:
-        """Where all touches have their points in the tool: (n, 3)."""
-        point = POINTS[which] + change[6:].reshape(-1, 3)[which] + slack[6:]
-        rotation = made.truly * Rotation.from_rotvec(slack[:3])
-        tool = TURN * Rotation.from_rotvec(change[:3])
-        tip = TIP + TURN.apply(change[3:6])
-        away = rotation.inv().apply(point - place - made.truly.apply(slack[3:6])) - tip
-        return tool.inv().apply(away)
-
-    jacobian = _jacobian(lambda array: seen(array, np.zeros(9)), size)
-    slacks = _jacobian(lambda array: seen(np.zeros(size), array), 9)
-    rows = {"point": [0, 1, 2], "z": [0, 1], "xz": [1]}
-    information = np.zeros((size, size))
-    for at, kind in enumerate(kinds):
-        slope, by_slack = jacobian[at][rows[kind]], slacks[at][rows[kind]] * sigmas
-        information += slope.T @ np.linalg.solve(by_slack @ by_slack.T, slope)
-    free = np.arange(0 if job.axes else 3, size)
-    least = np.zeros((size, size))
-    least[np.ix_(free, free)] = np.linalg.inv(information[np.ix_(free, free)])
-    return least[:6, :6]
-
-
-def _jacobian(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
-    # Small enough for central differences to be exact to 1e-9, large enough for rounding.
-    steps = 1e-5 * np.eye(size)
-    return np.stack([(function(step) - function(-step)) / 2e-5 for step in steps], axis=-1)
 
 
 def _reach(kind: str, rng: np.random.Generator) -> np.ndarray:

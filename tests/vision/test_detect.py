@@ -7,15 +7,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from support.fuzz.varied_arms import placed
-from support.fuzz.varied_images import Lens, Light, Print, draw
 
 from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
-from visioncal.core.types import Target
+from visioncal.core.transforms import compose, exp
+from visioncal.core.types import Camera, Target
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
+from visioncal.simulation import (
+    BOARDS,
+    CellOptions,
+    prepare_scene,
+    project,
+    render,
+    simulate,
+)
+from visioncal.simulation.render import light_on
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.boards.imaging import blur_at_corners, decode_image
@@ -187,22 +193,26 @@ def test_another_layout_than_declared_is_named(charuco, declared):
     assert "correct columns, rows, and legacy" in refused.value.next_step
 
 
+def seen_by_a_fisheye(target, turn, depth_m, resolution, *matrix):
+    """An image of a board before a wide lens, and where its corners are."""
+    camera = Camera("fisheye", resolution, np.array(matrix), np.zeros(4))
+    options = CellOptions(camera=camera, target=target, views=1, image_noise=0.0)
+    middle = 0.5 * target.square_m * np.array([target.columns, target.rows, 0.0])
+    pose = compose(turn := exp(np.array([*turn, 0, 0, 0]))[:3, :3], [0, 0, depth_m] - turn @ middle)
+    light = light_on(prepare_scene(simulate(options)), pose)
+    exact = project(camera, corner_positions(target) @ pose[:3, :3].T + pose[:3, 3])
+    return light.astype(np.uint8), exact
+
+
 @pytest.mark.parametrize("declared", [{}, {"columns": 18}, {"legacy": True}])
 def test_a_large_board_that_a_wide_lens_bends_is_judged_by_neighbours(declared):
-    board = {"kind": "charuco", "columns": 20, "rows": 10, "square_m": 0.03, "marker_m": 0.02}
-    printed = Print(board | {"dictionary": "DICT_5X5_250"}, 0.03)
-    lens = Lens("fisheye", (1024, 768), np.array([520.0, 519.0, 503.0, 378.0]), np.zeros(4))
-    turn = Rotation.from_rotvec([0.5, 0.4, 0.6])
-    pose = placed(np.array([0.0, 0.0, 0.35]) - turn.apply(printed.centre), turn)
-    image = np.full((768, 1024), 120.0, np.float32)
-    draw(image, lens, printed, pose, Light(30, 210, 120, 0.7, 1.0), 40.0)
     target = Target("wide", "charuco", 20, 10, 0.03, 3e-5, 0.02, "DICT_5X5_250")
-    seen = find_target(image.astype(np.uint8), replace(target, **declared))
+    image, exact = seen_by_a_fisheye(target, [0.5, 0.4, 0.6], 0.35, (1024, 768), 520, 519, 503, 378)
+    seen = find_target(image, replace(target, **declared))
     if declared:
         assert isinstance(seen, NotFound)
         assert seen.misfit
     else:
-        exact = lens.project(printed.corners @ pose[:3, :3].T + pose[:3, 3])
         # Wrong numbering would be off by a square.
         assert np.abs(seen.px - exact[seen.ids]).max() < 2.0
 

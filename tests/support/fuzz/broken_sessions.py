@@ -28,11 +28,9 @@ _CELL = replace(CellOptions(), views=15, seed=11)
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake, and what the first sentence about it has to name."""
+    """A mistake; without one, the cell itself is one, or nothing is wrong."""
 
-    plant: Callable[[Path], None]  # Breaks a sound session's folder.
-    # Words (a regular expression) of which one tells the cause; - where all is to be well.
-    names: str
+    plant: Callable[[Path], object] = lambda _: None  # Breaks a sound session's folder.
     options: CellOptions = _CELL  # What the cell is otherwise like.
     joints: bool = False  # Whether its table has joint angles, and its session.toml a robot.
 
@@ -45,8 +43,9 @@ def _rendered(options: CellOptions) -> TemporaryDirectory:
     return made
 
 
-def sound_session(folder: Path, mistake: Mistake) -> Path:
+def sound_session(folder: Path, mistake: Mistake | None = None) -> Path:
     """Writes the session into which a mistake is planted."""
+    mistake = mistake or Mistake()
     shutil.copytree(Path(_rendered(mistake.options).name) / "session", folder)
     if not mistake.joints:
         edit(folder, lambda text: text.replace('[robot]\nmodel = "ur10e"\ntip = "flange"\n', ""))
@@ -150,11 +149,11 @@ def _renamed(names: Mapping[str, str]) -> Callable[[Path], None]:
     return lambda folder: edit_rows(folder, changed)
 
 
-def _moved_cells(names: tuple[str, ...], order: Callable[[int], list[int]]) -> Callable[..., None]:
-    """Puts cells of some columns into other rows."""
+def _moved_cells(order: Callable[[int], list[int]]) -> Callable[..., None]:
+    """Puts poses into other rows."""
 
     def changed(rows: Rows) -> Rows:
-        cells = [{name: row[name] for name in names} for row in rows]
+        cells = [{name: row[name] for name in (*POSITION, *QUATERNION)} for row in rows]
         return [row | cells[index] for row, index in zip(rows, order(len(rows)), strict=True)]
 
     return lambda folder: edit_rows(folder, changed)
@@ -202,6 +201,10 @@ def _images(
     return planted
 
 
+def _smaller(image: np.ndarray) -> np.ndarray:
+    return cv2.resize(image, (960, 600), interpolation=cv2.INTER_AREA)
+
+
 def _deleted(folder: Path) -> None:
     for name in ("004.png", "009.png"):
         (folder / "images" / name).unlink()
@@ -211,10 +214,6 @@ def _as_jpg(folder: Path) -> None:
     for file in (folder / "images").iterdir():
         cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
         file.unlink()
-
-
-def _elsewhere(folder: Path) -> None:
-    (folder / "images").rename(folder / "frames")
 
 
 def _board(**changes: object) -> Callable[[Path], None]:
@@ -244,10 +243,6 @@ def _board(**changes: object) -> Callable[[Path], None]:
     return planted
 
 
-def _poor(**changes: object) -> CellOptions:
-    return replace(_CELL, **changes)
-
-
 def _tilted(angle: float) -> np.ndarray:
     turned = np.eye(4)
     turned[:3, :3] = Rotation.from_euler("xyz", [angle, 0.3, 0.2]).as_matrix()
@@ -255,127 +250,81 @@ def _tilted(angle: float) -> np.ndarray:
     return turned
 
 
-def _nothing(_: Path) -> None:
-    """The cell itself is the mistake."""
-
-
-def _few(folder: Path) -> None:
-    edit_rows(folder, lambda rows: rows[:2])
-
-
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
+# The mistakes by name; of those with a `Mistake`, the cell differs.
 BROKEN: Mapping[str, Mistake] = {
-    # The poses.
-    "positions in millimetres": Mistake(scaled(POSITION, 1e3), "positions in mm"),
-    "the other mount": Mistake(_toml("eye-in-hand", "eye-to-hand"), "mount"),
-    "quaternion with w first": Mistake(
-        _rotations(lambda value: value.as_quat()[:, [3, 0, 1, 2]]), "w, x, y, z"
-    ),
-    "Euler angles in degrees in quaternion columns": Mistake(
-        _rotations(lambda value: value.as_euler("ZYX", degrees=True)), "Euler"
-    ),
-    "Euler angles in radians in quaternion columns": Mistake(
-        _rotations(lambda value: value.as_euler("xyz")), "Euler"
-    ),
-    "rotation vectors in quaternion columns": Mistake(
-        _rotations(lambda value: value.as_rotvec()), "rotation vector"
-    ),
-    "columns rx, ry, rz": Mistake(_rotation_vectors, "rx,ry,rz"),
-    "columns x, y, z": Mistake(_renamed({"x_m": "x", "y_m": "y", "z_m": "z"}), "x,y,z"),
-    "inverse poses": Mistake(_poses(np.linalg.inv), "inverse"),
-    "a left-handed frame": Mistake(
-        _poses(lambda array: _MIRROR @ array @ _MIRROR), "handed|mirror"
-    ),
-    "rows shifted by one": Mistake(
-        _moved_cells((*POSITION, *QUATERNION), lambda n: [*range(1, n), 0]), "one row"
-    ),
-    "two rows exchanged": Mistake(_moved_cells((*POSITION, *QUATERNION), _swapped), "disagree"),
-    "the same pose in all rows": Mistake(
-        _moved_cells((*POSITION, *QUATERNION), lambda n: [0] * n), "one position"
-    ),
-    "one pose typed wrong": Mistake(_cell("z_m", (6,), "0.9"), "view 6"),
-    "poses of the tool": Mistake(
-        _poses(lambda array: array @ _tilted(0.4)), "tool|flange", joints=True
-    ),
-    "poses in base_link": Mistake(
-        _poses(lambda array: np.diag([-1.0, -1.0, 1.0, 1.0]) @ array),
-        "base_link|turned|180",
-        joints=True,
-    ),
-    "joint angles in degrees": Mistake(
-        scaled(tuple(f"q{index}_rad" for index in range(1, 7)), 180 / np.pi),
-        "degrees",
-        joints=True,
-    ),
-    "another robot": Mistake(_toml('"ur10e"', '"ur5e"'), "ur10e|ur5e|model", joints=True),
-    # The table.
-    "semicolons": Mistake(_text(lambda name: name.replace(",", ";")), "-"),
-    "decimal commas": Mistake(_text(_german), "-"),
-    "a byte-order mark": Mistake(_bytes(lambda name: name.encode("utf-8-sig")), "-"),
-    "UTF-16": Mistake(_bytes(lambda name: name.encode("utf-16")), "UTF-16|UTF-8"),
-    "empty rows": Mistake(
-        _text(lambda name: name + "," * name.splitlines()[0].count(",") + "\n"), "-"
-    ),
-    "no number (NaN)": Mistake(_cell("x_m", (5,), "nan"), "view 5|line 7"),
-    "a view's number twice": Mistake(_cell("view", (5,), "4"), "already|twice"),
-    "an image twice": Mistake(_cell("image", (5,), "images/004.png"), "view 5"),
-    # session.toml.
-    "[cam] for [camera]": Mistake(_toml("[camera]", "[cam]"), "cam"),
-    "a misspelt board": Mistake(_toml("charuco_9x6_30mm", "charuco_9x6_30"), "charuco_9x6_30mm"),
-    "eye_in_hand": Mistake(_toml("eye-in-hand", "eye_in_hand"), "eye-in-hand"),
-    "width and height exchanged": Mistake(
-        lambda folder: edit(folder, lambda name: name.replace("1280,\n    800", "800,\n    1280")),
-        "resolution|1280 x 800",
-    ),
-    "the lens of other images": Mistake(
-        _images(lambda array: cv2.resize(array, (960, 600), interpolation=cv2.INTER_AREA)),
-        "960 x 600",
-    ),
-    "images turned clockwise": Mistake(
-        _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_CLOCKWISE)),
-        "resolution",
-    ),
-    "images turned counterclockwise": Mistake(
-        _images(lambda array: cv2.rotate(array, cv2.ROTATE_90_COUNTERCLOCKWISE)),
-        "resolution",
-    ),
-    "the lens of larger images": Mistake(
-        lambda folder: (
-            _images(lambda array: cv2.resize(array, (960, 600), interpolation=cv2.INTER_AREA))(
-                folder
-            ),
+    name: plant if isinstance(plant, Mistake) else Mistake(plant)
+    for name, plant in {
+        # The poses.
+        "positions in millimetres": scaled(POSITION, 1e3),
+        "the other mount": _toml("eye-in-hand", "eye-to-hand"),
+        "quaternion with w first": _rotations(lambda value: value.as_quat()[:, [3, 0, 1, 2]]),
+        "Euler angles in degrees in quaternion columns": _rotations(
+            lambda value: value.as_euler("ZYX", degrees=True)
+        ),
+        "Euler angles in radians in quaternion columns": _rotations(
+            lambda value: value.as_euler("xyz")
+        ),
+        "rotation vectors in quaternion columns": _rotations(lambda value: value.as_rotvec()),
+        "columns rx, ry, rz": _rotation_vectors,
+        "columns x, y, z": _renamed({"x_m": "x", "y_m": "y", "z_m": "z"}),
+        "inverse poses": _poses(np.linalg.inv),
+        "a left-handed frame": _poses(lambda array: _MIRROR @ array @ _MIRROR),
+        "rows shifted by one": _moved_cells(lambda n: [*range(1, n), 0]),
+        "two rows exchanged": _moved_cells(_swapped),
+        "the same pose in all rows": _moved_cells(lambda n: [0] * n),
+        "one pose typed wrong": _cell("z_m", (6,), "0.9"),
+        "poses of the tool": Mistake(_poses(lambda array: array @ _tilted(0.4)), joints=True),
+        "poses in base_link": Mistake(
+            _poses(lambda array: np.diag([-1.0, -1.0, 1.0, 1.0]) @ array), joints=True
+        ),
+        "joint angles in degrees": Mistake(
+            scaled(tuple(f"q{index}_rad" for index in range(1, 7)), 180 / np.pi), joints=True
+        ),
+        "another robot": Mistake(_toml('"ur10e"', '"ur5e"'), joints=True),
+        # The table.
+        "semicolons": _text(lambda text: text.replace(",", ";")),
+        "decimal commas": _text(_german),
+        "a byte-order mark": _bytes(lambda text: text.encode("utf-8-sig")),
+        "UTF-16": _bytes(lambda text: text.encode("utf-16")),
+        "empty rows": _text(lambda text: text + "," * text.splitlines()[0].count(",") + "\n"),
+        "no number (NaN)": _cell("x_m", (5,), "nan"),
+        "a view's number twice": _cell("view", (5,), "4"),
+        "an image twice": _cell("image", (5,), "images/004.png"),
+        # session.toml.
+        "[cam] for [camera]": _toml("[camera]", "[cam]"),
+        "a misspelt board": _toml("charuco_9x6_30mm", "charuco_9x6_30"),
+        "eye_in_hand": _toml("eye-in-hand", "eye_in_hand"),
+        "width and height exchanged": _toml("1280,\n    800", "800,\n    1280"),
+        "the lens of other images": _images(_smaller),
+        "images turned clockwise": _images(lambda it: cv2.rotate(it, cv2.ROTATE_90_CLOCKWISE)),
+        "images turned counterclockwise": _images(
+            lambda it: cv2.rotate(it, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        ),
+        "the lens of larger images": lambda folder: (
+            _images(_smaller)(folder),
             _toml("1280,\n    800", "960,\n    600")(folder),
         )[0],
-        "lens|matrix|intrinsics|focal",
-    ),
-    # The images and the board.
-    "two images missing": Mistake(_deleted, "images/004.png|missing|two images|2 of 15"),
-    "images named .jpg": Mistake(_as_jpg, "missing"),
-    "images in another folder": Mistake(_elsewhere, "missing"),
-    "another kind of board": Mistake(
-        _board(kind="checkerboard", columns=8, rows=5), "ChArUco|charuco"
-    ),
-    "another size of board": Mistake(_board(columns=7, rows=5), "9 x 6|columns = 9"),
-    "another dictionary": Mistake(_board(dictionary="DICT_6X6_250"), "DICT_5X5"),
-    "another layout of markers": Mistake(_board(legacy=True), "legacy"),
-    "squares in millimetres": Mistake(_board(square_m=30.0, marker_m=22.0), "millimetre|30 m"),
-    "squares of another size": Mistake(_board(square_m=0.036, marker_m=0.0264), "board|square"),
-    "one image upside down": Mistake(
-        _images(lambda array: cv2.rotate(array, cv2.ROTATE_180), lambda at: at == 7), "view 7"
-    ),
-    "mirrored images": Mistake(_images(lambda array: array[:, ::-1]), "mirror"),
-    "blurred images": Mistake(
-        _images(lambda array: cv2.GaussianBlur(array, (0, 0), 9.0)),
-        "blurred",
-    ),
-    # The motion.
-    "two views": Mistake(_few, "2 views|views"),
-    "turns about one axis": Mistake(_nothing, "turn about", options=_poor(motion="one_axis")),
-    "no turns": Mistake(_nothing, "turn|rotat", options=_poor(motion="translation")),
-    "too little motion": Mistake(
-        _nothing,
-        "turn|motion|tilt",
-        options=_poor(tilt_rad=(0.0, 0.01), roll_rad=0.01),
-    ),
+        # The images and the board.
+        "two images missing": _deleted,
+        "images named .jpg": _as_jpg,
+        "images in another folder": lambda folder: (folder / "images").rename(folder / "frames"),
+        "another kind of board": _board(kind="checkerboard", columns=8, rows=5),
+        "another size of board": _board(columns=7, rows=5),
+        "another dictionary": _board(dictionary="DICT_6X6_250"),
+        "another layout of markers": _board(legacy=True),
+        "squares in millimetres": _board(square_m=30.0, marker_m=22.0),
+        "squares of another size": _board(square_m=0.036, marker_m=0.0264),
+        "one image upside down": _images(
+            lambda it: cv2.rotate(it, cv2.ROTATE_180), lambda at: at == 7
+        ),
+        "mirrored images": _images(lambda it: it[:, ::-1]),
+        "blurred images": _images(lambda it: cv2.GaussianBlur(it, (0, 0), 9.0)),
+        # The motion.
+        "two views": lambda folder: edit_rows(folder, lambda rows: rows[:2]),
+        "turns about one axis": Mistake(options=replace(_CELL, motion="one_axis")),
+        "no turns": Mistake(options=replace(_CELL, motion="translation")),
+        "too little motion": Mistake(options=replace(_CELL, tilt_rad=(0.0, 0.01), roll_rad=0.01)),
+    }.items()
 }

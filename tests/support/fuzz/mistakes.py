@@ -4,15 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from support.cells import known_of
 
-from visioncal.calibration.guess import Guess, guess_reading
-from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount
-from visioncal.simulation import SimulatedCell
 
 OTHER: Mapping[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
 HALF_TURNS = [np.diag([*pair, 1.0]) for pair in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
@@ -50,53 +45,6 @@ def numbers(poses: FloatArray, rotation: str = "quaternion-xyzw", unit: str = "m
 def sound(robot: FloatArray, camera: FloatArray, mount: Mount, **more) -> Poses:
     """Poses that are told as they are."""
     return Poses(numbers(robot), numbers(camera), mount, robot, mount, **more)
-
-
-def measured(cell: SimulatedCell) -> RunState:
-    """What is known of a cell once the target's poses are."""
-    known = known_of(cell)
-    for stage in STAGES:
-        if stage.name in ("intrinsics", "pnp"):
-            known = stage.run(known)
-    return known
-
-
-def seen_in(cell: SimulatedCell) -> Poses:
-    """The poses of a simulated cell: the camera's are measured from corners, lens included."""
-    known = measured(cell)
-    views = sorted(known.poses)
-    camera = np.array([known.poses[view].cam_from_target[0] for view in views])
-    return sound(cell.robot.base_from_flange[views], camera, cell.options.mount)
-
-
-def guessed(poses: Poses) -> Guess:
-    """What the guess makes of the poses."""
-    return guess_reading(
-        poses.robot,
-        poses.camera,
-        poses.mount,
-        chain=poses.chain,
-        is_measured=poses.is_measured,
-    )
-
-
-def is_named(guess: Guess, poses: Poses) -> bool:
-    """Whether the right reading is named: it stands out and gives the true poses back.
-
-    They may differ by half turns of both frames where an axis was mirrored: no view tells which.
-    """
-    best = guess.best
-    if not guess.stands_out or best.hypothesis.mount != poses.true_mount:
-        return False
-    if not np.isclose(best.board_scale, poses.true_scale):
-        return False
-    found, true = best.hypothesis.robot_numbers(poses.robot).poses(), poses.true_robot
-    there = np.isfinite(true).all(axis=(1, 2))
-    turns = HALF_TURNS if best.hypothesis.robot.mirrored else HALF_TURNS[:1]
-    # Numbers are rewritten without loss, but for the rounding of a few conversions.
-    return any(
-        np.allclose(a @ found[there] @ b, true[there], atol=1e-7) for a in turns for b in turns
-    )
 
 
 def _told(poses: Poses, rotation: str, unit: str, reading: Reading) -> Poses:
