@@ -97,10 +97,15 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     notes = list(foreign.notes)
-    paths = _image_paths(foreign.images, foreign.name, notes)
+    if foreign.store is None:
+        paths = _image_paths(foreign.images, foreign.name, notes)
+    else:
+        paths = ["" if path is None else path.as_posix() for path in foreign.images]
     files = {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
     rows = _view_rows(foreign, paths)
-    if files:
+    if foreign.lenses:
+        document["cameras"] = {name: dict(lens) for name, lens in foreign.lenses.items()}
+    elif files:
         document["camera"] = _camera(foreign, list(files.values()))
     target = foreign.target if files else None
     if target is not None:
@@ -112,17 +117,19 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         document,
         names,
         cells,
-        FileImages(files) if files else MemoryImages({}),
+        foreign.store or (FileImages(files) if files else MemoryImages({})),
         target_document=target,
         robot_document=robot,
     )
     stream = foreign.stream
     if stream is not None:
-        poses = pose_cells(stream.poses, session_columns.POSE)
-        numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in poses])
-        values = np.hstack([stream.stamps_s[:, None], numbers])
+        rows = pose_cells(stream.poses, session_columns.POSE)
+        numbers = [[float(row.get(name, "nan")) for name in session_columns.POSE] for row in rows]
+        q = np.zeros((len(rows), 0)) if stream.joints_rad is None else stream.joints_rad
+        values = np.hstack([stream.stamps_s[:, None], np.array(numbers), q])
         values.setflags(write=False)
-        columns = ("stamp_s", *session_columns.POSE)
+        joints = (f"q{at + 1}_rad" for at in range(q.shape[1]))
+        columns = ("stamp_s", *session_columns.POSE, *joints)
         session = session.with_streams({"robot": Stream(columns, values)})
     elif foreign.joints_rad is None and not foreign.robot.present.all():
         missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.present)]
@@ -253,7 +260,8 @@ def _extra_columns(foreign: ForeignRecording) -> dict[str, tuple[str, ...]]:
     reserved |= {*session_columns.joint_columns(tuple(foreign.columns))}
     columns: dict[str, tuple[str, ...]] = {}
     for name, cells in foreign.columns.items():
-        unique = name if _is_meant(name, cells) else f"source_{name}"
+        is_meant = (name == "camera" and foreign.lenses) or _is_meant(name, cells)
+        unique = name if is_meant else f"source_{name}"
         while unique in reserved or unique in columns:
             unique = f"source_{unique}"
         columns[unique] = cells
@@ -308,6 +316,9 @@ def _image_bytes(file: Path) -> bytes:
 
 def _robot(foreign: ForeignRecording, document: dict[str, Any]) -> dict[str, Any] | None:
     """Reads and checks the robot's model, and names it in the document."""
+    if foreign.arm is None and foreign.robot_document is not None:
+        document["robot"] = {"model": "robot.urdf", "tip": foreign.robot_document["tip"]}
+        return dict(foreign.robot_document)
     if foreign.arm is None:
         return None
     arm = {name: str(value) for name, value in foreign.arm.items()}

@@ -8,7 +8,8 @@ from typing import Any, Self
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.core.types import FloatArray, IntArray, Mount
+from visioncal.core.types import FloatArray, IntArray, Mount, Progress
+from visioncal.session import ImageStore
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,8 @@ class ImportOptions:
     resolution: tuple[int, int] | None = None  # (width, height) [px].
     robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
     tip: str | None = None  # The frame that the poses are of.
+    # Called during long reading.
+    progress: Progress | None = field(default=None, compare=False, repr=False)
 
     def with_poses(self, robot: PoseImportOptions, camera: PoseImportOptions) -> Self:
         """These options over what a source states of its poses."""
@@ -97,6 +100,7 @@ class ForeignStream:
 
     stamps_s: FloatArray  # (k,) times [s], ascending.
     poses: PoseNumbers  # (k,) `base_from_flange`.
+    joints_rad: FloatArray | None = None  # (k, j) joint angles [rad], NaN in a row without.
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +113,7 @@ class ForeignRecording:
     camera: PoseNumbers | None = None
     # (n,) the image of each row; None in a row without one, empty where there are none.
     images: tuple[Path | None, ...] = ()
+    store: ImageStore | None = None  # Where these are, if they are no files.
     # (n, j) joint angles [rad], NaN in a row without; None where they were not recorded.
     joints_rad: FloatArray | None = None
     stamps_s: FloatArray | None = None  # (n,) times [s]; None where they were not recorded.
@@ -117,6 +122,10 @@ class ForeignRecording:
     target: Mapping[str, Any] | None = None
     # The fields of `[camera]` in session.toml, where the source has intrinsics.
     lens: Mapping[str, Any] | None = None
+    # The same of `[cameras.NAME]`, of several.
+    lenses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # The robot's description, where the source holds it; see `Robot.from_document`.
+    robot_document: Mapping[str, Any] | None = None
     # The fields of `[robot]` in session.toml, where the user names a robot.
     arm: Mapping[str, Any] | None = None
     views: tuple[int, ...] = ()  # (n,) the rows' numbers in the source; 0, 1, ... where empty.

@@ -11,10 +11,12 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import did_you_mean
 from visioncal.interchange.formats.assemble import assemble, with_user_options
+from visioncal.interchange.formats.bags import BAG
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.file_search import files_in
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KINEMATICS, MOVEIT
+from visioncal.interchange.formats.lerobot import LEROBOT
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
@@ -28,6 +30,8 @@ from visioncal.session.selecting import check_one_of_each
 
 # The first that recognises a path reads it, so the least specific come last.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
+    BAG,
+    LEROBOT,
     HAND_EYE,
     KINEMATICS,
     VISP,

@@ -1,0 +1,128 @@
+"""Bags of ROS and data sets of LeRobot become sessions that calibrate to the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.bags import FORMS, BagOptions, write_bag
+from support.lerobot import write_dataset
+
+from visioncal import calibrate
+from visioncal.calibration.stages.motion import motion_of
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import pose_difference
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert
+from visioncal.session import Session
+
+BOARD = ImportOptions(target="charuco_9x6_30mm")
+LENS = {"matrix": [914.2, 913.6, 645.3, 396.8], "distortion": [-0.1, 0.06, 0.0, 0.0, 0.0]}
+
+
+@pytest.fixture(scope="module")
+def source(rendered) -> Session:
+    session = Session.load(rendered)
+    document = session.document | {"camera": session.document["camera"] | LENS}
+    return replace(session, document=document, views=session.views[:6])
+
+
+def bag(path: Path, source: Session, rendered: Path, **options) -> Path:
+    return write_bag(path, source, rendered, BagOptions(**options))
+
+
+def pixels(store, path):
+    return cv2.imdecode(np.frombuffer(store.read(path), np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+@pytest.mark.parametrize(
+    ("form", "options"),
+    [
+        *((form, {}) for form in FORMS),
+        ("mcap", {"is_compressed": True, "camera_late_s": 0.05, "jitter_s": 0.01}),
+    ],
+)
+def test_a_bag_is_the_session_that_it_was_made_of(form, options, source, rendered, tmp_path):
+    path = bag(tmp_path / ("b.bag" if form == "ros1" else "b"), source, rendered, form=form,
+               is_compressed=options.pop("is_compressed", False), **options)  # fmt: skip
+    said = []
+    asked = replace(BOARD, progress=lambda *each: said.append(each))
+    session = convert(path, tmp_path / "out", requested=asked)
+    assert session.mount == "eye-in-hand"
+    assert said[-1][1] == said[-1][2]
+    assert session.declaration.camera.matrix == LENS["matrix"]
+    assert len(session.views) == len(source.views)
+    flange = motion_of(session, None, "robot").flange
+    late_s = options.get("camera_late_s", 0.0)
+    for view, meant in zip(session.views, source.views, strict=True):
+        assert np.array_equal(
+            pixels(session.images, view.image), pixels(source.images, meant.image)
+        )
+        pose = flange.at(np.array([view.stamp_s - late_s]))[0]
+        away = pose_difference(pose, meant.base_from_flange().as_matrix())
+        # Written stamps have a tenth of a microsecond, and quaternions sixteen digits.
+        assert max(away) < 1e-6
+
+
+def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, is_compressed=True, names=("left", "right"))
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert list(session.cameras) == ["left_camera", "right_camera"]
+    only = replace(BOARD, image="/left/camera/image_raw/compressed")
+    assert not convert(path, tmp_path / "one", requested=only).declaration.cameras
+
+
+@pytest.mark.parametrize(
+    ("options", "message", "step"),
+    [
+        ({"without": ("/tf",)}, "does not say where the robot was", "--robot-columns"),
+        ({"without": ("/camera/image_raw/compressed",)}, "no topic has images", "ros2 bag record"),
+        ({"poses": "pose"}, "how the camera is mounted is not known", "--mount"),
+    ],
+)
+def test_what_a_bag_lacks_is_said(options, message, step, source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, is_compressed=True, **options)
+    with pytest.raises(DataError, match=message) as caught:
+        convert(path, tmp_path / "out", requested=BOARD)
+    assert step in caught.value.next_step
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_of_a_topic_and_frames_are_named(source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, is_compressed=True, poses="pose")
+    asked = replace(BOARD, mount="eye-in-hand")
+    session = convert(path, tmp_path / "out", requested=asked)
+    assert len(session.views) == len(source.views)
+    frames = bag(tmp_path / "frames", source, rendered, is_compressed=True)
+    wrong = replace(BOARD, robot=PoseImportOptions(("base_link", "tool1")))
+    with pytest.raises(DataError, match="no 'tool1'") as caught:
+        convert(frames, tmp_path / "none", requested=wrong)
+    assert "tool0" in caught.value.next_step
+
+
+def test_a_damaged_bag_is_refused(source, rendered, tmp_path):
+    path = bag(tmp_path / "b.bag", source, rendered, form="ros1", is_compressed=True)
+    path.write_bytes(path.read_bytes()[:100_000])
+    with pytest.raises(DataError, match="cannot be read as a bag"):
+        convert(path, tmp_path / "out", requested=BOARD)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_data_set_of_lerobot_calibrates(version, source, rendered, tmp_path):
+    path = write_dataset(tmp_path / "set", source, rendered, version, "ur10e_follower")
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert session.declaration.robot.model == "ur10e"
+    assert len(session.views) == len(source.views)
+    q = np.array([view.joints_rad for view in session.views])
+    assert np.abs(q - [view.joints_rad for view in source.views]).max() < 1e-4
+    transform = calibrate(session, level="hand-eye").transforms["flange_from_cam"]
+    meant = calibrate(source, level="hand-eye").transforms["flange_from_cam"]
+    # A video's compression moves corners by some hundredths of a pixel.
+    assert pose_difference(transform.as_matrix(), meant.as_matrix())[0] < 0.5
+
+
+def test_a_data_set_without_its_large_files_is_refused(source, rendered, tmp_path):
+    path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
+    next((path / "data").rglob("*.parquet")).write_text("version https://git-lfs.github.com")
+    with pytest.raises(DataError, match="cannot be read as parquet"):
+        convert(path, tmp_path / "out", requested=BOARD)

@@ -1,0 +1,564 @@
+"""Bags of ROS 1 and ROS 2 (sqlite3 and MCAP), read without ROS by rosbags (extra `ros`).
+
+Images, CameraInfo, JointState, TF, PoseStamped and /robot_description are read by their types. The
+robot's motion becomes a stream on its own clock; where the arm stood, one frame a stop becomes a
+view, else frames of the whole sweep. Images are read from the bag when they are stored, one by one:
+memory does not grow with the bag.
+"""
+
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from visioncal.calibration.stages.motion import is_standing_still
+from visioncal.core.conventions import PoseNumbers
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.transforms import invert, log
+from visioncal.core.types import FloatArray, Mount
+from visioncal.estimation.clock_correlation import evenly
+from visioncal.estimation.trajectory import Trajectory
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ForeignStream,
+    ImportOptions,
+)
+from visioncal.interchange.formats.intrinsics import intrinsics_from
+from visioncal.robot import Robot
+from visioncal.session.images import ImageStore
+
+# A message, or a reader of these: their classes are made from the bag's own definitions.
+Message: TypeAlias = Any
+Reader: TypeAlias = Any
+_ENDINGS = (".bag", ".mcap", ".db3")
+# Frames of a robot that are preferred where TF has several, by what they are.
+_BASES = ("base_link", "base", "panda_link0", "fr3_link0", "link_base", "link_0", "world")
+_TIPS = ("tool0", "flange", "panda_link8", "fr3_link8", "link_eef", "ee_link", "tcp")
+# Fewest stops that make a recording one of stops, and most frames of a sweep.
+_FEWEST_STOPS, _MOST_FRAMES = 5, 600
+# Frames are of another stop where the flange has moved by this [rad, m].
+_MOVED = 1e-3
+# Conversions of raw images to what an image file holds, by encoding.
+_COLOURS: Mapping[str, int | None] = {
+    **dict.fromkeys(("mono8", "8UC1", "mono16", "16UC1", "bgr8", "8UC3"), None),
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+    "yuv422": cv2.COLOR_YUV2BGR_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """The images of one topic."""
+
+    is_compressed: bool
+    frame: str  # The camera's frame in TF.
+    size: tuple[int, int]  # (width, height) [px].
+    stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
+    received_ns: "array[int]" = field(default_factory=lambda: array("q"))
+
+
+@dataclass(frozen=True, eq=False)
+class _Contents:
+    """All that a bag says of one cell, by topic; images by their times alone."""
+
+    images: dict[str, _Images] = field(default_factory=dict)
+    lenses: dict[str, Any] = field(default_factory=dict)  # The first CameraInfo.
+    # Times, and positions by the joints' names.
+    joints: dict[str, dict[tuple[str, ...], "array[float]"]] = field(default_factory=dict)
+    poses: dict[str, "array[float]"] = field(default_factory=dict)  # Time and seven numbers a row.
+    # The same of `parent_from_child`; those at rest have one row.
+    moving: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
+    still: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
+    descriptions: list[str] = field(default_factory=list)
+
+    @cached_property
+    def parents(self) -> dict[str, str]:
+        """The parent of each frame of TF."""
+        return {child: parent for parent, child in (*self.still, *self.moving)}
+
+    def chain(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on to the root of TF."""
+        names = [frame]
+        while (parent := self.parents.get(names[-1])) is not None and parent not in names:
+            names.append(parent)
+        return names
+
+
+@dataclass(frozen=True, eq=False)
+class BagImages(ImageStore):
+    """Images in a bag, by their paths in the session."""
+
+    source: Path
+    # The topic, whether it is compressed, and the time of receipt [ns], by path.
+    places: Mapping[str, tuple[str, bool, int]]
+
+    def read(self, path: str) -> bytes:
+        """Reads one image: as it was compressed, or as a PNG."""
+        if path not in self.places:
+            raise DataError(f"The bag has no image {path}.", culprits=[path])
+        topic, is_compressed, at_ns = self.places[path]
+        with _opened(self.source) as reader:
+            connections = [each for each in reader.connections if each.topic == topic]
+            rows = reader.messages(connections=connections, start=at_ns, stop=at_ns + 1)
+            connection, _, raw = next(iter(rows))
+            message = reader.deserialize(raw, connection.msgtype)
+            return bytes(message.data) if is_compressed else _png(message, topic)
+
+    def absence(self, path: str) -> str:
+        """Why there is no such image; empty where there is one."""
+        return "" if path in self.places else "is missing"
+
+
+@contextmanager
+def _opened(source: Path) -> Iterator[Reader]:
+    """An open reader of a bag of any form.
+
+    Raises:
+        DataError: The extra is not installed, or the bag cannot be read.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise DataError(
+            f"{source} is a bag of ROS, and rosbags, which reads it, is not installed.",
+            culprits=[str(source)],
+            next_step="Install it (no ROS is needed): pip install 'visioncal[ros]'",
+        ) from error
+    paths = sorted(source.glob("*.bag")) if source.is_dir() else [source]
+    try:
+        # Bags of old versions of ROS 2 do not hold the definitions of their messages.
+        types = get_typestore(Stores.ROS2_HUMBLE)
+        with AnyReader(paths or [source], default_typestore=types) as reader:
+            yield reader
+    except VisioncalError:
+        raise
+    # A damaged bag raises whatever its reader meets.
+    except Exception as error:
+        raise DataError(
+            f"{source} cannot be read as a bag: {error}.",
+            culprits=[str(source)],
+            next_step="A bag of ROS 1 that was not closed: rosbag reindex. One of ROS 2 is the "
+            "folder with its metadata.yaml: ros2 bag reindex FOLDER.",
+        ) from error
+
+
+def _png(message: Message, topic: str) -> bytes:
+    """A raw image as a PNG."""
+    if message.encoding not in _COLOURS:
+        raise DataError(
+            f"topic {topic}: its images are of encoding {message.encoding!r}; known are "
+            f"{', '.join(_COLOURS)}.",
+            culprits=[topic],
+            next_step="Record the topic of its rectified or compressed images.",
+        )
+    is_wide = message.encoding in ("mono16", "16UC1")
+    kind = np.dtype("u2" if is_wide else "u1").newbyteorder(">" if message.is_bigendian else "<")
+    lines = np.frombuffer(bytes(message.data), "u1").reshape(message.height, message.step)
+    used = lines[:, : message.step - message.step % message.width]
+    pixels = np.ascontiguousarray(used).view(kind).reshape(message.height, message.width, -1)
+    pixels = pixels.astype("u2" if is_wide else "u1")
+    code = _COLOURS[message.encoding]
+    image = pixels if code is None else cv2.cvtColor(pixels, code)
+    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+def _is_bag(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() in _ENDINGS
+    return any(next(path.glob(f"*{ending}"), None) is not None for ending in _ENDINGS)
+
+
+def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
+    """Reads a bag; topics and frames are guessed where the user names none."""
+    contents, name = _contents(source, requested), source.stem
+    if not contents.images:
+        raise DataError(
+            f"{source}: no topic has images (sensor_msgs/Image or CompressedImage).",
+            culprits=[str(source)],
+            next_step="Record the camera's topic, too: ros2 bag record IMAGES /tf /tf_static.",
+        )
+    cameras, (stream, words, tip, robot) = (
+        _cameras(contents, requested),
+        _motion(contents, requested),
+    )
+    at_s, poses = stream.stamps_s, stream.poses.poses()
+    flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
+    rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, bool, int]]()
+    notes = [f"The robot's motion: {words}. --robot-columns BASE,TIP or a topic names another."]
+    for topic, camera in cameras.items():
+        images = contents.images[topic]
+        chosen, how = _chosen(np.array(images.stamps_s), flange)
+        notes.append(f"{topic}: {how}.")
+        for at in chosen.tolist():
+            ending = "jpg" if images.is_compressed else "png"
+            path = f"images/{camera}{'_' if camera else ''}{at:06d}.{ending}"
+            places[path] = topic, images.is_compressed, images.received_ns[at]
+            rows.append((camera, images.stamps_s[at], path))
+    rows.sort(key=lambda row: row[1])
+    lenses = {camera: _lens(contents, topic, notes) for topic, camera in cameras.items()}
+    labels = tuple(f"{name}, {path}" for _, _, path in rows)
+    one = next(iter(lenses.values())) if len(lenses) == 1 else None
+    return ForeignRecording(
+        name=name,
+        robot=PoseNumbers.empty(labels),
+        images=tuple(Path(path) for _, _, path in rows),
+        store=BagImages(source, places),
+        stamps_s=np.array([stamp_s for _, stamp_s, _ in rows]),
+        mount=_mount(contents, [contents.images[topic].frame for topic in cameras], tip),
+        lens=one,
+        lenses={} if one is not None else lenses,
+        robot_document=None if robot is None else robot.document,
+        columns={} if one is not None else {"camera": tuple(camera for camera, _, _ in rows)},
+        stream=stream,
+        notes=tuple(notes),
+    )
+
+
+def _contents(source: Path, requested: ImportOptions) -> _Contents:
+    """Reads all messages but the images' pixels."""
+    contents = _Contents()
+    with _opened(source) as reader:
+        known = [each for each in reader.connections if each.msgtype in _READERS]
+        count = sum(each.msgcount for each in known)
+        messages = enumerate(reader.messages(connections=known), start=1)
+        for at, (connection, received_ns, raw) in messages:
+            message = reader.deserialize(raw, connection.msgtype)
+            _READERS[connection.msgtype](contents, connection.topic, message, received_ns)
+            if requested.progress is not None and (at % 200 == 0 or at == count):
+                requested.progress("bag", at, count)
+    return contents
+
+
+def _stamp_s(message: Message, received_ns: int) -> float:
+    """The time in a message's header [s]; that of receipt where it states none."""
+    stamp = message.header.stamp
+    return (stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * received_ns
+
+
+def _seven(position: Message, rotation: Message) -> tuple[float, ...]:
+    return (
+        *(position.x, position.y, position.z),
+        *(rotation.x, rotation.y, rotation.z, rotation.w),
+    )
+
+
+def _add_image(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
+    images = contents.images.get(topic)
+    if images is None:
+        is_compressed, size = not hasattr(message, "encoding"), (0, 0)
+        # Depth is no picture.
+        if "depth" in topic.lower() or getattr(message, "encoding", "") == "32FC1":
+            return
+        if is_compressed:
+            data = np.frombuffer(bytes(message.data), np.uint8)
+            decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+            if decoded is None:
+                return
+            size = decoded.shape[1], decoded.shape[0]
+        else:
+            size = message.width, message.height
+        frame = message.header.frame_id.strip("/")
+        images = contents.images[topic] = _Images(is_compressed, frame, size)
+    images.stamps_s.append(_stamp_s(message, received_ns))
+    images.received_ns.append(received_ns)
+
+
+def _add_lens(contents: _Contents, topic: str, message: Message, _: int) -> None:
+    contents.lenses.setdefault(topic, message)
+
+
+def _add_joints(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
+    if len(message.position) == len(message.name) > 0:
+        rows = contents.joints.setdefault(topic, {})
+        values = rows.setdefault(tuple(message.name), array("d"))
+        values.extend((_stamp_s(message, received_ns), *map(float, message.position)))
+
+
+def _add_pose(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
+    pose = message.pose
+    values = contents.poses.setdefault(topic, array("d"))
+    values.extend((_stamp_s(message, received_ns), *_seven(pose.position, pose.orientation)))
+
+
+def _add_frames(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
+    for each in message.transforms:
+        edge = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+        moved = _seven(each.transform.translation, each.transform.rotation)
+        if "static" in topic:
+            contents.still[edge] = array("d", (0.0, *moved))
+        else:
+            rows = contents.moving.setdefault(edge, array("d"))
+            rows.extend((_stamp_s(each, received_ns), *moved))
+
+
+def _add_description(contents: _Contents, topic: str, message: Message, _: int) -> None:
+    if topic.endswith("robot_description") and "<robot" in message.data:
+        contents.descriptions.append(message.data)
+
+
+_READERS = {
+    "sensor_msgs/msg/Image": _add_image,
+    "sensor_msgs/msg/CompressedImage": _add_image,
+    "sensor_msgs/msg/CameraInfo": _add_lens,
+    "sensor_msgs/msg/JointState": _add_joints,
+    "geometry_msgs/msg/PoseStamped": _add_pose,
+    "tf2_msgs/msg/TFMessage": _add_frames,
+    "tf/msg/tfMessage": _add_frames,
+    "std_msgs/msg/String": _add_description,
+}
+
+
+def _namespace(topic: str) -> str:
+    """What the topics of one camera begin with."""
+    parts = topic.strip("/").split("/")
+    endings = ("compressed", "image_raw", "image_rect", "image_color", "image_rect_color", "image")
+    while parts and parts[-1] in (*endings, "camera_info"):
+        parts.pop()
+    return "/".join(parts)
+
+
+def _cameras(contents: _Contents, requested: ImportOptions) -> dict[str, str]:
+    """The topics of images to take, and the cameras' names; the only one has none."""
+    topics = list(contents.images)
+    if requested.image is not None:
+        asked = [name.strip() for name in requested.image.split(",")]
+        for name in asked:
+            if name not in topics:
+                raise _no_topic(name, topics, "--image-key")
+        topics = asked
+    # Of one camera, raw images come before compressed ones, and unrectified before rectified ones.
+    topics.sort(key=lambda name: (contents.images[name].is_compressed, "rect" in name))
+    first = {_namespace(topic): topic for topic in reversed(topics)}
+    if len(first) == 1:
+        return dict.fromkeys(first.values(), "")
+    names = {space: space.replace("/", "_").replace("-", "_") or "cam" for space in first}
+    return {topic: names[space] for space, topic in sorted(first.items())}
+
+
+def _no_topic(name: str, names: Sequence[str], option: str) -> DataError:
+    return DataError(
+        f"The bag has no {name!r}; it has {some_of(list(names), 20)}.",
+        culprits=[name],
+        next_step=did_you_mean(name, names) or f"Say {option} with one of these.",
+    )
+
+
+def _lens(contents: _Contents, topic: str, notes: list[str]) -> dict[str, Any]:
+    """The fields of `[camera]` of a topic's images, by the CameraInfo beside it."""
+    size = list(contents.images[topic].size)
+    space = _namespace(topic)
+    info = next((at for name, at in contents.lenses.items() if _namespace(name) == space), None)
+    # ROS 1 has them in capitals.
+    fields = {name.lower(): value for name, value in vars(info).items()} if info else {}
+    if not np.any(fields.get("k", 0.0)):
+        notes.append(f"{topic}: no CameraInfo states its lens, which is estimated.")
+        return {"resolution": size}
+    content = {
+        "camera_matrix": np.reshape(fields["k"], (3, 3)).tolist(),
+        "distortion_coefficients": np.asarray(fields["d"]).tolist(),
+        "distortion_model": fields["distortion_model"] or "plumb_bob",
+    }
+    if "rect" in topic:
+        content |= {"distortion_coefficients": [0.0] * 5, "distortion_model": "plumb_bob"}
+    lens, more = intrinsics_from(content, f"{topic}: CameraInfo")
+    notes += more
+    return lens | {"resolution": size}
+
+
+def _motion(
+    contents: _Contents, requested: ImportOptions
+) -> tuple[ForeignStream, str, str, Robot | None]:
+    """The robot's motion, where it is from, the tip's frame in TF if any, and the robot's model."""
+    names, tip = requested.robot.names, ""
+    if len(names) == 1 and names[0] not in contents.poses:
+        raise _no_topic(names[0], [*contents.poses, *contents.parents], "--robot-columns BASE,TIP")
+    is_named_pose = len(names) == 1
+    if not is_named_pose and contents.moving:
+        base, tip = names[:2] if len(names) > 1 else _ends(contents)
+        stamps_s, poses = _between(contents, base, tip)
+        words = f"{tip} in {base} by TF"
+    elif is_named_pose or len(contents.poses) == 1:
+        topic = names[0] if is_named_pose else next(iter(contents.poses))
+        stamps_s, poses = _rows(contents.poses[topic])
+        words = f"topic {topic}"
+    else:
+        stamps_s, poses, words = np.zeros(0), np.zeros((0, 4, 4)), ""
+    joints_s, joints, robot = _joint_rows(contents, requested, tip)
+    if robot is not None and not len(stamps_s):
+        stamps_s, poses = joints_s, robot.base_from_flange(joints)
+        words = f"joint angles through /robot_description up to {robot.tip}"
+    if not len(stamps_s):
+        raise DataError(
+            "The bag does not say where the robot was: it has "
+            f"{some_of([*contents.poses, *contents.joints]) or 'no poses'}, and neither TF of a "
+            "moving arm nor joints with /robot_description.",
+            culprits=[*contents.poses, *contents.joints],
+            next_step="Name its poses: --robot-columns TOPIC (of PoseStamped) or BASE,TIP (frames "
+            "of TF); or record /tf, /tf_static and /robot_description, too.",
+        )
+    every_s = np.union1d(stamps_s, joints_s)
+    found = np.full((len(every_s), 4, 4), np.nan)
+    found[np.searchsorted(every_s, stamps_s)] = poses
+    q = None
+    if robot is not None:
+        q = np.full((len(every_s), robot.joint_count), np.nan)
+        q[np.searchsorted(every_s, joints_s)] = joints
+    labels = tuple(f"sample {at}" for at in range(len(every_s)))
+    return ForeignStream(every_s, PoseNumbers.of_poses(found, labels), q), words, tip, robot
+
+
+def _rows(values: "array[float]") -> tuple[FloatArray, FloatArray]:
+    """(m,) times and (m, 4, 4) poses, in the order of time, each time once."""
+    table = np.frombuffer(values, dtype=float).reshape(-1, 8)
+    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    rotations = Rotation.from_quat(table[:, 4:])
+    poses = RigidTransform.from_components(table[:, 1:4], rotations)
+    return table[:, 0], np.asarray(poses.as_matrix())
+
+
+def _ends(contents: _Contents) -> tuple[str, str]:
+    """The frames of the arm's base and tip: the ends of the longest chain of moving frames."""
+    links = {
+        child: [*_moving_above(contents, child)]
+        for _, child in contents.moving
+        if not any(parent == child for parent, _ in contents.moving)
+    }
+    longest = max(map(len, links.values()))
+    ends = [child for child, above in links.items() if len(above) == longest]
+    if len(ends) > 1:
+        pairs = [f"{links[end][-1]},{end}" for end in ends]
+        raise DataError(
+            f"TF has several moving chains of {longest - 1} joints: {some_of(pairs, 6)}.",
+            culprits=ends,
+            next_step=f"Say which is the robot's: --robot-columns {pairs[0]}",
+        )
+    base, tip = links[ends[0]][-1], ends[0]
+    below = [name for name in contents.parents if tip in contents.chain(name)]
+    above = contents.chain(base)
+    return (
+        next((name for name in _BASES if name in above), base),
+        next((name for name in _TIPS if name in below), tip),
+    )
+
+
+def _moving_above(contents: _Contents, frame: str) -> Iterator[str]:
+    """A frame and those above it, as long as each moves in the next."""
+    yield frame
+    for child, parent in pairwise(contents.chain(frame)):
+        if (parent, child) not in contents.moving:
+            return
+        yield parent
+
+
+def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, FloatArray]:
+    """(m,) times and (m, 4, 4) `base_from_tip` by TF."""
+    known = {*contents.parents, *contents.parents.values()}
+    for name in (base, tip):
+        if name not in known:
+            raise _no_topic(name, sorted(known), "--robot-columns BASE,TIP")
+    up, down = contents.chain(base), contents.chain(tip)
+    common = next((name for name in up if name in down), None)
+    edges = [
+        (parent, child, is_up)
+        for chain, is_up in ((up, True), (down, False))
+        for child, parent in pairwise(chain)
+        if common is not None and common not in chain[: chain.index(child) + 1]
+    ]
+    moving = {(parent, child) for parent, child, _ in edges} & contents.moving.keys()
+    if common is None or not moving:
+        raise DataError(
+            f"TF does not move {tip} in {base}{'' if common else ': nothing joins them'}.",
+            culprits=[base, tip],
+            next_step="Name the base and the tip of the arm: --robot-columns base_link,tool0",
+        )
+    tracks = {edge: Trajectory(*_rows(contents.moving[edge])) for edge in moving}
+    # The times of the frame that is told least often; the others are interpolated.
+    at_s = min((track.stamps_s for track in tracks.values()), key=len)
+    at_s = at_s[np.all([track.covers(at_s) for track in tracks.values()], axis=0)]
+
+    def poses(parent: str, child: str) -> FloatArray:
+        if (parent, child) in tracks:
+            return tracks[parent, child].at(at_s)
+        return _rows(contents.still[parent, child])[1]
+
+    base_from_common, common_from_tip = np.eye(4)[None], np.eye(4)[None]
+    for parent, child, is_up in edges:
+        if is_up:
+            base_from_common = base_from_common @ invert(poses(parent, child))
+        else:
+            common_from_tip = poses(parent, child) @ common_from_tip
+    return at_s, np.broadcast_to(base_from_common @ common_from_tip, (len(at_s), 4, 4))
+
+
+def _joint_rows(
+    contents: _Contents, requested: ImportOptions, tip: str
+) -> tuple[FloatArray, FloatArray, Robot | None]:
+    """(m,) times and (m, n) joint angles in the order of the bag's own robot model, and that."""
+    none = np.zeros(0), np.zeros((0, 0)), None
+    if not contents.descriptions or requested.robot_model is not None:
+        return none
+    document = {"schema": 1, "name": "robot", "urdf": contents.descriptions[0]}
+    tip = requested.tip or tip
+    robot: Robot | None = None
+    for end in (tip, *_TIPS) if tip else _TIPS:
+        with suppress(VisioncalError):
+            robot = Robot.from_document(document | {"tip": end})
+            break
+    for topic, by_names in contents.joints.items() if robot is not None else ():
+        if requested.joints and topic not in requested.joints:
+            continue
+        for names, values in by_names.items():
+            if robot is not None and {*robot.joint_names} <= {*names}:
+                table = np.frombuffer(values, dtype=float).reshape(-1, 1 + len(names))
+                table = table[np.unique(table[:, 0], return_index=True)[1]]
+                order = [1 + names.index(name) for name in robot.joint_names]
+                return table[:, 0], table[:, order], robot
+    return none
+
+
+def _chosen(stamps_s: FloatArray, flange: Trajectory) -> tuple[np.ndarray, str]:
+    """Numbers of the frames to take: one a stop, or of a sweep evenly; and that in words."""
+    order = np.argsort(stamps_s, kind="stable")
+    still = order[is_standing_still(flange, stamps_s[order])]
+    poses = flange.at(stamps_s[still])
+    moved = np.abs(log(invert(poses[:-1]) @ poses[1:])).max(axis=1) > _MOVED
+    runs = np.split(still, np.flatnonzero(moved) + 1)
+    count = len(stamps_s)
+    if len(runs) >= _FEWEST_STOPS:
+        # The middle of each rest, where clocks that differ a little have no effect.
+        chosen = np.array([run[len(run) // 2] for run in runs])
+        return chosen, f"{len(chosen)} of {count} frames are views, one a stop of the robot"
+    chosen = order[evenly(count, _MOST_FRAMES)]
+    return chosen, f"{len(chosen)} of {count} frames are views, of a motion without stops"
+
+
+def _mount(contents: _Contents, frames: Sequence[str], tip: str) -> Mount | None:
+    """How the cameras are mounted, where TF has their frames beside the arm's."""
+    moving = {child for _, child in contents.moving}
+    hands = {
+        bool(moving & {*contents.chain(frame)}) for frame in frames if frame in contents.parents
+    }
+    if not tip or len(hands) != 1:
+        return None
+    return "eye-in-hand" if hands.pop() else "eye-to-hand"
+
+
+BAG = ForeignFormat("bag", "a bag of ROS 1 or ROS 2 (.bag, .mcap, or its folder)", _is_bag, _read)

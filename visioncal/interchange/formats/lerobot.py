@@ -1,0 +1,245 @@
+"""Data sets of LeRobot, versions 2 and 3: joints in parquet, images in videos (extra `lerobot`).
+
+Every frame has the joint angles of its moment. Where the arm stood, one frame a stop becomes a
+view; of a motion without stops, frames evenly. Videos are read when the session is stored.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from visioncal.core.conventions import PoseNumbers
+from visioncal.core.documents import mapping
+from visioncal.core.documents.jsons import parse_json
+from visioncal.core.errors import DataError
+from visioncal.core.files import read_bytes, read_text
+from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.types import FloatArray, IntArray, Mount
+from visioncal.estimation.clock_correlation import evenly
+from visioncal.interchange.formats.file_search import path_inside
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
+from visioncal.robot import robot_names
+from visioncal.session.images import ImageStore
+from visioncal.vision.boards.imaging import decode_image
+
+_STATE, _IMAGES = "observation.state", "observation.image"
+# Built-in models by words in `robot_type`, beside their own names.
+_ARMS = {"so100": "so101", "so-100": "so101", "franka": "panda"}
+# Names of what is on the flange, and of cameras there.
+_GRIPPERS, _WRISTS = ("gripper", "finger", "hand"), ("wrist", "hand", "gripper", "eef")
+# A stop: joints stay within the first for the time before and after [rad, s]; those of another
+# stop differ by more than the second.
+_STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad(3.0))
+# Fewest stops that make a recording one of stops, and most frames of any other.
+_FEWEST_STOPS, _MOST_FRAMES = 5, 60
+
+
+@dataclass(frozen=True, eq=False)
+class FrameImages(ImageStore):
+    """Frames of videos, or images in parquet, by their paths in the session."""
+
+    # The video and the frame's number in it, or the bytes of the image.
+    places: Mapping[str, tuple[Path, int] | bytes]
+
+    def read(self, path: str) -> bytes:
+        """Reads one frame, as a PNG."""
+        place = self.places.get(path)
+        if place is None:
+            raise DataError(f"The data set has no image {path}.", culprits=[path])
+        if isinstance(place, bytes):
+            return place
+        video = cv2.VideoCapture(str(place[0]), cv2.CAP_FFMPEG)
+        video.set(cv2.CAP_PROP_POS_FRAMES, place[1])
+        found, image = video.read()
+        video.release()
+        if not found:
+            raise DataError(
+                f"{place[0]}: frame {place[1]} cannot be decoded.",
+                culprits=[str(place[0])],
+                next_step="Where ffmpeg reads it, write it anew: ffmpeg -i IN.mp4 -c:v libx264 "
+                "-crf 1 OUT.mp4",
+            )
+        return cv2.imencode(".png", image)[1].tobytes()
+
+    def absence(self, path: str) -> str:
+        """Why there is no such image; empty where there is one."""
+        return "" if path in self.places else "is missing"
+
+
+def _info(path: Path) -> Path:
+    return path / "meta" / "info.json"
+
+
+def _parquet(path: Path, columns: list[str] | None = None) -> dict[str, list[Any]]:
+    """The columns of a parquet file.
+
+    Raises:
+        DataError: The extra is not installed, or the file cannot be read.
+    """
+    try:
+        from pyarrow import ArrowException
+        from pyarrow.parquet import read_table
+    except ImportError as error:
+        raise DataError(
+            f"{path} is parquet, and pyarrow, which reads it, is not installed.",
+            culprits=[str(path)],
+            next_step="Install it: pip install 'visioncal[lerobot]'",
+        ) from error
+    try:
+        columns_read: dict[str, list[Any]] = read_table(path, columns=columns).to_pydict()
+    except (ArrowException, OSError, ValueError) as error:
+        raise DataError(
+            f"{path} cannot be read as parquet: {error}.",
+            culprits=[str(path)],
+            next_step="Download the data set again, with its large files.",
+        ) from error
+    return columns_read
+
+
+def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
+    """Reads a data set; of several cameras the one that `--image-key` names."""
+    info = mapping(parse_json(read_text(_info(source)), "meta/info.json"), "meta/info.json")
+    features = mapping(info.get("features"), "meta/info.json: features")
+    cameras = [name for name in features if name.startswith(_IMAGES)]
+    key = requested.image or next(iter(cameras), "")
+    if key not in cameras:
+        raise DataError(
+            f"{source}: no images {key!r}; it has {some_of(cameras, 20) or 'none'}.",
+            culprits=[key],
+            next_step=did_you_mean(key, cameras) or "Name one with --image-key.",
+        )
+    state = (*requested.joints, _STATE)[0]
+    is_video = mapping(features[key], key).get("dtype") == "video"
+    columns = [state, "timestamp", "frame_index", "episode_index", *([] if is_video else [key])]
+    files = sorted((source / "data").glob("chunk-*/*.parquet"))
+    rows: dict[str, list[Any]] = {name: [] for name in columns}
+    for file in files:
+        for name, cells in _parquet(file, columns).items():
+            rows[name] += cells
+    if not rows[columns[0]]:
+        raise DataError(
+            f"{source}/data has no rows of {state}.",
+            culprits=[state],
+            next_step="Download the whole data set, with its large files.",
+        )
+    joints, notes = _joints(np.array(rows[state], dtype=float), features, state, requested)
+    episodes, stamps_s = (np.array(rows[name], dtype=float) for name in columns[3:0:-2])
+    fps = float(info.get("fps", 30.0))
+    chosen, how = _chosen(joints, episodes, fps)
+    paths = tuple(Path(f"images/{at:06d}.png") for at in chosen.tolist())
+    places: dict[str, tuple[Path, int] | bytes] = {}
+    starts = {} if not is_video else _starts(source, info, key, fps)
+    for path, at in zip(paths, chosen.tolist(), strict=True):
+        if is_video:
+            file, first = starts[int(episodes[at])]
+            places[path.as_posix()] = file, first + int(rows["frame_index"][at])
+        else:
+            cell = rows[key][at]
+            named = source / str(cell.get("path")) if not cell.get("bytes") else None
+            places[path.as_posix()] = cell["bytes"] if named is None else read_bytes(named, 10**8)
+    kind = str(info.get("robot_type")).lower()
+    arms = {name: name for name in robot_names()} | _ARMS
+    arm = next((arms[word] for word in sorted(arms, key=len, reverse=True) if word in kind), None)
+    mount: Mount = "eye-in-hand" if any(at in key for at in _WRISTS) else "eye-to-hand"
+    if arm is None and requested.robot_model is None:
+        notes.append(f"Robot type {kind!r} is no built-in arm: name its model with --robot-model.")
+    notes += [
+        how,
+        f"The camera {key} is taken to be mounted {mount}, by its name; --mount says it.",
+    ]
+    return ForeignRecording(
+        name=source.resolve().name,
+        robot=PoseNumbers.empty(tuple(f"frame {at}" for at in chosen.tolist())),
+        images=paths,
+        store=FrameImages(places),
+        joints_rad=joints[chosen],
+        stamps_s=stamps_s[chosen] + 1e4 * episodes[chosen],
+        mount=mount,
+        lens={"resolution": _size(FrameImages(places), paths[0].as_posix())},
+        arm=None if arm is None else {"model": arm},
+        notes=tuple(notes),
+    )
+
+
+def _joints(
+    state: FloatArray, features: Mapping[str, Any], key: str, requested: ImportOptions
+) -> tuple[FloatArray, list[str]]:
+    """(n, j) joint angles [rad], without the gripper, and notes on what was assumed."""
+    names = mapping(features.get(key), key).get("names") or []
+    if isinstance(names, Mapping):
+        names = next(iter(names.values()), [])
+    if len(names) == state.shape[1]:
+        arm = [at for at, name in enumerate(names) if not any(x in str(name) for x in _GRIPPERS)]
+        state = state[:, arm]
+    is_deg = requested.joints_deg or bool(np.abs(state).max() > 2.0 * np.pi + 0.1)
+    notes = []
+    if is_deg and not requested.joints_deg:
+        notes.append(
+            f"{key} is in degrees, by its size. Of a servo arm that was recorded with "
+            "use_degrees=false it is in hundredths of each joint's range, which are no angles: "
+            "record it anew."
+        )
+    return np.deg2rad(state) if is_deg else state, notes
+
+
+def _chosen(joints: FloatArray, episodes: FloatArray, fps: float) -> tuple[IntArray, str]:
+    """The rows to take: one a stop, or else evenly; and that in words."""
+    reach, count = max(round(_STILL_S * fps), 1), len(joints)
+    at = np.arange(count)
+    sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
+    is_still = np.all(
+        [
+            (np.abs(joints[side] - joints).max(axis=1) < _STILL_RAD)
+            & (episodes[side] == episodes)
+            & (np.abs(side - at) == reach)
+            for side in sides
+        ],
+        axis=0,
+    )
+    still = np.flatnonzero(is_still)
+    moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
+    runs = np.split(still, np.flatnonzero(moved) + 1)
+    if len(runs) < _FEWEST_STOPS:
+        chosen = evenly(count, _MOST_FRAMES)
+        return chosen, f"{len(chosen)} of {count} frames are views, of a motion without stops."
+    chosen = np.array([run[len(run) // 2] for run in runs])
+    return chosen, f"{len(chosen)} of {count} frames are views, one a stop of the arm."
+
+
+def _starts(
+    source: Path, info: Mapping[str, Any], key: str, fps: float
+) -> dict[int, tuple[Path, int]]:
+    """The video of each episode, and the episode's first frame in it."""
+    form = str(info.get("video_path"))
+    tables = sorted((source / "meta" / "episodes").glob("chunk-*/*.parquet"))
+    starts: dict[int, tuple[Path, int]] = {}
+    for table in tables:
+        prefix = f"videos/{key}/"
+        names = [f"{prefix}{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
+        columns = _parquet(table, ["episode_index", *names])
+        for episode, chunk, file, from_s in zip(*columns.values(), strict=True):
+            named = form.format(video_key=key, chunk_index=chunk, file_index=file)
+            starts[episode] = path_inside(source, named), round(from_s * fps)
+    if not tables:
+        for episode in range(int(info.get("total_episodes", 1))):
+            chunk = episode // int(info.get("chunks_size", 1000))
+            named = form.format(video_key=key, episode_chunk=chunk, episode_index=episode)
+            starts[episode] = path_inside(source, named), 0
+    return starts
+
+
+def _size(images: FrameImages, path: str) -> list[int]:
+    """(width, height) of an image [px]."""
+    image = decode_image(images.read(path))
+    if isinstance(image, str):
+        raise DataError(f"{path} {image}.", culprits=[path])
+    return [image.shape[1], image.shape[0]]
+
+
+LEROBOT = ForeignFormat(
+    "lerobot", "a data set of LeRobot", lambda path: path.is_dir() and _info(path).is_file(), _read
+)
