@@ -198,6 +198,30 @@ def slope(poses, size):
     return np.stack(columns, axis=-1)
 
 
+# Flange with all joints at zero, as drawings and pendants of the makers have it [mm].
+_AT_ZERO = {
+    "xarm6": (207, 0, 112),
+    "xarm7": (206, 0, 120.5),
+    "kr6-r900": (980, 0, 435),
+    "iiwa14": (0, 0, 1306 + 26),
+    "irb1200-5-0.9": (533, 0, 889.1),
+    "lrmate200id": (465, 0, 365 + 330),
+    "gen3": (0, -24.9, 1187.4),
+    "a0509": (0, 0, 1055.5),
+    "m1013": (0, 34.5, 1452.5),
+    "cr5": (0, -246, 1047),
+    "ur20": (-1590.7, -355.3, 77),
+    "ur30": (-1140.7, -355.3, 77),
+}
+
+
+@pytest.mark.parametrize("name", _AT_ZERO)
+def test_arms_stand_at_zero_as_their_makers_draw_them(name):
+    flange = load_robot(name).base_from_flange(np.zeros((1, load_robot(name).joint_count)))[0]
+    # Drawings are rounded to a tenth of a millimetre.
+    np.testing.assert_allclose(1e3 * flange[:3, 3], _AT_ZERO[name], atol=0.06)
+
+
 @pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
 def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
     q, count = some_joints(robot), robot.joint_count

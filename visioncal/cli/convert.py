@@ -40,16 +40,18 @@ def convert_command(options: ConvertOptions) -> None:
         tip=written.tip,
     )
     choose = partial(_chosen, yes=options.yes) if options.guess else None
-    session = convert(
-        options.source,
-        options.dest,
-        requested=requested,
-        form=written.form,
-        force=options.force,
-        choose=choose,
-        mirrors_poses=options.mirror_poses,
-        exchange=options.exchange,
-    )
+    # A choice shows its own progress.
+    with shown_progress(quiet=options.guess) as progress:
+        session = convert(
+            options.source,
+            options.dest,
+            requested=replace(requested, progress=progress),
+            form=written.form,
+            force=options.force,
+            choose=choose,
+            mirrors_poses=options.mirror_poses,
+            exchange=options.exchange,
+        )
     for warning in session.warnings:
         say(f"note: {warning}")
     say(f"wrote {options.dest}\nsha256 {session.digest()}")

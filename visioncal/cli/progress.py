@@ -9,6 +9,7 @@ from visioncal.cli.console import messages
 
 # Descriptions of steps; other names are words already.
 WORDS = {
+    "bag": "read the bag",
     "robot": "read the robot",
     "readings": "read the instruments",
     "detect": "detect the board",
