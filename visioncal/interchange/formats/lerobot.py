@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from visioncal.core.conventions import PoseNumbers
-from visioncal.core.documents import mapping
 from visioncal.core.documents.jsons import parse_json
+from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, read_text
 from visioncal.core.number_format import did_you_mean, some_of
