@@ -28,6 +28,7 @@ from visioncal.calibration.stages.random_effects import of_random_effects, rando
 from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, with_sizes
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
@@ -43,6 +44,7 @@ from visioncal.estimation.outliers import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -104,6 +106,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)
     cell_fit = _fit_with_inliers(initial, observed)
+    if cell_fit.inlier_fit.problem.is_combined:
+        cell_fit = _with_likelier_noise(cell_fit, observed)
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
@@ -137,6 +141,21 @@ def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
         fit = Solution(state, estimate_noise(problem, state, noise))
         return cell_fit.with_joint_fit(model, ConvergedFit(corners, problem, fit))
     return replace(cell_fit, inlier_fit=cell_fit.inlier_fit.refitted())
+
+
+def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
+    """Takes the combined noise of robot and camera as the flange's, where that is clearly likelier.
+
+    Servo arms turn by a degree from stop to stop. Taken for noise of the targets, that attenuates
+    the edges, since the robot's poses are then regressors without errors (Fuller 1987, 1.1).
+    """
+    inliers, values = cell_fit.inlier_fit, []
+    of_flange = replace(inliers, problem=replace(inliers.problem, is_combined=False)).refitted()
+    other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
+    for found in (cell_fit.inlier_fit, other.inlier_fit):
+        part, fit = found.problem.subset(inliers.used), found.fit
+        values.append(robot_likelihood(part, fit.state, fit.noise).white[1])
+    return other if values[0] - values[1] > CONTRADICTION else cell_fit
 
 
 def _without_misreported(
