@@ -150,7 +150,11 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     the edges, since the robot's poses are then regressors without errors (Fuller 1987, 1.1).
     """
     inliers, values = cell_fit.inlier_fit, []
-    of_flange = replace(inliers, problem=replace(inliers.problem, is_combined=False)).refitted()
+    of_flange = replace(inliers, problem=replace(inliers.problem, is_combined=False))
+    if len(of_flange.problem.units[1]) < len(of_flange.problem):
+        # Several observations of one stop tell both noises apart, but not in one level.
+        return cell_fit
+    of_flange = of_flange.refitted()
     other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
     for found in (cell_fit.inlier_fit, other.inlier_fit):
         part, fit = found.problem.subset(inliers.used), found.fit
