@@ -56,12 +56,22 @@ def elementary(axis, angle=0.0, along=0.0):
     return matrix
 
 
+def given(place):
+    """A constant transform of a table, by its position and angles about x, y, z."""
+    if place is None:
+        return np.eye(4)
+    roll, pitch, yaw = place["rpy_rad"]
+    turned = elementary("z", yaw) @ elementary("y", pitch) @ elementary("x", roll)
+    turned[:3, 3] = place["xyz_m"]
+    return turned
+
+
 def dh_product(document, q):
     """The textbook's product of a DH table, row by row."""
-    result = np.eye(4)
+    result = given(document.get("base"))
     rows = [(row, row.get("theta_offset_rad", 0.0)) for row in document["joint"]]
     angles = [offset + angle for (_, offset), angle in zip(rows, q, strict=True)]
-    if "flange" in document:
+    if "d_m" in document.get("flange", ()):
         rows.append((document["flange"], 0.0))
         angles.append(document["flange"].get("theta_rad", 0.0))
     for (row, _), theta in zip(rows, angles, strict=True):
@@ -69,7 +79,7 @@ def dh_product(document, q):
         along_x = elementary("x", along=row["a_m"]) @ elementary("x", row["alpha_rad"])
         modified = document["convention"] == "modified"
         result = result @ (along_x @ about_z if modified else about_z @ along_x)
-    return result
+    return result if "d_m" in document.get("flange", ()) else result @ given(document.get("flange"))
 
 
 @pytest.mark.parametrize("name", robot_names())
