@@ -178,54 +178,62 @@ def find_steps(
         ]
         for candidate in candidates
     ]
+    every = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
     ends = np.cumsum([0, *map(len, columns)])
-    best, squares = dict[int, Step](), dict[int, float]()
-    freedom = _residual_freedom(problem, fit)
-    tried = Counter[str]()
+    stops, sums, gradients = list[int](), list[FloatArray](), list[FloatArray]()
+    for stop, information, gradient in equations_from(widened, start, every):
+        across, alone = information[:, :size], information[:, every]
+        sums.append(np.stack([alone, alone - across @ fitted @ across.T]))
+        stops.append(stop)
+        gradients.append(gradient)
+    all_blocks, all_slopes = np.array(sums), np.array(gradients)
+    freedom, tried = _residual_freedom(problem, fit), Counter[str]()
     for candidate in candidates:
         tried[candidate.kind] += len(candidate.stops)
-    for stop, information, gradient in equations_from(
-        widened, start, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
-    ):
-        across = information[:, :size]
-        following = -fitted @ across.T
-        for at, candidate in enumerate(candidates):
-            if stop not in candidate.stops:
-                continue
-            mine = slice(ends[at], ends[at + 1])
-            alone = information[mine, columns[at]]
-            marginal = alone + across[mine] @ following[:, mine]
-            scale = np.sqrt(np.maximum(np.diag(alone), np.finfo(float).tiny))
-            scaled = np.linalg.eigvalsh(np.stack([alone, marginal]) / np.outer(scale, scale))
-            if scaled.min() < ROUNDING:
-                continue
-            covariance = covariance_from(marginal)
-            value = -covariance @ gradient[mine]
-            square, count = float(-gradient[mine] @ value), len(value)
-            many = freedom / (kinds if count > 1 else 1)
-            limit = count * float(
-                f_limit(FALSE_ALARM / tried[candidate.kind], count, max(0.5 * many, 6.0))
-            )
-            if _as_f_test(square, many, count) < limit or square <= squares.get(at, 0.0):
-                continue
-            squares[at] = square
-            gain = -freedom * float(np.log1p(-min(square / freedom, _MOST_EXPLAINED)))
-            before = following[:, mine] @ value
-            after = before.copy()
-            if candidate.effect is None:
-                after[columns[at]] += value
-            spread = (np.outer(before, before) + np.outer(after, after)) / 2.0
-            best[at] = Step(candidate, stop, value, covariance, gain, spread)
-    return sorted(best.values(), key=lambda step: -step.gain)
+    found = dict[int, tuple[int, FloatArray, FloatArray, float]]()
+    for at, candidate in enumerate(candidates):
+        mine, among = np.arange(ends[at], ends[at + 1]), np.isin(stops, candidate.stops)
+        if not among.any():
+            continue
+        slopes = all_slopes[among][:, mine]
+        blocks = all_blocks[among][:, :, mine[:, None], mine]
+        scale = np.sqrt(
+            np.maximum(np.diagonal(blocks[:, 0], axis1=1, axis2=2), np.finfo(float).tiny)
+        )
+        scaled = blocks / (scale[:, :, None] * scale[:, None, :])[:, None]
+        sound = np.linalg.eigvalsh(scaled).min(axis=(1, 2)) >= ROUNDING
+        covariances = covariance_from(blocks[sound, 1])
+        values = -(covariances @ slopes[sound][:, :, None])[:, :, 0]
+        squares, count = -np.sum(slopes[sound] * values, axis=1), len(mine)
+        many = freedom / (kinds if count > 1 else 1)
+        chance = FALSE_ALARM / tried[candidate.kind]
+        limit = count * float(f_limit(chance, count, max(0.5 * many, 6.0)))
+        shown = np.where(_as_f_test(squares, many, count) < limit, 0.0, squares)
+        if shown.max(initial=0.0) > 0.0:
+            best = int(np.argmax(shown))
+            share = min(float(shown[best]) / freedom, _MOST_EXPLAINED)
+            stop = np.array(stops)[among][sound][best]
+            found[at] = int(stop), values[best], covariances[best], -freedom * np.log1p(-share)
+    steps = []
+    for stop, information, _ in equations_from(widened, start, every) if found else ():
+        for at, (first, value, covariance, gain) in found.items():
+            if first == stop:
+                before = -fitted @ information[ends[at] : ends[at + 1], :size].T @ value
+                after = before.copy()
+                if candidates[at].effect is None:
+                    after[columns[at]] += value
+                spread = (np.outer(before, before) + np.outer(after, after)) / 2.0
+                steps.append(Step(candidates[at], stop, value, covariance, gain, spread))
+    return sorted(steps, key=lambda step: -step.gain)
 
 
-def _as_f_test(square: float, freedom: float, count: int) -> float:
-    """Score statistic of `count` values as that of an F test, times their number.
+def _as_f_test(squares: FloatArray, freedom: float, count: int) -> FloatArray:
+    """Score statistics (k,) of `count` values as those of an F test, times their number.
 
     The noise of the score includes the tested change, which bounds the score.
     """
-    remaining = max(freedom - square, (1.0 - _MOST_EXPLAINED) * freedom)
-    return square * max(freedom - count, 1.0) / remaining
+    remaining = np.maximum(freedom - squares, (1.0 - _MOST_EXPLAINED) * freedom)
+    return np.asarray(squares * max(freedom - count, 1.0) / remaining)
 
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:
