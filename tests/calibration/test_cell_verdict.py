@@ -89,7 +89,7 @@ def test_a_sound_cell_is_good_and_says_how_good(session):
     assert good_for.startswith("It is good for tasks of ")
     used = sum(view.used for view in found.views)
     assert reason.startswith(
-        f"All {used} used views agree: left out of the fit, they are predicted"
+        f"All {used} used views agree. Checked with views that were not used in the fit:"
     )
     assert "offset along the cell's" in reason
 
@@ -140,7 +140,7 @@ def test_a_robot_whose_poses_are_misread_is_named_first(session):
 
     with pytest.raises(DegenerateError) as refused:
         calibrate(rewritten(session, turn))
-    words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, the chain closes"
+    words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, robot and camera"
     assert str(refused.value).startswith(words)
     assert "rows of robot b in views.csv" in refused.value.next_step
 

@@ -21,17 +21,12 @@ def text_of(html):
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
 
 
-def test_the_graph_has_every_frame_with_its_sigma():
-    html = render_cell(CELL)
-    figure = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
-    labels = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
+def test_a_table_has_every_frame_with_its_sigma():
+    words = text_of(render_cell(CELL))
     for frame in ("base_b", "cam_top", "cam_hand", "target_plate"):
         edge = CELL.tree.edge_of(frame)
-        assert frame in labels
-        worth = f"{significant(edge.sigma_mm)} mm, {significant(edge.sigma_deg)}°"
-        assert worth in [label.replace("&#176;", "°") for label in labels]
-    assert "the reference" in labels
-    assert {"robot a", "robot b"} <= set(labels)
+        assert f"{significant(edge.sigma_mm)} mm, {significant(edge.sigma_deg)}°" in words
+        assert frame in words
 
 
 def test_observations_are_counted_by_who_saw_whom():
@@ -46,5 +41,5 @@ def test_observations_are_counted_by_who_saw_whom():
     assert (first.used, first.left_out, first.rms.mm) == (2, 1, 12.5**0.5)
     assert (second.used, second.rms) == (0, None)
     words = text_of(render_cell(replace(CELL, views=views)))
-    assert "2 (\N{MINUS SIGN}1)" in words
+    assert "cam_top target_plate 2 1" in words
     assert "view 2 not used cam_top of target_plate: disagrees" in words

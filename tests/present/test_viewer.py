@@ -265,7 +265,7 @@ def test_directions_lie_on_the_side_that_the_camera_is_on():
     target_from_cam = RigidTransform.from_components(tilt.apply([0.0, 0.0, -0.5]), tilt)
     assert target_from_cam.translation[0] > 0.2
     seen = ViewEvidence(4, cam_from_target=target_from_cam.inv().as_matrix())
-    chart = coverage.directions_chart({4: seen})
+    chart = coverage.directions_chart([seen])
     np.testing.assert_allclose(chart.points[4], [[30.0, 0.0]], atol=1e-9)
 
 

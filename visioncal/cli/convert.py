@@ -74,7 +74,7 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
     print_table(
-        ("reading", "chain closes to", "views that agree"),
+        ("reading", "robot and camera agree to", "views that agree"),
         [
             (
                 candidate.words,

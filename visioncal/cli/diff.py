@@ -4,7 +4,7 @@ from visioncal.cli.console import answer, print_json, print_table
 from visioncal.cli.result_options import DiffOptions
 from visioncal.core.number_format import figure
 from visioncal.interchange.result_files import load_result
-from visioncal.results.compare import Significance, compare, to_document
+from visioncal.results.compare import LensChange, Significance, compare, to_document
 
 # Below a nanometre and a micro-degree differences are rounding.
 _DECIMALS = 6
@@ -22,6 +22,9 @@ def diff_command(options: DiffOptions) -> None:
     )
     if options.as_json:
         print_json(to_document(comparison))
+        return
+    if comparison.is_equal:
+        answer("Both hold the same result.")
         return
     paths = (str(options.first), str(options.second))
     for order, path, mount, verdict in zip(
@@ -51,10 +54,19 @@ def diff_command(options: DiffOptions) -> None:
         *((name, "second") for name in comparison.only_in_b),
     ):
         answer(f"{name} is in the {where} only.")
-    lens = comparison.lens
-    if lens is not None and lens.significance is None and not lens.is_change:
+    if comparison.lens is not None:
+        _print_lens(comparison.lens)
+    noise = [
+        (name, *("" if level is None else f"{level:.3g}" for level in levels))
+        for name, levels in comparison.noise.items()
+    ]
+    print_table(("noise, per axis", "first", "second"), noise)
+
+
+def _print_lens(lens: LensChange) -> None:
+    if lens.significance is None and not lens.is_change:
         answer("The lens was given, and is the same in both.")
-    elif lens is not None:
+    else:
         sigmas = [""] * len(lens.names)
         if lens.sigmas is not None:
             sigmas = [figure(sigma) for sigma in lens.sigmas]
@@ -66,11 +78,6 @@ def diff_command(options: DiffOptions) -> None:
             for name, a, b, sigma in zip(lens.names, lens.a, lens.b, sigmas, strict=True)
         ]
         print_table(("lens", "first", "second", "difference", "sigma"), changes, caption=caption)
-    noise = [
-        (name, *("" if level is None else f"{level:.3g}" for level in levels))
-        for name, levels in comparison.noise.items()
-    ]
-    print_table(("noise, per axis", "first", "second"), noise)
 
 
 def _outcome(test: Significance) -> tuple[str, str]:

@@ -70,8 +70,8 @@ def _print_residuals(calibration: Calibration) -> None:
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
     answer(
-        f"{used} of {len(calibration.views)} views used; left out of the fit they are predicted to "
-        f"{figure(held.mm)} mm"
+        f"{used} of {len(calibration.views)} views used. "
+        f"Checked with views that were not used in the fit: {figure(held.mm)} mm"
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
         + (f", {figure(held.px)} px" if held.px and held.px < _MOST_PX else "")
     )

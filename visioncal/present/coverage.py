@@ -29,14 +29,21 @@ class PointChart:
     words: Sequence[tuple[tuple[float, float], str]]  # Labels with their positions.
 
 
-def image_chart(
-    calibration: Calibration, evidence: Mapping[int, ViewEvidence]
-) -> PointChart | None:
-    """All corners of all views in one image; None if there are none."""
-    points = {view: seen.corners.px for view, seen in evidence.items() if seen.corners is not None}
-    if not points or calibration.camera is None:
-        return None
-    return corners_chart(calibration.camera.camera.resolution, points)
+def coverage_charts(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> list[PointChart]:
+    """Coverage of the image, of directions and of rotation axes, where known; none for a cell."""
+    if calibration.cell is not None:
+        # A chart has no room for several cameras, boards or robots.
+        return []
+    used = {view.view for view in calibration.views if view.used}
+    corners = {view.view: view.corners.px for view in evidence if view.corners is not None}
+    charts = [
+        corners_chart(calibration.camera.camera.resolution, corners)
+        if corners and calibration.camera is not None
+        else None,
+        None if calibration.mount == "instrument" else directions_chart(evidence),
+        rotation_axes_chart([view for view in evidence if view.view in used]),
+    ]
+    return [chart for chart in charts if chart is not None]
 
 
 def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray]) -> PointChart:
@@ -50,12 +57,12 @@ def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray])
     return PointChart("image", points, lines, [])
 
 
-def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
+def directions_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
     """Viewing directions: angle from the target's normal [deg], and azimuth."""
     points = {
         # The target's z axis points into the board, away from the camera.
-        view: _disc(seen.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
-        for view, seen in evidence.items()
+        seen.view: _disc(seen.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
+        for seen in evidence
         if seen.cam_from_target is not None
     }
     if not points:

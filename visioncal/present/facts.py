@@ -12,7 +12,7 @@ from visioncal.present import result_parts
 from visioncal.present.network_layout import pairs
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Edge, Rms
-from visioncal.results.sections import BoardResult
+from visioncal.results.sections import BoardResult, UncertaintyResult
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
 # Suffixes of names on disk, and the units shown.
@@ -183,6 +183,16 @@ def source_table(calibration: Calibration) -> Table | None:
         for edge, budget in budgets.items()
     ]
     return Table.of(("", *(SOURCES.get(name, name) for name in shown)), edge_rows)
+
+
+def spectrum_facts(uncertainty: UncertaintyResult) -> tuple[Fact, ...]:
+    """Sigmas of the least and the best known direction, as shares of the largest accepted."""
+    shares = uncertainty.spectrum[uncertainty.spectrum > 0.0]
+    if not len(shares):
+        return ()
+    worst, best = (f"{significant(100.0 * float(end))} %" for end in (shares.max(), shares.min()))
+    note = f"of the largest accepted sigma, 5 mm or 0.5 deg; the best known: {best}"
+    return (Fact("least known direction", worst, note),)
 
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:

@@ -1,4 +1,4 @@
-"""Layout of the drawing of an aligned cell's network: bodies side by side, and who saw whom."""
+"""The network of a cell: who saw whom, and how well each frame is known."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,12 +7,6 @@ from visioncal.core.number_format import significant
 from visioncal.results import Rms, ViewResult
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import left_out_rms, rms_of
-
-# Spacing of frames, and gap between bodies, in units of the drawing.
-STEP, GAP = 1.5, 0.8
-# Heights of sensors, of targets, and of robot bases.
-_TOP, _MIDDLE, _BOTTOM = 2.5, 1.05, 0.1
-_SEERS = ("cam", "instrument")
 
 
 @dataclass(frozen=True)
@@ -44,7 +38,7 @@ def pairs(views: Iterable[ViewResult]) -> tuple[SeenPair, ...]:
 
 def weakest_frame(tree: FrameTree) -> str:
     """The frame whose pose on its parent has the largest sigma, at the end of the session."""
-    edges = {name: tree.edge_of(name) for name in _placed(tree)}
+    edges = {name: tree.edge_of(name) for name in tree.last if name not in tree.flanges}
     return max(edges, key=lambda frame: edges[frame].sigma_mm, default="")
 
 
@@ -55,37 +49,3 @@ def sigma_words(tree: FrameTree, frame: str) -> str:
     edge = tree.edge_of(frame)
     rotation = f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}" if edge.oriented else ""
     return f"{significant(edge.sigma_mm)} mm{rotation}"
-
-
-def _placed(tree: FrameTree) -> list[str]:
-    """Frames with an edge to their parent, at the end of the session."""
-    return [name for name in tree.last if name not in tree.flanges]
-
-
-def layout(
-    tree: FrameTree,
-) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, float]]]:
-    """Places in the drawing of the cell, which stands between the flanges, at the session's end.
-
-    Returns:
-        Left and right end of each body, the cell or a flange with what it carries, from left to
-        right; and the centre (x, y) of each frame's box, y upwards.
-    """
-    flanges, left = list(tree.flanges), 0.0
-    half = (len(flanges) + 1) // 2
-    spans: dict[str, tuple[float, float]] = {}
-    places: dict[str, tuple[float, float]] = {}
-    for body in [*flanges[:half], "cell", *flanges[half:]]:
-        frames = [frame for frame in _placed(tree) if tree.parents[frame] == body]
-        top = [frame for frame in frames if frame.startswith(_SEERS)]
-        bottom = [frame for frame in frames if frame.startswith("base")]
-        middle = [frame for frame in frames if frame not in top and frame not in bottom]
-        width = STEP * max(len(top), len(middle), len(bottom), 1)
-        for names, height in ((top, _TOP), (middle, _MIDDLE), (bottom, _BOTTOM)):
-            start = left + 0.5 * (width - STEP * len(names))
-            places |= {
-                name: (start + STEP * (column + 0.5), height) for column, name in enumerate(names)
-            }
-        spans[body] = (left, left + width)
-        left += width + GAP
-    return spans, places

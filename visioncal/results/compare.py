@@ -101,6 +101,24 @@ class Comparison:
             self.lens is not None and self.lens.is_change
         )
 
+    @property
+    def is_equal(self) -> bool:
+        """Whether both are the same result of one session, but for rounding."""
+        pairs: list[tuple[Any, Any]] = [] if self.lens is None else [(self.lens.a, self.lens.b)]
+        pairs += [(edge.twist, np.zeros(6)) for edge in self.edges]
+        pairs += [(first, second) for first, second in self.noise.values()]
+        return (
+            self.same_session
+            and not (self.only_in_a or self.only_in_b)
+            and self.verdicts[0] == self.verdicts[1]
+            and all(
+                pair[0] is not None
+                and pair[1] is not None
+                and np.allclose(*pair, rtol=1e-6, atol=_LEAST_SIGMA)
+                for pair in pairs
+            )
+        )
+
 
 @typed
 def compare(

@@ -224,9 +224,10 @@ def _check_mount(likely: Sequence[Candidate]) -> None:
 
 def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate]) -> str:
     """States the finding, with its figures."""
-    closes = f"the chain closes to {_figures(best)}"
+    closes = f"robot and camera agree to {_figures(best)}"
     if best is not declared:
-        return f"With {best.words}, {closes} instead of {_figures(declared)}."
+        otherwise = f"to {_figures(declared)}" if declared.fit.agreeing else "in no view"
+        return f"With {best.words}, {closes}; as declared, {otherwise}."
     if not declared.fit.is_readable:
         return (
             "As declared, the rotations of the robot or of the camera are none, and no other "

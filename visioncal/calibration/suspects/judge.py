@@ -116,12 +116,12 @@ def _need_words(findings: Findings, met: NeedMet) -> str:
 def _agreement(findings: Findings, *, is_enough: bool) -> Finding:
     used = sum(view.used for view in findings.views)
     worst_known = "".join(
-        f", and {worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm"
+        f"; {worst.words}, its least certain direction, is known to {figure(1e3 * worst.sigma)} mm"
         for worst in findings.worst[:1]
     )
     return Finding(
         AGREEMENT,
-        f"All {used} used views agree: left out of the fit, they are predicted to "
+        f"All {used} used views agree. Checked with views that were not used in the fit: "
         f"{findings.held_out.words} (rms){worst_known}.",
         findings.use if is_enough else None,
     )

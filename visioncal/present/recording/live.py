@@ -75,7 +75,7 @@ class LiveDrawing:
         self._scene.log_views(stream, row)
         self._px[view.view] = view.px
         chart = corners_chart(self.cell.resolution, self._px)
-        charts = Charts((chart,), (), frozenset(self._px))
+        charts = Charts((chart,), frozenset(self._px))
         charts.log_static(stream)
         charts.log_views(stream, row)
         if view.sigma_mm is not None:

@@ -134,11 +134,6 @@ def magnified_arm(factor: int) -> str:
     return f"{NOMINAL_ARM}/off_magnified_{factor}x"
 
 
-def over_joint(joint: int) -> str:
-    """Entity of the residuals against the angle of a joint (index from 0)."""
-    return f"{RESIDUALS}/over_joints/q{joint + 1}"
-
-
 def of_joint(group: str, joint: int) -> str:
     """Entity of a joint (index from 0) within a group over time."""
     return f"{group}/joint_{joint + 1}"

@@ -159,10 +159,10 @@ def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int
         rims.append(project(preview.camera, apply(cam_from_target, sides)))
     charts = (
         corners_chart(preview.camera.resolution, px),
-        directions_chart(evidence),
+        directions_chart([*evidence.values()]),
         rotation_axes_chart(list(evidence.values())),
     )
-    drawn = Charts(tuple(chart for chart in charts if chart), (), frozenset(evidence))
+    drawn = Charts([chart for chart in charts if chart], frozenset(evidence))
     drawn.log_static(stream)
     in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
     style = rr.Points2D.from_fields(colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))

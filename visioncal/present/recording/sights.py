@@ -7,7 +7,7 @@ import rerun as rr
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray
-from visioncal.present.network_layout import layout, pairs, sigma_words
+from visioncal.present.network_layout import pairs, sigma_words
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.overlays import image_frames, log_image_frames
 from visioncal.present.recording.scene import Scene
@@ -18,8 +18,6 @@ from visioncal.session.frames import frames_of_kind
 
 # Length of the cell's axes, as a share of its size.
 _CELL_AXIS = 0.24
-# Height of the bodies' names, and the drawing's units [px].
-_BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
 
 def log_seen_targets(
@@ -76,8 +74,7 @@ def log_network(stream: rr.RecordingStream, scene: Scene, calibration: Calibrati
     axes = rr.TransformAxes3D(_CELL_AXIS * scene.size_m, show_frame=False)
     stream.log(paths.CELL, rr.CoordinateFrame(paths.CELL_FRAME), axes, static=True)
     tree = calibration.tree
-    spans, places = layout(tree)
-    nodes = {body: (0.5 * sum(span), _BODY_HEIGHT) for body, span in spans.items()} | places
+    nodes = [paths.CELL_FRAME, *(frame for frame in tree.last if frame != paths.CELL_FRAME)]
     captions = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
     captions[paths.CELL_FRAME] = f"the frame of {tree.reference}"
     labels = [f"{node}\n{captions.get(node) or sigma_words(tree, node)}" for node in nodes]
@@ -87,8 +84,7 @@ def log_network(stream: rr.RecordingStream, scene: Scene, calibration: Calibrati
     stream.log(
         paths.NETWORK,
         rr.GraphNodes(
-            list(nodes),
-            positions=[(_ACROSS_PX * x, -_DOWN_PX * y) for x, y in nodes.values()],
+            nodes,
             labels=labels,
             colors=[colours.LINK if node in bodies else colours.USED for node in nodes],
         ),

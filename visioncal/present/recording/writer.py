@@ -12,6 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
 from visioncal.present import result_parts
+from visioncal.present.coverage import coverage_charts
 from visioncal.present.recording import codec, notes, paths, sights
 from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
 from visioncal.present.recording.charts import Charts
@@ -171,7 +172,10 @@ def _draw(
     frames = result_parts.target_frames(calibration, session)
     for drawing in (
         Uncertainty.of(calibration, evidence, scene.size_m, frames),
-        Charts.of(session, calibration, evidence),
+        Charts(
+            coverage_charts(calibration, [*evidence.values()]),
+            frozenset(view.view for view in calibration.views if view.used),
+        ),
         ArmPicture.of(session, calibration, scene.size_m),
     ):
         if drawing is not None:

@@ -19,11 +19,11 @@ from visioncal.present.report.plotting import (
     WIDE_IN,
     beside,
     colour_bar,
-    dots,
     drawn,
     legend,
     logarithmic,
     panels,
+    scattered,
 )
 from visioncal.results.arm import ArmResult, ThermalResult
 
@@ -49,7 +49,9 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
     positions[count:] += _GAP
     kinds = [("position [mm]", "nominal_mm", "mm"), ("orientation [deg]", "nominal_deg", "deg")]
     kinds = kinds if all(view.deg is not None for view in views) else kinds[:1]
-    figure, grid = panels(WIDE_IN, 1.7 * len(kinds) + 0.2, len(kinds), sharex=True)
+    figure, grid = panels(
+        WIDE_IN, 1.7 * len(kinds) + 0.4, len(kinds), 1, (0.8, 0.45, 0.75, 0.4), sharex=True
+    )
     for axes, (label, *names) in zip(grid[:, 0], kinds, strict=True):
         pairs = np.maximum([[getattr(view, name) for name in names] for view in views], _LEAST)
         logarithmic(axes.yaxis)
@@ -97,12 +99,12 @@ def workspace(
 
     order, stops = np.argsort(arm.map_sigmas_mm), seen(stops_m)
     low, high = np.percentile(arm.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
-    figure, ((axes,),) = panels(MIDDLE_IN, 0.8 * MIDDLE_IN)
+    figure, ((axes,),) = panels(MIDDLE_IN, 0.8 * MIDDLE_IN, 1, 1, (0.6, 0.45, 0.3, 0.06))
     labels = ("base x [m]", "base y [m]")
     labels = labels if side == "top" else ("distance from the base's axis [m]", "base z [m]")
     axes.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
     places, sigmas_mm = seen(arm.map_places_m)[order], arm.map_sigmas_mm[order]
-    shown = dots(axes, places, sigmas_mm, vmin=low, vmax=high, s=26.0)
+    shown = scattered(axes, places, sigmas_mm, vmin=low, vmax=high, s=26.0)
     axes.plot(stops[:, 0], stops[:, 1], "x", color=INK, markersize=4.5)
     axes.plot([0.0], [0.0], "s", color=INK, markersize=6.0)
     colour_bar(axes, shown, "sigma [mm]")

@@ -16,6 +16,7 @@ from visioncal.present.report.plotting import (
     ACCENT,
     BAD,
     WIDE_IN,
+    bars,
     drawn,
     few_ticks,
     label_x,
@@ -25,8 +26,8 @@ from visioncal.present.report.plotting import (
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
 
-# Width of a stop's bars, and the largest number of labels below them.
-_BAR, _MOST_LABELS = 0.38, 20
+# Width of a stop's bars.
+_BAR = 0.38
 # Words for the states of triggers, in the order of the table.
 _STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
 
@@ -88,18 +89,18 @@ def _residuals(
     """Residuals by stop: as calibrated, and with the change undone."""
     sides = [("as calibrated", ACCENT if after is None else BAD, before)]
     sides += [] if after is None else [("with the change undone", ACCENT, after)]
-    figure, grid = panels(WIDE_IN, 3.6, 2, sharex=True)
+    figure, grid = panels(WIDE_IN, 3.6, 2, 1, (0.8, 0.45, 0.06, 0.3), sharex=True)
     # Side by side where there are two.
     width, shifts = (1.5 * _BAR, (0.0,)) if after is None else (_BAR, (-0.5 * _BAR, 0.5 * _BAR))
     places = np.arange(len(stops))
+    label_x(grid[1, 0], stops, "stop, by its views")
     for column, label in enumerate(("position [mm]", "rotation [deg]")):
         axes = grid[column, 0]
         for shift, (_, colour, values) in zip(shifts, sides, strict=True):
-            axes.bar(places + shift, values[:, column], width, color=colour, alpha=0.9)
-        axes.set_ylabel(label)
+            bars(axes, places + shift, values[:, column], colour, width)
+        axes.set(ylabel=label, ylim=(0.0, None))
+        axes.grid(visible=False, axis="x")
         few_ticks(axes, y=4)
-    label_x(grid[1, 0], stops, _MOST_LABELS, "stop, by its views")
-    grid[0, 0].grid(visible=False, axis="x")
     if after is not None:
         legend(figure, [("s", colour, words) for words, colour, _ in sides])
     return figure, "Residuals of each stop, before and after the change"

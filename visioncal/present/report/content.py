@@ -16,14 +16,12 @@ from visioncal.core.types import FloatArray
 from visioncal.present import result_parts
 from visioncal.present.advice import mark_of
 from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
-from visioncal.present.network_layout import weakest_frame
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import ClockResult
 from visioncal.session import Session
-from visioncal.session.frames import CELL, frames_of_kind
 from visioncal.vision.camera import intrinsics
 
 _MOUNTS = {
@@ -59,28 +57,13 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
-    """The few figures that most readers look for."""
-    validation = calibration.validation
-    facts = [*need_facts(calibration.need, calibration.verdict)]
-    if calibration.cell is None:
-        edge = next(iter(calibration.edges.values()))
-        sensor = "instrument" if calibration.mount == "instrument" else "camera"
-        facts += [
-            Fact(f"{sensor} position, sigma", f"{significant(edge.sigma_mm)} mm"),
-            Fact(f"{sensor} orientation, sigma", f"{significant(edge.sigma_deg)}{DEGREE}"),
-        ]
-    else:
-        facts += _cell_sigmas(calibration)
-    for name, arm in calibration.by_name.robots.items():
-        if arm.arm is not None and arm.arm.workspace_sigma_mm is not None:
-            sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
-            facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
+    """The three figures that most readers look for, where they are known."""
+    facts, validation = [*need_facts(calibration.need, calibration.verdict)], calibration.validation
     if validation.is_of_unseen:
         rotation_deg = validation.held_out.deg
         note = "" if rotation_deg is None else f"{significant(rotation_deg)}{DEGREE}"
-        facts.append(Fact("held-out residual", f"{significant(validation.held_out.mm)} mm", note))
-    if calibration.rms.px is not None:
-        facts.append(Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
+        size = f"{significant(validation.held_out.mm)} mm"
+        facts.append(Fact("views not used in the fit agree to", size, note))
     return (*facts, views_used(calibration))
 
 
@@ -90,21 +73,6 @@ def views_used(calibration: Calibration) -> Fact:
     return Fact("views used", f"{used} of {len(calibration.views)}")
 
 
-def _cell_sigmas(calibration: Calibration) -> list[Fact]:
-    """Sigmas of the robots' bases relative to the first one, and the least known frame."""
-    tree = calibration.tree
-    bases = [name for name in frames_of_kind(tree.parents, "base") if tree.parents[name] == CELL]
-    facts = []
-    for base in bases[1:]:
-        edge = tree.between(bases[0], base)
-        sigma_mm, sigma_deg = significant(edge.sigma_mm), f"{significant(edge.sigma_deg)}{DEGREE}"
-        facts.append(Fact(f"{base} in {bases[0]}, sigma", f"{sigma_mm} mm", sigma_deg))
-    worst = weakest_frame(tree)
-    if worst:
-        facts.append(Fact("least known", worst, f"{significant(tree.edge_of(worst).sigma_mm)} mm"))
-    return facts
-
-
 def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> FloatArray:
     """(m, 3) flange positions of the used views [m]."""
     used = {view.view for view in calibration.views if view.used}
@@ -112,22 +80,21 @@ def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Float
     return np.reshape([pose[:3, 3] for pose in poses if pose is not None], (-1, 3))
 
 
-def need_facts(need: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
-    """Probability that the task's need is met, and the tolerance the result suits."""
-    facts = []
+def need_facts(need: NeedMet | None, verdict: Verdict) -> Iterator[Fact]:
+    """Probability that the task's need is met, or else the tolerance that the result suits."""
+    good, sent = "", ""
+    if verdict.good_for_mm is not None:
+        good, sent = f"{significant(rounded_up(verdict.good_for_mm))} mm", "and more"
+        if verdict.good_for_mm_uncorrected is not None:
+            of = significant(rounded_up(verdict.good_for_mm_uncorrected))
+            sent += f", with corrected targets; by the controller's own poses {of} mm"
     if need is not None:
         tolerances = ((need.need.mm, " mm"), (need.need.deg, DEGREE))
         words = " and ".join(f"{value:g}{unit}" for value, unit in tolerances if value is not None)
-        facts.append(Fact(f"picks within {words}", percent(need.probability)))
-    if verdict.good_for_mm is not None:
-        of = verdict.good_for_mm_uncorrected
-        sent = "and more" if of is None else "and more, with corrected targets"
-        size = f"{significant(rounded_up(verdict.good_for_mm))} mm"
-        facts.append(Fact("good for tasks of", size, sent))
-        if of is not None:
-            size = f"{significant(rounded_up(of))} mm"
-            facts.append(Fact("by the controller's own poses, of", size, "and more"))
-    return tuple(facts)
+        note = f"good for tasks of {good} {sent}" if good else ""
+        yield Fact(f"picks within {words}", percent(need.probability), note)
+    elif good:
+        yield Fact("good for tasks of", good, sent)
 
 
 def method_facts(calibration: Calibration, session: Session | None = None) -> tuple[Fact, ...]:

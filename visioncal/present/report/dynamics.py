@@ -22,11 +22,11 @@ from visioncal.present.report.plotting import (
     BAD,
     MUTED,
     WIDE_IN,
-    dots,
     drawn,
     few_ticks,
     legend,
     panels,
+    strokes,
 )
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
@@ -94,7 +94,13 @@ def torques(prediction: Prediction) -> tuple[Figure, str]:
     errors = np.where(prediction.used[subset], measured - predicted, np.nan)
     joints = measured.shape[1]
     figure, grid = panels(
-        WIDE_IN, 1.15 * joints + 0.4, joints, 2, sharex=True, width_ratios=_SHARES
+        WIDE_IN,
+        1.15 * joints + 0.4,
+        joints,
+        2,
+        (0.8, 0.45, 0.06, 0.3),
+        sharex=True,
+        width_ratios=_SHARES,
     )
     for joint, (axes, error_axes) in enumerate(grid):
         axes.plot(times, measured[:, joint], color=MUTED, linewidth=2.0)
@@ -119,7 +125,8 @@ def friction(
         return None
     joints = identified.robot.joint_count
     rows = -(-joints // _COLUMNS)
-    figure, grid = panels(WIDE_IN, 2.3 * rows, rows, _COLUMNS)
+    figure, grid = panels(WIDE_IN, 2.3 * rows, rows, _COLUMNS, (0.8, 0.45, 0.06, 0.3))
+    figure.subplots_adjust(wspace=0.22, hspace=0.3)
     for axes in grid.flat[joints:]:
         axes.set_visible(False)
     for joint, axes in enumerate(grid.flat[:joints]):
@@ -147,6 +154,6 @@ def _draw_friction(
     curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
     curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
     modelled = friction_at(identified, curve)[:, joint]
-    dots(axes, samples, color=MUTED, alpha=0.5)
+    strokes(axes, *samples.T, MUTED, 2.5)
     axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
     few_ticks(axes, 5, 5)

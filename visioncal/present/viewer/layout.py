@@ -28,7 +28,6 @@ class _Contents:
     """Which parts a session and its result have."""
 
     images: bool
-    joints: int
     unused: bool
     frames: bool
     orientations: bool
@@ -38,12 +37,10 @@ class _Contents:
 
     @classmethod
     def of(cls, session: Session, calibration: Calibration | None) -> "_Contents":
-        joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
         cell = None if calibration is None else calibration.cell
         views = () if calibration is None else calibration.views
         return cls(
             any(view.image or view.has_corners for view in session.views),
-            min(joints, default=0) if cell is None else 0,
             not all(view.used for view in views),
             calibration is not None and bool(calibration.frames),
             not views or any(view.residual_deg is not None for view in views),
@@ -204,20 +201,7 @@ def _verdict(contents: _Contents, verdict: Verdict | None) -> rrb.Container | rr
 
 def _residuals(contents: _Contents) -> rrb.Container:
     over_views = [rrb.Horizontal(*_plots(contents, seer)) for seer in contents.seers]
-    if contents.joints == 0:
-        return rrb.Vertical(*over_views, name="Residuals")
-    over_joints = rrb.Grid(
-        *(
-            rrb.BarChartView(
-                name=f"Position residual [mm] over q{joint + 1} [deg]",
-                origin=paths.over_joint(joint),
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-            for joint in range(contents.joints)
-        ),
-        grid_columns=min(contents.joints, 4) if contents.joints != 6 else 3,
-    )
-    return rrb.Vertical(*over_views, over_joints, name="Residuals", row_shares=[1, 2])
+    return rrb.Vertical(*over_views, name="Residuals")
 
 
 def _coverage(contents: _Contents) -> rrb.Container:
