@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal
-from support.drawn import column
 from support.marks import slow
 
 from visioncal.core.errors import DataError, DegenerateError
@@ -15,7 +14,6 @@ from visioncal.dynamics.identified import stribeck_rows
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics
-from visioncal.present.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.session import Session
 from visioncal.simulation.dynamics import (
@@ -243,7 +241,6 @@ def written(run, tmp_path_factory):
     assert [file.name for file in write_dynamics(folder, run).files] == [
         "dynamics.json",
         "report.html",
-        "recording.rrd",
     ]
     return folder
 
@@ -258,18 +255,6 @@ def test_the_report_says_what_was_found(written, run):
     assert parameters.count('<tr class="') == identified.base.rank
     assert page.count("<svg role") == len(run.predictions) + 1
     assert "http://" not in page.replace("http://www.w3.org", "")
-
-
-def test_the_recording_has_torques_over_time(written, run):
-    path = written / "recording.rrd"
-    samples = sum(len(prediction.times_s) for prediction in run.predictions)
-    for name in ("measured", "predicted", "known_before"):
-        # One more a motion ends its line.
-        entity = f"/dynamics/torques_nm/joint_3/{name}"
-        count = len(column(path, entity, "Scalars:scalars", MOTION_TIMELINE))
-        assert count == samples + len(run.predictions)
-    # It is the session as well, which can be identified again.
-    assert Session.load(path).digest() == run.session.digest()
 
 
 @pytest.mark.parametrize("form", ["robot-urdf", "robot-json"])

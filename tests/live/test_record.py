@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import re
 import signal
 import sys
@@ -12,23 +11,18 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 import pytest
-import rerun as rr
 from support.commands import visioncal
-from support.drawn import column
 from support.live_cell import fake_devices, fake_plan
 from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
 from visioncal.cli import record as record_module
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DataError
 from visioncal.live.capture import devices
 from visioncal.live.capture.cell import HostClock
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
+from visioncal.live.planning.plan_file import plan_document, read_plan
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.present.recording import paths
-from visioncal.present.recording.live import LiveCell, LiveDrawing, LiveView
-from visioncal.present.viewer import live as viewer
 from visioncal.session import Session
 
 ARM, CAMERA = ("--arm", "fake:here"), ("--camera", "fake")
@@ -300,51 +294,3 @@ def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_pa
         number = number_of(cv2.imread(str(tmp_path / "live" / view.image)))
         off = view.base_from_flange().translation - true_flanges[number][:3, 3]
         assert np.linalg.norm(off) < REPEATABILITY_M
-
-
-def test_a_recording_is_drawn(tmp_path):
-    plan: PlanFile = fake_plan(2)
-    arm, camera = fake_devices(plan)
-    rr.set_strict_mode(True)
-    file = tmp_path / "live.rrd"
-    stream = rr.RecordingStream(paths.APPLICATION)
-    stream.save(file)
-    scene = plan.cell
-    drawn = LiveCell(
-        scene.mount, scene.target, camera.resolution, scene.robot, camera.lens, scene.x, scene.z
-    )
-    drawing = LiveDrawing(stream, drawn)
-    drawing.begin()
-    px = np.array([[100.0, 50.0], [300.0, 200.0]])
-    for view, stop in enumerate(plan.stops, start=1):
-        arm.q0 = stop.q
-        state, image = arm.state(), camera.frame().image
-        shown = LiveView(view, image, px, state.base_from_flange, state.q, 0.1 * view, "note")
-        drawing.draw(shown)
-    stream.send_blueprint(viewer.live_blueprint())
-    stream.disconnect()
-    rr.set_strict_mode(False)
-    assert len(column(file, paths.LIVE_SIGMA, "Scalars:scalars")) == 2
-
-
-def test_without_a_display_the_recording_goes_on(planned, cell, tmp_path, monkeypatch):
-    def none(_):
-        raise DriverError("rerun's viewer cannot be shown here; is there a display?")
-
-    monkeypatch.setattr(viewer, "live_viewer", none)
-    done = record(tmp_path / "live", "--plan", planned[0], "--yes", "--view")
-    assert done.status == 0, done.err
-    assert "goes on without it" in done.err
-    assert cell[0].moves >= 4
-
-
-@pytest.mark.skipif(
-    any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")),
-    reason="there is a display, on which a window would open",
-)
-def test_a_viewer_without_a_display_is_told():
-    with (
-        pytest.raises(DriverError, match="cannot be shown here"),
-        viewer.live_viewer("recording"),
-    ):
-        pass

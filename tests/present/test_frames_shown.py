@@ -1,17 +1,14 @@
 """Tools and fixtures in the report and in the recording."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 from support.drawn import column
 from support.kept import assert_same_evidence
 from support.samples import (
     BASE_FROM_FIXTURE,
     FLANGE_FROM_TOOL,
-    fixture_frame,
     made_up,
     with_frames,
 )
@@ -22,7 +19,6 @@ from visioncal.present.recording import (
     read_evidence,
     write_recording,
 )
-from visioncal.present.recording.accuracy import SIGMAS_95
 from visioncal.present.report.content import edge_facts
 from visioncal.results import to_document
 
@@ -72,19 +68,3 @@ def test_frames_hang_where_they_belong(recorded, child, parent, expected):
     np.testing.assert_allclose(place_m, expected.translation, atol=1e-6)
     np.testing.assert_allclose(turn, expected.rotation.as_matrix(), atol=1e-6)
     assert column(recorded, entity, "CoordinateFrame:frame")[0].tolist() == [child]
-
-
-def test_the_ellipsoid_holds_95_percent():
-    points = np.random.default_rng(2).normal(size=(200_000, 3))
-    # The share's standard deviation is 0.0005.
-    assert np.mean(np.linalg.norm(points, axis=1) < SIGMAS_95) == pytest.approx(0.95, abs=0.002)
-
-
-def test_exact_frames_have_no_ellipsoid(sample, tmp_path):
-    frame = fixture_frame()
-    exact = replace(frame, edge=replace(frame.edge, covariance=np.zeros((6, 6))))
-    calibration = replace(sample.calibration, frames={"base_from_fixture": exact})
-    write_recording(tmp_path / "cell.rrd", sample.session, calibration, sample.evidence, None)
-    entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "cell.rrd").stream()}
-    assert f"{paths.FRAMES}/fixture" in entities
-    assert not [entity for entity in entities if entity.startswith(f"{paths.FRAMES}/fixture/")]

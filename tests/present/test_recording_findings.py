@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 from support.drawn import column
 from support.findings import healthy, sick, with_findings
 from support.samples import TARGET, made_up
@@ -85,27 +84,6 @@ def test_residuals_of_views_left_out_are_drawn_to_scale(sample, recorded):
         for found, wanted in zip((magnified[view], to_scale[view]), expected, strict=True):
             # Single precision of arrows that are some ten pixels long.
             np.testing.assert_allclose(found, wanted, atol=1e-4)
-
-
-def test_placements_far_out_are_drawn_at_arm_s_length(sample, tmp_path):
-    away = np.eye(4)
-    away[:3, 3] = [0.3, 0.0, 0.4]
-    seen = sample.evidence[6]
-    assert seen.cam_from_target is not None
-    evidence = [*sample.evidence]
-    evidence[6] = replace(seen, cam_from_target=seen.cam_from_target @ away)
-    path = tmp_path / "recording.rrd"
-    write_recording(path, sample.session, sample.calibration, evidence, None)
-    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
-    (beyond,) = (
-        entity for entity in entities if entity.endswith(paths.BEYOND) and "placements" in entity
-    )
-    (arrow,) = column(path, beyond, "Arrows3D:vectors")[0]
-    points = column(path, beyond.replace(paths.BEYOND, paths.REJECTED), "Points3D:positions")[0]
-    # It points where the view puts the target, and is as short as a fifth of the cell.
-    np.testing.assert_allclose(arrow / np.linalg.norm(arrow), [0.6, 0.0, 0.8], atol=1e-3)
-    assert 0.05 < np.linalg.norm(arrow) < 0.3
-    np.testing.assert_allclose(points, [arrow], atol=1e-6)
 
 
 def test_the_target_as_a_view_left_out_sees_it_is_marked(recorded):

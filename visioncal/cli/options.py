@@ -50,7 +50,6 @@ force_both = partial(flag, "Replace an existing file; and use a result that is b
 yes_flag = partial(
     flag, "Move the arm without asking: the cell is clear, a hand on the stop button.", "--yes"
 )
-view_flag = partial(flag, "Show it in the rerun viewer as it goes.", "--view")
 seed_option = partial(option, "Random seed.", "--seed", default=0, min=0)
 camera_name = partial(option, "Of a whole cell: which camera, as left.", "--camera")
 robot_name = partial(option, "Of a whole cell: which robot, as a.", "--robot")

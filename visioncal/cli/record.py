@@ -4,10 +4,10 @@ import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from visioncal.cli.console import asked, print_json, say
 from visioncal.cli.parsing import refuse_given
@@ -33,14 +33,9 @@ from visioncal.live.capture.recording import (
     motion_summary,
     record,
 )
-from visioncal.live.capture.take import Missed
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
-
-# For type hints only: rerun takes half a second to import.
-if TYPE_CHECKING:
-    from visioncal.present.recording.live import LiveDrawing
 
 
 def record_command(options: RecordOptions) -> None:
@@ -74,44 +69,15 @@ def record_command(options: RecordOptions) -> None:
         count = len(scene.planned.stops) if drives else options.views
         facts = facts_of(scene, cell, options.out.name)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        with shown_in(scene, cell, wanted=options.view) as viewers:
-            watchers = [ViewLines(), *viewers]
-            if drives:
-                steps = record_driven(cell, scene, journal, taking, watchers, consent)
-            else:
-                ask = asked if answers else None
-                steps = record_guided(cell, scene, journal, taking, watchers, options.views, ask)
+        watchers = [ViewLines()]
+        if drives:
+            steps = record_driven(cell, scene, journal, taking, watchers, consent)
+        else:
+            ask = asked if answers else None
+            steps = record_guided(cell, scene, journal, taking, watchers, options.views, ask)
     if drives:
         check_all(journal, steps)
     finish(journal, steps, as_json=options.as_json)
-
-
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A watcher that draws each view."""
-
-    drawing: "LiveDrawing"
-
-    def stepped(self, step: CaptureEvent) -> None:
-        """Draws a view."""
-        # Rerun takes half a second to import, which recordings without a viewer need not wait for.
-        from visioncal.present.recording.live import LiveView
-
-        outcome = step.found
-        if isinstance(outcome, Missed):
-            return
-        sigma_mm = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
-        self.drawing.draw(
-            LiveView(
-                step.view,
-                outcome.frame.image,
-                outcome.corners.px,
-                outcome.state.base_from_flange,
-                outcome.state.q,
-                sigma_mm,
-                step.note,
-            )
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,38 +212,6 @@ def record_guided(
         return ask_and_take(capture, cell.arm, views, ask)
     say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
     return follow(capture, views)
-
-
-@contextmanager
-def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
-    """Opens the viewer if wanted; without a display the recording continues without it."""
-    if not wanted:
-        yield []
-        return
-    # Rerun takes half a second to import, which recordings without a viewer need not wait for.
-    from visioncal.present.recording import live
-    from visioncal.present.viewer.live import live_viewer
-
-    plan = None if scene.plan is None else scene.plan.cell
-    drawn = live.LiveCell(
-        scene.mount,
-        scene.target,
-        cell.camera.resolution,
-        scene.robot,
-        cell.camera.factory or scene.lens,
-        None if plan is None else plan.x,
-        None if plan is None else plan.z,
-    )
-    with ExitStack() as opened:
-        watchers: list[Watcher] = []
-        try:
-            stream = opened.enter_context(live_viewer(f"recording with {cell.camera.name}"))
-            drawing = live.LiveDrawing(stream, drawn)
-            drawing.begin()
-            watchers = [Shown(drawing)]
-        except DriverError as error:
-            say(f"{error} The recording goes on without it.")
-        yield watchers
 
 
 @contextmanager

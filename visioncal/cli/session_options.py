@@ -17,7 +17,6 @@ from visioncal.cli.options import (
     seed_option,
     session_argument,
     size_option,
-    view_flag,
     yes_flag,
 )
 from visioncal.cli.parsing import names_in, pair_in
@@ -441,7 +440,6 @@ class RecordOptions:
     resume: bool = flag("Go on with a recording that was ended or cut off.")
     dry_run: bool = flag("Only say what would be driven; nothing moves.")
     yes: bool = yes_flag()
-    view: bool = view_flag()
     as_json: bool = json_flag()
 
 

@@ -186,20 +186,14 @@ def write_motions(
 
 
 def write_dynamics(folder: Path, run: "Run") -> Written:
-    """Writes identified dynamics, their report and recording; see `write_outputs`."""
+    """Writes identified dynamics and their report; see `write_outputs`."""
 
     def report(path: Path) -> None:
         from visioncal.present.report.dynamics import render_dynamics
 
         write_atomically(path, render_dynamics(run))
 
-    def record(path: Path) -> None:
-        from visioncal.present.recording.dynamics import write_dynamics_recording
-        from visioncal.present.viewer.planned import dynamics_blueprint
-
-        write_dynamics_recording(path, run, dynamics_blueprint(run))
-
-    return _write(folder, {DYNAMICS_FILE: run.identified.save}, {REPORT: report, RECORDING: record})
+    return _write(folder, {DYNAMICS_FILE: run.identified.save}, {REPORT: report}, (RECORDING,))
 
 
 def _write(

@@ -65,13 +65,6 @@ class CaptureEvent:
             f"{sigma}{next_words}"
         )
 
-    @property
-    def note(self) -> str:
-        """The same in Markdown, for the viewer."""
-        sigma = "" if self.accuracy is None else f"\n\nPredicted sigma: {self.accuracy.words}"
-        next_words = self.advice or "anything new"
-        return f"**View {self.view}**\n\n{self.covered}{sigma}\n\nNext: {next_words}"
-
 
 class Watcher(Protocol):
     """Observer of a recording; it must be quick."""

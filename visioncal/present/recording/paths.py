@@ -39,16 +39,8 @@ DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
-# The calibrated arm.
-WORKSPACE = "/arm/workspace"
-NOMINAL_ARM = "/arm/as_stated"
-UNSEEN_MM = "/arm/unseen/position_mm"
-UNSEEN_DEG = "/arm/unseen/orientation_deg"
+# What was found of the arms.
 ARM_NOTE = "/notes/arm"
-
-# Drift with temperature.
-DRIFT_MM = "/arm/warming/drift_mm"
-RISE_K = "/arm/warming/rise_k"
 
 # A cell of several robots: its frame, and who saw whom.
 CELL_FRAME = "cell"
@@ -68,18 +60,6 @@ STOP_NOTE = "/notes/stop"
 MOTION_TIMELINE = "motion"
 MOTION = "/motion"
 MOTION_KINDS = ("position_deg", "speed_deg_s", "acceleration_deg_s2", "torque_nm")
-
-# A dynamic identification, on the same timeline.
-TORQUES = "/dynamics/torques_nm"
-TORQUE_ERRORS = "/dynamics/errors_nm"
-SPEEDS = "/dynamics/speeds_rad_s"
-DYNAMICS_NOTE = "/notes/dynamics"
-PARAMETERS_NOTE = "/notes/parameters"
-MEASURED_TORQUE, PREDICTED_TORQUE, KNOWN_TORQUE = "measured", "predicted", "known_before"
-
-# A live recording.
-LIVE_SIGMA = "/live/predicted_sigma_mm"
-LIVE_NOTE = "/notes/recording"
 
 # Plots and text.
 RESIDUALS = "/residuals"
@@ -127,13 +107,3 @@ def part_of(plot: str, name: str) -> str:
 def magnified_residuals(factor: int) -> str:
     """Entity of residuals drawn `factor` times longer."""
     return f"{IMAGE}/residuals_magnified_{factor}x"
-
-
-def magnified_arm(factor: int) -> str:
-    """Entity of the nominal arm, its deviation drawn `factor` times larger."""
-    return f"{NOMINAL_ARM}/off_magnified_{factor}x"
-
-
-def of_joint(group: str, joint: int) -> str:
-    """Entity of a joint (index from 0) within a group over time."""
-    return f"{group}/joint_{joint + 1}"

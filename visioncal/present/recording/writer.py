@@ -14,7 +14,6 @@ from visioncal.core.types import Searched
 from visioncal.present import result_parts
 from visioncal.present.coverage import coverage_charts
 from visioncal.present.recording import codec, notes, paths, sights
-from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.recording.reader import RecordedImages
@@ -169,28 +168,13 @@ def _draw(
         sights.log_network(stream, scene, calibration)
         sights.log_sights(stream, scene, session, calibration)
     sights.log_seen_targets(stream, scene, session, calibration, seen)
-    frames = result_parts.target_frames(calibration, session)
-    for drawing in (
-        Uncertainty.of(calibration, evidence, scene.size_m, frames),
-        Charts(
-            coverage_charts(calibration, [*evidence.values()]),
-            frozenset(view.view for view in calibration.views if view.used),
-        ),
-        ArmPicture.of(session, calibration, scene.size_m),
-    ):
-        if drawing is not None:
-            drawing.log_static(stream)
-            drawing.log_views(stream, rows)
+    charts = Charts(
+        coverage_charts(calibration, [*evidence.values()]),
+        frozenset(view.view for view in calibration.views if view.used),
+    )
+    charts.log_static(stream)
+    charts.log_views(stream, rows)
     notes.log_static(stream, calibration, result_parts.stated_boards(session))
     shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
     unposed = {row: scene.unposed(view) for view, row in rows.items()}
     notes.log_views(stream, shown, dict(enumerate(session.views)), unposed)
-    for name, arm in calibration.by_name.robots.items():
-        drifts = () if arm.thermal is None else arm.thermal.views
-        for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
-            values = {
-                rows[drift.view]: float(getattr(drift, attribute))
-                for drift in drifts
-                if drift.view in rows
-            }
-            notes.log_scalars(stream, paths.part_of(plot, name), values)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
@@ -12,22 +11,9 @@ from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
-from visioncal.present.report.plotting import (
-    ACCENT,
-    BAD,
-    WIDE_IN,
-    bars,
-    drawn,
-    few_ticks,
-    label_x,
-    legend,
-    panels,
-)
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
 
-# Width of a stop's bars.
-_BAR = 0.38
 # Words for the states of triggers, in the order of the table.
 _STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
 
@@ -62,12 +48,11 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
             for view, reason in sorted(check.predicted.observed.reasons.items())
         ),
         residuals=_residual_table(stops, before, after if undone else None),
-        figure=_residuals(stops, before, after if undone else None),
     )
 
 
 def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Table:
-    """Residuals by stop, and their rms; see `_residuals`."""
+    """Residuals by stop, and their rms: as calibrated, and with the change undone."""
     sides = {"as calibrated": before} | ({} if after is None else {"undone": after})
     # Positions first, then rotations.
     columns = {
@@ -80,30 +65,6 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
     return Table.of(
         ("stop (views)", *columns), [(name, *map(significant, row)) for name, *row in rows]
     )
-
-
-@drawn
-def _residuals(
-    stops: Sequence[str], before: FloatArray, after: FloatArray | None
-) -> tuple[Figure, str]:
-    """Residuals by stop: as calibrated, and with the change undone."""
-    sides = [("as calibrated", ACCENT if after is None else BAD, before)]
-    sides += [] if after is None else [("with the change undone", ACCENT, after)]
-    figure, grid = panels(WIDE_IN, 3.6, 2, 1, (0.8, 0.45, 0.06, 0.3), sharex=True)
-    # Side by side where there are two.
-    width, shifts = (1.5 * _BAR, (0.0,)) if after is None else (_BAR, (-0.5 * _BAR, 0.5 * _BAR))
-    places = np.arange(len(stops))
-    label_x(grid[1, 0], stops, "stop, by its views")
-    for column, label in enumerate(("position [mm]", "rotation [deg]")):
-        axes = grid[column, 0]
-        for shift, (_, colour, values) in zip(shifts, sides, strict=True):
-            bars(axes, places + shift, values[:, column], colour, width)
-        axes.set(ylabel=label, ylim=(0.0, None))
-        axes.grid(visible=False, axis="x")
-        few_ticks(axes, y=4)
-    if after is not None:
-        legend(figure, [("s", colour, words) for words, colour, _ in sides])
-    return figure, "Residuals of each stop, before and after the change"
 
 
 def _change_table(check: Check) -> Table:

@@ -13,14 +13,11 @@ from visioncal.present import result_parts
 from visioncal.present.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.present.recording import colours, paths
 from visioncal.results import Calibration, CellResult
-from visioncal.results.arm import ArmResult
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
 
 # Distance of the eye from the cell's centre, in extents of the cell's content.
 EYE_DISTANCE = 0.8
-# In extents of the workspace, whose corners are empty.
-MAP_DISTANCE = 0.55
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     tabs: list[rrb.Container | rrb.View] = [_overview(contents, eye, calibration)]
     if contents.cell is not None:
         tabs.append(rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK))
-    tabs += [] if calibration is None else _arms(calibration, eye)
+    tabs += [] if calibration is None else _arms(calibration)
     tabs.append(_residuals(contents))
     if contents.cell is None:
         tabs.append(_coverage(contents))
@@ -145,42 +142,16 @@ def _overview(
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
 
 
-def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
-    """Calibrated arms, one with its workspace or several as text; and their drift."""
+def _arms(calibration: Calibration) -> list[rrb.Container]:
+    """What was found of the arms, as text."""
     sections = calibration.by_name.robots.values()
-    calibrated = [
-        section.arm for section in sections if section.arm is not None and section.arm.is_calibrated
-    ]
-    tabs: list[rrb.Container] = []
-    if calibrated and calibration.cell is None:
-        tabs.append(_arm(calibrated[0], eye))
-    elif calibrated:
-        note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
-        tabs.append(rrb.Horizontal(note, name="Arm"))
-    if any(section.thermal is not None for section in sections):
-        drift = rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM)
-        rise = rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K)
-        tabs.append(rrb.Vertical(drift, rise, name="Temperature"))
-    return tabs
-
-
-def _arm(arm: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
-    """Accuracy of the calibrated arm, residuals of unseen views, and parameters."""
-    # The workspace surrounds the base and extends beyond the views.
-    workspace_eye = eye_on(arm.map_places_m, MAP_DISTANCE) if arm.workspace_map else eye
-    places = (paths.BASE, paths.ROBOT, paths.WORKSPACE, paths.NOMINAL_ARM)
-    contents = [*(f"+ {place}/**" for place in places), f"+ {paths.STOPS}/{paths.USED}"]
-    cell = space_view("Sigma of a tool's place over the workspace", contents, workspace_eye)
-    note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
-    if not arm.left_out:
-        return rrb.Horizontal(cell, note, name="Arm", column_shares=[1.4, 1])
-    # A title has little room; the note explains the rest.
-    legend = "orange: as stated, blue: calibrated"
-    unseen = [series(f"Left out [mm], {legend}", paths.UNSEEN_MM)]
-    if arm.nominal.held_out_deg is not None:
-        unseen.append(series(f"Left out [deg], {legend}", paths.UNSEEN_DEG))
-    left = rrb.Vertical(cell, rrb.Horizontal(*unseen), row_shares=[2.4, 1])
-    return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
+    if not any(
+        section.thermal is not None or (section.arm is not None and section.arm.is_calibrated)
+        for section in sections
+    ):
+        return []
+    note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
+    return [rrb.Horizontal(note, name="Arm")]
 
 
 def _verdict(contents: _Contents, verdict: Verdict | None) -> rrb.Container | rrb.View:

@@ -3,14 +3,12 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from visioncal.dynamics import Run
 from visioncal.present.recording import paths
 from visioncal.present.recording.preview import MotionPreview, Preview
 from visioncal.present.viewer.layout import (
     disc_views,
     eye_on,
     image_view,
-    series,
     space_view,
     with_panels,
 )
@@ -83,34 +81,3 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
         column_shares=[1, 1],
     )
     return with_panels(both, paths.MOTION_TIMELINE)
-
-
-def dynamics_blueprint(run: Run) -> rrb.Blueprint:
-    """Layout of torques over time beside the moving arm."""
-    figures = rrb.Horizontal(
-        rrb.TextDocumentView(name="How well torques are predicted", origin=paths.DYNAMICS_NOTE),
-        rrb.TextDocumentView(name="Base parameters", origin=paths.PARAMETERS_NOTE),
-        name="Figures",
-    )
-    robot = run.identified.robot
-    joints, names = range(robot.joint_count), robot.joint_names
-    torques = [
-        series(f"{names[joint]} [N m]", paths.of_joint(paths.TORQUES, joint)) for joint in joints
-    ]
-    q = np.concatenate([prediction.q for prediction in run.predictions])
-    flange = robot.base_from_flange(q)[:, :3, 3]
-    contents = [f"+ {paths.BASE}/**", f"+ {paths.ROBOT}/**"]
-    arm = space_view("The arm as it moved", contents, eye_on(np.array([np.zeros(3), *flange])))
-    left = rrb.Vertical(
-        arm,
-        series("Error of all joints [N m]", paths.TORQUE_ERRORS),
-        series("Speeds [rad/s]", paths.SPEEDS),
-        row_shares=[2, 1, 1],
-    )
-    over_time = rrb.Horizontal(
-        left,
-        rrb.Grid(*torques, grid_columns=2),
-        name="Torques: measured grey, predicted blue, by what was known before brown",
-        column_shares=[1, 2],
-    )
-    return with_panels(rrb.Tabs(over_time, figures, active_tab=0), paths.MOTION_TIMELINE)
