@@ -1,4 +1,4 @@
-"""Plots of an arm: residuals before and after calibration, uncertainty, springs and drift."""
+"""Figures of arms and boards: residuals before and after, uncertainty, drift, a board's shape."""
 
 from typing import Literal
 
@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from visioncal.core.number_format import significant
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Target
 from visioncal.present.arms import hours
 from visioncal.present.report.plotting import (
     ACCENT,
@@ -26,6 +26,7 @@ from visioncal.present.report.plotting import (
     scattered,
 )
 from visioncal.results.arm import ArmResult, ThermalResult
+from visioncal.results.sections import BoardResult
 
 # Gap between cross-validation views and hold-out views, in views; most labelled views.
 _GAP, _MOST_LABELS = 1.5, 25
@@ -33,6 +34,8 @@ _GAP, _MOST_LABELS = 1.5, 25
 _LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
 # Smallest value on a logarithmic scale [mm, deg].
 _LEAST = 1e-6
+# Smaller depths are rounding errors.
+_LEAST_DEPTH_MM = 1e-6
 # Half width of the drift's 95 % band in sigmas.
 _BAND = 1.96
 
@@ -124,3 +127,22 @@ def course(thermal: ThermalResult) -> tuple[Figure, str]:
                       linewidth=0.0)  # fmt: skip
     axes.plot(times_h, drift_mm, color=ACCENT, linewidth=1.6)
     return figure, "Drift of the flange against time, with its 95 % band"
+
+
+@drawn
+def board_shape(board: BoardResult, target: Target, name: str = "") -> tuple[Figure, str] | None:
+    """Depth of a board behind its mean plane; None for a flat one."""
+    x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
+    reach = float(np.abs(depth_mm).max())
+    if not board.is_bent or reach < _LEAST_DEPTH_MM:
+        return None
+    figure, ((axes,),) = panels(MIDDLE_IN, 0.7 * MIDDLE_IN, 1, 1, (0.6, 0.45, 0.3, 0.06))
+    levels = np.linspace(-reach, reach, 14)
+    shown = axes.tricontourf(x_mm, y_mm, depth_mm, levels, cmap="coolwarm")
+    axes.plot(x_mm, y_mm, "o", color="#202020", markersize=1.4)
+    # y points down on the printed page.
+    axes.invert_yaxis()
+    axes.set(xlabel="target x [mm]", ylabel="target y [mm]", aspect="equal")
+    axes.grid(visible=False)
+    colour_bar(axes, shown, "depth [mm]")
+    return figure, f"Depth of the board {name}".strip() + " over its plane"

@@ -1,53 +1,40 @@
-"""Plots of the report: residuals by view and over joints, coverage, the board's shape."""
+"""Charts of the report as SVG: residuals by view and over joints, and coverage.
 
-from collections.abc import Collection, Sequence
+They are lines, dots and words in the page's colours; matplotlib, whose import takes as long as all
+else in a report, draws those of arms and boards.
+"""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from markupsafe import Markup, escape
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import log
-from visioncal.core.types import Target
+from visioncal.core.types import FloatArray
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import coverage_charts
-from visioncal.present.report.plotting import (
-    ACCENT,
-    BAD,
-    CHECK,
-    GOOD,
-    INK,
-    LINE,
-    MIDDLE_IN,
-    MUTED,
-    SMALL,
-    WIDE_IN,
-    bars,
-    beside,
-    colour_bar,
-    drawn,
-    few_ticks,
-    label_x,
-    legend,
-    panels,
-    strokes,
-)
 from visioncal.present.result_parts import placement, target_frames
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence
-from visioncal.results.sections import BoardResult
 from visioncal.results.views import rms_of
 from visioncal.session import Session
 
-_AXES = (("x", ACCENT), ("y", CHECK), ("z", GOOD))
+# Width of a drawing, and room for labels to its left and right [px].
+_WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 75.0
+# Height of a panel with its gap, and of its scale [px].
+_PANEL, _SCALE = 120.0, 92.0
+# Most steps of a scale, and most labels of views.
+_MOST_STEPS, _MOST_LABELS = 4, 25
 # Scales ignore the few largest points, which would compress the others.
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
 # Height of a bar chart over its largest used bar.
-_HEADROOM = 1.25
-# Smaller depths are rounding errors.
-_LEAST_DEPTH_MM = 1e-6
+_HEADROOM = 1.5
+# Ends of lines, by which one without length is a dot.
+_ROUND = 'style="stroke-linecap:round"'
+_COLOURS = ("accent", "check", "good")
 _LIMITS = CalibrationLimits()
 # Kinds of residuals: label, attributes of a view and of `Rms`, and where doubt begins.
 _MEASURES: tuple[tuple[str, str, str, float | None], ...] = (
@@ -55,12 +42,81 @@ _MEASURES: tuple[tuple[str, str, str, float | None], ...] = (
     ("orientation [deg]", "residual_deg", "deg", _LIMITS.scatter_deg[0]),
     ("reprojection [px]", "rms_px", "px", None),
 )
+# What each chart of the coverage shows.
+_CHARTS = {
+    "image": "corners in the image",
+    "directions": "viewing directions",
+    "rotation_axes": "rotation axes of the flange",
+}
 
 
-@drawn
-def residuals(
-    calibration: Calibration, outlying: Collection[int] = ()
-) -> tuple[Figure, str] | None:
+@dataclass
+class Drawing:
+    """Parts of an `<svg>` element, with the colours' names of the page."""
+
+    parts: list[str] = field(default_factory=list)
+
+    def path(self, colour: str, width: float, path: str, style: str = "") -> None:
+        """Draws a path."""
+        self.parts.append(
+            f'<path d="{path}" fill="none" stroke="var(--{colour})" stroke-width="{width:.3g}" '
+            f"{style}/>"
+        )
+
+    def text(self, x: float, y: float, words: str, anchor: str = "middle", more: str = "") -> None:
+        """Writes words around a place, or before or after it (`end`, `start`)."""
+        self.parts.append(
+            f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" {more}>{escape(words)}</text>'
+        )
+
+    def svg(self, words: str, height: float) -> Markup:
+        """The element, which scales with its container."""
+        return Markup(
+            f'<svg role="img" aria-label="{escape(words)}" viewBox="0 0 {_WIDTH:g} {height:g}" '
+            f'font-size="12" fill="var(--ink)">{"".join(self.parts)}</svg>'
+        )
+
+
+@dataclass
+class Panel:
+    """A scale from `low` to `high` in a drawing, whose zero is at the bottom or in the middle."""
+
+    drawing: Drawing
+    top: float  # Its upper end [px].
+    low: float
+    high: float
+
+    def y(self, value: FloatArray | float) -> FloatArray:
+        """Places of values in the drawing [px]."""
+        share = (np.asarray(value, dtype=float) - self.low) / (self.high - self.low)
+        return np.asarray(self.top + _SCALE * (1.0 - share))
+
+    def draw_scale(self, label: str) -> None:
+        """Draws lines at round values, with their figures."""
+        wanted = (self.high - self.low) / _MOST_STEPS
+        decade = 10.0 ** np.floor(np.log10(wanted))
+        step = decade * next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= wanted)
+        for value in step * np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1):
+            y = float(self.y(value))
+            self.drawing.path("line", 1.0, f"M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}")
+            self.drawing.text(_LEFT - 6.0, y + 4.0, f"{value + 0.0:.6g}", "end")
+        middle = self.top + 0.5 * _SCALE
+        self.drawing.text(14.0, middle, label, more=f'transform="rotate(-90 14 {middle:.1f})"')
+
+    def draw_level(self, value: float, words: str, colour: str, dashes: str) -> None:
+        """Draws a dashed line at a value, with words to its right."""
+        y = float(self.y(value))
+        style = f'stroke-dasharray="{dashes}"'
+        self.drawing.path(colour, 1.2, f"M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}", style)
+        self.drawing.text(_WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
+
+
+def dots(x: Iterable[float], y: Iterable[float]) -> str:
+    """A path that has a dot at each place, with round ends."""
+    return "".join(f"M{across:.1f} {down:.1f}h0" for across, down in zip(x, y, strict=True))
+
+
+def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
     """Residuals of all views: every kind for one camera, positions by camera for a cell.
 
     Args:
@@ -78,120 +134,111 @@ def residuals(
         if any(getattr(view, measure[1]) is not None for view in views)
     ]
     if not shown:
-        return None
-    height_in, room = (1.9, 0.45) if is_cell else (1.3, 0.16)
-    figure, grid = panels(
-        WIDE_IN, height_in * len(shown) + 0.5, len(shown), 1, (0.8, 0.45, 0.75, 0.25)
-    )
-    figure.subplots_adjust(hspace=room)
-    for axes, (seer, views, (label, name, unit, limit)) in zip(grid[:, 0], shown, strict=True):
-        # With several cameras, each panel has other views.
-        is_labelled = is_cell or axes is grid[-1, 0]
-        label_x(axes, [str(view.view) for view in views] if is_labelled else [], "")
-        axes.set_xlim(-0.7, len(views) - 0.3)
-        _draw_views(
-            axes,
-            views,
-            np.array([getattr(view, name) for view in views], dtype=float),
-            outlying,
-            getattr(rms_of(views), unit),
-        )
+        return Markup("")
+    drawing, pitch = Drawing(), _PANEL + 20.0 if is_cell else _PANEL
+    for index, (seer, views, (label, name, unit, limit)) in enumerate(shown):
+        values = np.array([getattr(view, name) for view in views], dtype=float)
+        top = index * pitch + 22.0
+        _draw_views(drawing, top, views, values, outlying, label)
+        panel = _scale_of(drawing, top, views, values)
+        rms = getattr(rms_of(views), unit)
+        if rms is not None:
+            panel.draw_level(rms, f"rms {significant(rms)}", "ink", "5 4")
         if limit is not None and not is_cell:
-            _draw_limit(axes, limit)
-        axes.set_ylabel(label)
-        axes.set_title(seer, loc="left")
-    grid[-1, 0].set_xlabel("view")
-    return figure, "Bars: residuals of each view"
+            if limit < panel.high:
+                panel.draw_level(limit, f"doubt from {limit:g}", "bad", "1 4")
+            else:
+                words = f"doubt from {limit:g} \N{UPWARDS ARROW}"
+                drawing.text(_WIDTH - _RIGHT, top - 4.0, words, "end")
+        drawing.text(_LEFT, top - 8.0, seer, "start")
+        # With several cameras, each panel has other views.
+        if is_cell or index == len(shown) - 1:
+            step = max(1, -(-len(views) // _MOST_LABELS))
+            for x, view in [*zip(_places(len(views)), views, strict=True)][::step]:
+                drawing.text(x, top + _SCALE + 16.0, str(view.view))
+    height = pitch * len(shown) + 40.0
+    drawing.text(0.5 * (_LEFT + _WIDTH - _RIGHT), height - 4.0, "view")
+    return drawing.svg("Bars: residuals of each view", height)
+
+
+def _places(count: int) -> FloatArray:
+    """Centres of equal parts of a panel's width [px]."""
+    return _LEFT + (np.arange(count) + 0.5) * (_WIDTH - _LEFT - _RIGHT) / count
+
+
+def _scale_of(
+    drawing: Drawing, top: float, views: Sequence[ViewResult], values: FloatArray
+) -> Panel:
+    """A scale for the used views, which those that were not used do not compress."""
+    used = values[[view.used for view in views]]
+    shown = used if len(used) else values
+    return Panel(
+        drawing, top, 0.0, _HEADROOM * float(shown[np.isfinite(shown)].max(initial=0.0)) or 1.0
+    )
 
 
 def _draw_views(
-    axes: Axes,
+    drawing: Drawing,
+    top: float,
     views: Sequence[ViewResult],
-    values: np.ndarray,
+    values: FloatArray,
     outlying: Collection[int],
-    rms: float | None,
+    label: str,
 ) -> None:
-    """Draws a bar a view, clipped to the scale of the used ones, and a mark for each other one."""
-    colours = [
-        (CHECK if view.view in outlying else ACCENT)
-        if view.used
-        else BAD
-        if contradicts(view)
-        else MUTED
-        for view in views
-    ]
-    is_used = np.array([view.used for view in views])
-    shown = values[is_used] if is_used.any() else values
-    top = _HEADROOM * float(shown[np.isfinite(shown)].max(initial=0.0)) or 1.0
-    places = np.arange(len(values))
-    bars(axes, places, np.minimum(np.nan_to_num(values), top), colours, 0.7)
-    axes.set_ylim(0.0, 1.2 * top)
-    few_ticks(axes, y=4)
-    for place in places[~is_used]:
-        value, colour = values[place], colours[place]
-        clipped = bool(value > top)
-        height = 0.05 * top if np.isnan(value) else min(value, top)
-        axes.plot([place], [height], marker="^" if clipped else "x", color=colour, markersize=5.0)
-        if clipped:
-            axes.annotate(significant(value), (place, top), xytext=(0.0, 5.0), ha="center",
-                          textcoords="offset points", fontsize=SMALL, color=colour)  # fmt: skip
-    if rms is not None:
-        axes.axhline(rms, color=INK, linewidth=0.9, linestyle="--")
-        beside(axes, rms, f"rms {significant(rms)}")
+    """Draws a bar a view, and a mark at each that was not used."""
+    panel, places = _scale_of(drawing, top, views, values), _places(len(views))
+    panel.draw_scale(label)
+    bars: dict[str, str] = {}
+    for view, x, value in zip(views, places, values, strict=True):
+        left_out = "bad" if contradicts(view) else "muted"
+        colour = ("check" if view.view in outlying else "accent") if view.used else left_out
+        height = min(np.nan_to_num(value), panel.high)
+        bars[colour] = bars.get(colour, "") + f"M{x:.1f} {panel.y(0.0):.1f}V{panel.y(height):.1f}"
+        if not view.used:
+            beyond = f"\N{BLACK UP-POINTING TRIANGLE} {significant(float(value))}"
+            mark = beyond if value > panel.high else "\N{MULTIPLICATION SIGN}"
+            drawing.text(x, float(panel.y(height)) - 3.0, mark, more=f'fill="var(--{colour})"')
+    width = 0.7 * (_WIDTH - _LEFT - _RIGHT) / len(views)
+    for colour, path in bars.items():
+        drawing.path(colour, width, path)
 
 
-def _draw_limit(axes: Axes, limit: float) -> None:
-    """A line where doubt begins, if the scale contains it, else a text."""
-    words, top = f"doubt from {limit:g}", axes.get_ylim()[1]
-    if limit < 0.92 * top:
-        axes.axhline(limit, color=BAD, linewidth=0.9, linestyle=":")
-        axes.annotate(words, (0.0, limit), xycoords=("axes fraction", "data"), xytext=(4.0, 2.0),
-                      textcoords="offset points", fontsize=SMALL, color=BAD)  # fmt: skip
-    else:
-        axes.text(1.0, 1.02, f"{words} \N{UPWARDS ARROW}", fontsize=SMALL, color=MUTED, ha="right",
-                  va="bottom", transform=axes.transAxes)  # fmt: skip
-
-
-# What each chart of the coverage shows.
-_CHARTS = {
-    "image": "corners in the image",
-    "directions": "viewing directions",
-    "rotation_axes": "rotation axes of the flange",
-}
-
-
-@drawn
-def coverage(
-    calibration: Calibration, evidence: Sequence[ViewEvidence]
-) -> tuple[Figure, str] | None:
+def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
     """Coverage of the image, of viewing directions and of rotation axes, side by side."""
     charts = coverage_charts(calibration, evidence)
     if not charts:
-        return None
+        return Markup("")
     used = {view.view for view in calibration.views if view.used}
-    figure, grid = panels(WIDE_IN, 3.1, 1, len(charts), (0.05, 0.05, 0.05, 0.3))
-    for axes, chart in zip(grid[0], charts, strict=True):
-        axes.set(title=_CHARTS[chart.name], aspect="equal")
-        axes.set_axis_off()
-        axes.invert_yaxis()
-        axes.add_collection(LineCollection(chart.lines, colors=LINE, linewidths=0.7))
+    drawing, side = Drawing(), _WIDTH / 3.0
+    for index, chart in enumerate(charts):
+        ends = np.vstack([*chart.lines])
+        middle, reach = 0.5 * (ends.max(axis=0) + ends.min(axis=0)), np.ptp(ends, axis=0).max()
+        scale, at = 0.82 * side / reach, np.array([(index + 0.5) * side, 0.5 * side + 14.0])
+
+        def drawn(points: FloatArray, scale: float = scale, at: FloatArray = at,
+                  middle: FloatArray = middle) -> FloatArray:  # fmt: skip
+            return np.asarray(scale * (points - middle) + at)
+
+        drawing.text(float(at[0]), 14.0, _CHARTS[chart.name])
+        for line in chart.lines:
+            drawing.path("line", 1.0, "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in drawn(line)))
         for place, words in chart.words:
-            axes.text(*place, words, color=MUTED, fontsize=SMALL, ha="center", va="center")
-        width = 2.0 if chart.name == "image" else 4.5
-        for is_used, colour in ((True, ACCENT), (False, BAD)):
+            x, y = drawn(np.array(place)).tolist()
+            drawing.text(x, y + 4.0, words)
+        for is_used, colour in ((True, "accent"), (False, "bad")):
             points = [xy for view, xy in chart.points.items() if (view in used) is is_used]
             if points:
-                strokes(axes, *np.vstack(points).T, colour, width)
-    return figure, "Coverage: corners, viewing directions, rotation axes"
+                path = dots(*drawn(np.vstack(points)).T)
+                drawing.path(colour, 2.2 if chart.name == "image" else 5.0, path, _ROUND)
+    return drawing.svg("Coverage: corners, viewing directions, rotation axes", side + 20.0)
 
 
-@drawn
 def residuals_over_joints(
     calibration: Calibration,
     session: Session | None,
     evidence: Sequence[ViewEvidence],
     outlying: Collection[int] = (),
-) -> tuple[Figure, str] | None:
+) -> Markup:
     """Residuals of the used views along the target's axes, over each joint's angle in turn.
 
     Args:
@@ -201,7 +248,7 @@ def residuals_over_joints(
         outlying: Numbers of used views to leave out, as they would compress the scale.
     """
     if session is None or not evidence:
-        return None
+        return Markup("")
     joints_rad = {view.number: view.joints_rad for view in session.views}
     shown = {view.view for view in calibration.views if view.used and view.view not in outlying}
     frames = target_frames(calibration, session)
@@ -213,50 +260,27 @@ def residuals_over_joints(
         and (placed := placement(calibration, view, frames.get(view.view))) is not None
     ]
     if len(pairs) < 3:
-        return None
+        return Markup("")
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
     low, high = joints_deg.min(axis=0), joints_deg.max(axis=0)
-    # Each joint has a part of the axis of its own, from its smallest to its largest angle.
-    places = np.arange(len(low)) + 0.8 * (joints_deg - low) / np.maximum(high - low, 1e-9)
-    twists = np.array([residual for _, residual in pairs])
-    figure, grid = panels(WIDE_IN, 3.2, 2, 1, (0.8, 0.5, 0.06, 0.3), sharex=True)
-    rows = (
-        (grid[0, 0], 1e3 * twists[:, 3:], "position [mm]"),
-        (grid[1, 0], np.rad2deg(twists[:, :3]), "rotation [deg]"),
-    )
-    for axes, values, label in rows:
+    # Each joint has a part of the width of its own, from its smallest to its largest angle.
+    centres = _places(len(low))
+    part = 0.8 * (_WIDTH - _LEFT - _RIGHT) / len(low)
+    places = centres + part * ((joints_deg - low) / np.maximum(high - low, 1e-9) - 0.5)
+    twists, drawing = np.array([residual for _, residual in pairs]), Drawing()
+    for index, (values, label) in enumerate(
+        ((1e3 * twists[:, 3:], "position [mm]"), (np.rad2deg(twists[:, :3]), "rotation [deg]"))
+    ):
         reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
-        axes.set(ylim=(-1.1 * reach, 1.1 * reach), ylabel=label)
-        axes.axhline(0.0, color=INK, linewidth=0.7)
-        axes.grid(visible=False, axis="x")
-        few_ticks(axes, y=4)
-        for column, (_, colour) in enumerate(_AXES):
-            heights = np.clip(values[:, column], -reach, reach)
-            repeated = np.broadcast_to(heights[:, None], places.shape)
-            strokes(axes, places.ravel(), repeated.ravel(), colour, 1.2, 0.05)
-    grid[1, 0].set_xticks(
-        np.arange(len(low)) + 0.4,
-        [f"q{joint + 1}\n{a:.0f} to {b:.0f} deg"
-         for joint, (a, b) in enumerate(zip(low, high, strict=True))],
-    )  # fmt: skip
-    legend(figure, [("line", colour, f"target {name}") for name, colour in _AXES])
-    return figure, "Residuals of the used views over each joint's angle"
-
-
-@drawn
-def board_shape(board: BoardResult, target: Target, name: str = "") -> tuple[Figure, str] | None:
-    """Depth of a board behind its mean plane; None for a flat one."""
-    x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
-    reach = float(np.abs(depth_mm).max())
-    if not board.is_bent or reach < _LEAST_DEPTH_MM:
-        return None
-    figure, ((axes,),) = panels(MIDDLE_IN, 0.7 * MIDDLE_IN, 1, 1, (0.6, 0.45, 0.3, 0.06))
-    levels = np.linspace(-reach, reach, 14)
-    shown = axes.tricontourf(x_mm, y_mm, depth_mm, levels, cmap="coolwarm")
-    axes.plot(x_mm, y_mm, "o", color="#202020", markersize=1.4)
-    # y points down on the printed page.
-    axes.invert_yaxis()
-    axes.set(xlabel="target x [mm]", ylabel="target y [mm]", aspect="equal")
-    axes.grid(visible=False)
-    colour_bar(axes, shown, "depth [mm]")
-    return figure, f"Depth of the board {name}".strip() + " over its plane"
+        panel = Panel(drawing, index * _PANEL + 24.0, -reach, reach)
+        panel.draw_scale(label)
+        for colour, column in zip(_COLOURS, np.clip(values, -reach, reach).T, strict=True):
+            heights = np.broadcast_to(panel.y(column)[:, None], places.shape)
+            drawing.path(colour, 3.5, dots(places.ravel(), heights.ravel()), _ROUND)
+    for joint, (x, start, end) in enumerate(zip(centres, low, high, strict=True), 1):
+        drawing.text(x, 2 * _PANEL + 14.0, f"q{joint}")
+        drawing.text(x, 2 * _PANEL + 30.0, f"{start:.0f} to {end:.0f} deg")
+    for index, (name, colour) in enumerate(zip("xyz", _COLOURS, strict=True)):
+        x = _WIDTH - _RIGHT - 60.0 * (2 - index)
+        drawing.text(x, 12.0, f"target {name}", "end", f'fill="var(--{colour})"')
+    return drawing.svg("Residuals of the used views over each joint's angle", 2 * _PANEL + 36.0)

@@ -34,8 +34,6 @@ SMALL = 8.0
 WIDE_IN, MIDDLE_IN = 9.2, 5.0
 # Resolution of bitmaps in vectors.
 _RASTER_DPI = 144.0
-# Largest number of labels of an axis.
-_MOST_LABELS = 25
 # Above this number of marks a bitmap is smaller than vectors.
 _MANY_MARKS = 2500
 _STYLE: Any = {
@@ -110,18 +108,6 @@ def panels(
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def bars(
-    axes: Axes, places: FloatArray, heights: FloatArray, colours: Sequence[str] | str, share: float
-) -> None:
-    """Draws bars from zero; `share` is their width as one of the distance of places.
-
-    One collection of lines is drawn ten times as fast as a rectangle a bar.
-    """
-    width_in = axes.figure.get_size_inches()[0] * axes.get_position().width
-    width_pt = 72.0 * width_in * share / np.ptp(axes.get_xlim())
-    axes.vlines(places, 0.0, heights, colors=colours, linewidth=width_pt, alpha=0.9)
-
-
 def strokes(
     axes: Axes, x: FloatArray, y: FloatArray, colour: str, width: float, length: float = 0.0
 ) -> None:
@@ -159,14 +145,6 @@ def legend(figure: Figure, entries: Sequence[tuple[str, str, str]]) -> None:
     ]  # fmt: skip
     figure.legend(handles=handles, loc="upper right", ncols=len(handles), handletextpad=0.3,
                   columnspacing=1.2, borderaxespad=0.0)  # fmt: skip
-
-
-def label_x(axes: Axes, labels: Sequence[str], title: str) -> None:
-    """Labels of the places 0, 1, ..., as many as there is room for; no vertical grid."""
-    step = max(1, -(-len(labels) // _MOST_LABELS))
-    axes.set_xticks(range(0, len(labels), step), labels[::step])
-    axes.set(xlim=(-0.7, len(labels) - 0.3), xlabel=title)
-    axes.grid(visible=False, axis="x")
 
 
 def beside(axes: Axes, y: float, words: str, colour: str = INK, rise: str = "center") -> None:

@@ -1,14 +1,17 @@
 """Page templates, and the functions that they call."""
 
 import platform
-from functools import cache
+from functools import cache, partial
 from importlib import metadata
 
 from jinja2 import Environment, Template
+from markupsafe import Markup
 
 from visioncal.core.version import __version__
 from visioncal.present.words import templates_of
 
+# Figures by matplotlib.
+_FIGURES = ("before_and_after", "workspace", "course", "board_shape")
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 
 
@@ -34,13 +37,12 @@ def _environment(*, has_result: bool) -> Environment:
     environment.globals |= {"software": _software, "version": __version__}
     if not has_result:
         return environment
-    # Imported late: a page without figures does not wait for matplotlib.
     from visioncal.present import advice, arms, details, facts, result_parts, torques, words
-    from visioncal.present.report import armplots, content, network, plots
+    from visioncal.present.report import content, network, plots
 
     called = (
         *(result_parts, facts, arms, details, torques, advice, words),
-        *(content, network, plots, armplots),
+        *(content, network, plots),
     )
     environment.globals |= {
         name: var
@@ -48,4 +50,12 @@ def _environment(*, has_result: bool) -> Environment:
         for name, var in vars(module).items()
         if getattr(var, "__module__", "") == module.__name__
     }
+    environment.globals |= {name: partial(_figure, name) for name in _FIGURES}
     return environment
+
+
+def _figure(name: str, *about: object) -> Markup:
+    """A figure by matplotlib, which a page without one does not wait for."""
+    from visioncal.present.report import armplots
+
+    return Markup(getattr(armplots, name)(*about))
