@@ -65,7 +65,7 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
     for path, words in (
         (session, f"visioncal calibrate {session} -o OUT"),
         (empty, "holds no recording.rrd"),
-        (other, "first bytes"),
+        (other, "is no recording"),
         (tmp_path / "nowhere.rrd", "does not exist"),
     ):
         done = visioncal("show", "--viewer", path)

@@ -120,8 +120,6 @@ def correct_command(options: CorrectOptions) -> None:
     if file is None:
         typer.echo(table_to_send(targets, columns, rows), nl=False)
     _report(columns, rows, unreachable, warnings, is_answer=file is not None)
-    if np.isnan(targets.q_seed).all() and options.seed_joints is None:
-        say(_posture(arm, corrected.q[rows[0]]))
     if file is not None:
         say(f"wrote {file}")
 
@@ -213,19 +211,6 @@ def _warn_singular(
         f"{some_of([targets.places[rows[index]] for index in near])}: nearly singular; at "
         f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
         f"{turn_words} deg. Move slowly there, or keep away from it."
-    )
-
-
-def _posture(arm: CalibratedArm, q: FloatArray) -> str:
-    """States the initial posture of targets without seeds."""
-    turning = ~arm.real.chain.prismatic
-    words = [
-        f"{np.rad2deg(value):.0f}" if turns else f"{1e3 * value:.0f} mm"
-        for value, turns in zip(q, turning, strict=True)
-    ]
-    return (
-        f"the first is reached in the posture nearest to the middle of the joints' limits, "
-        f"({', '.join(words)}) deg; --seed-joints begins in another"
     )
 
 

@@ -49,7 +49,6 @@ from visioncal.dynamics.identified import (
     UNKNOWN,
     Identified,
     judge,
-    stribeck_rows,
     to_document,
 )
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
@@ -69,6 +68,8 @@ from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrMotion
 from visioncal.live.planning.messages import plan_warnings, plan_words
+from visioncal.present.torques import torque_table
+from visioncal.present.words import said
 from visioncal.robot import Inertias, load_robot, symmetric_matrices
 from visioncal.robot.collision import Body, capsule
 from visioncal.session import STREAMS, Session, check_stream, save_stream
@@ -285,32 +286,10 @@ def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
         f"{identified.base.rank} base parameters: {shares}, {counts[-1][1]} {counts[-1][0]}, "
         f"{identified.determined.count(UNKNOWN)} {UNKNOWN}"
     )
-    names = [identified.base.model.names[index] for index in identified.base.independent]
-    values = dict(zip(names, identified.values.tolist(), strict=True))
-    stribeck = {row["joint"]: row for row in stribeck_rows(identified)}
-    joints = range(1, identified.robot.joint_count + 1)
-    columns: dict[str, list[float | None]] = {"fitted": [*identified.fitted_rms_nm]}
-    validation = identified.validation
-    if validation is not None:
-        columns["predicted"] = [*validation.rms_nm]
-        columns["of range, %"] = [*(100.0 * validation.shares)]
-        if validation.known_rms_nm is not None:
-            columns["before"] = [*validation.known_rms_nm]
-    for symbol in ("Fc", "Fv", "Ia"):
-        columns[symbol] = [values.get(f"{symbol}{joint}") for joint in joints]
-    columns["Fs/Fc"] = [stribeck.get(joint, {}).get("static_over_coulomb") for joint in joints]
-    columns["vs"] = [stribeck.get(joint, {}).get("speed_rad_s") for joint in joints]
-    filled = {
-        name: column
-        for name, column in columns.items()
-        if any(value is not None for value in column)
-    }
-    rows = [
-        (str(joint), *("" if value is None else figure(float(value)) for value in values))
-        for joint, *values in zip(joints, *filled.values(), strict=True)
-    ]
-    print_table(("joint", *filled), rows)
-    answer("in N m, N m s/rad, kg m^2 and rad/s; before: with the robot's own inertias")
+    torques = torque_table(identified)
+    print_table(torques.titles, [row.cells for row in torques.rows])
+    for words in said("torque_note", identified):
+        answer(words)
 
 
 def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:

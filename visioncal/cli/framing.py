@@ -14,7 +14,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions, TouchOptions
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.fixture_from_markers import fixture_from_marker_images
@@ -103,46 +103,13 @@ class FrameLocation:
         """Writes the frame to its destination, if any; a bad one joins no result."""
         if frame.verdict.status == "bad" and self.file is None:
             return Written(())
-        return self._write({**self._frames(), self.name: frame})
-
-    def _write(self, frames: dict[str, Frame]) -> Written:
-
+        frames = {**self._frames(), self.name: frame}
         if self.file is not None:
             FrameFile(frames).save(self.file)
             return Written((self.file,))
         if self.folder is None or self.result is None:
             return Written(())
         return rewrite_result(self.folder, replace(self.result, frames=frames))
-
-    @classmethod
-    def remove(cls, options: FrameOptions, kind: FrameKind, name: str) -> Written:
-        """Removes a frame from a result or a file of frames.
-
-        Raises:
-            DataError: No place is named, or it has no such frame.
-        """
-        path, file = options.calibration, options.out
-        if path is None and file is None:
-            raise DataError(
-                "--remove: from where is not said.",
-                culprits=["--remove"],
-                next_step="Name the calibration (-c) or the file of frames (-o) that has it.",
-            )
-        result = None if path is None or file is not None else load_result(path)
-        folder = None if path is None or file is not None else _folder(path)
-        place = cls(name, None, result, folder, file)
-        frames = place._frames()
-        lead = transform_name(kind, "x").removesuffix("x")
-        there = [known for known in frames if known.startswith(lead)]
-        found = [known for known in there if known in (name, f"{lead}{name}")]
-        if not found:
-            raise DataError(
-                f"{file or folder} has no {kind} {name!r}; it has {some_of(there) or 'none'}.",
-                culprits=[name],
-                next_step=did_you_mean(f"{lead}{name}", there),
-            )
-        kept = {known: frame for known, frame in frames.items() if known not in found}
-        return place._write(kept)
 
 
 def _folder(path: Path) -> Path:
@@ -219,20 +186,13 @@ def place_frame(
             each other.
     """
     part, source = request.part, request.touches
-    if source is None or request.goes.remove is not None:
+    if source is None:
         command = "tcp" if kind == "tool" else "fixture"
-        name = request.goes.remove
-        if name is None:
-            raise DataError(
-                f"{command}: touches of it, or a session that shows it, are needed.",
-                culprits=["TOUCHES"],
-                next_step=f"Name them: visioncal {command} TOUCHES -c OUT; or --remove NAME.",
-            )
-        refuse_given(
-            {"TOUCHES": request.touches, "--name": request.goes.name}, "--remove measures nothing"
+        raise DataError(
+            f"{command}: touches of it, or a session that shows it, are needed.",
+            culprits=["TOUCHES"],
+            next_step=f"Name them: visioncal {command} TOUCHES -c OUT.",
         )
-        report_written(FrameLocation.remove(request.goes, kind, name))
-        return
     session = _image_session(source, {"--tool": tool, **request.written.given()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"

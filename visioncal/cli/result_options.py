@@ -295,9 +295,6 @@ class FrameOptions:
         "A file of frames (.json) to put it into instead; made where missing.", "-o", "--out"
     )
     name: str | None = option("Name of the frame: gripper, jig_2.")
-    remove: str | None = option(
-        "Remove one from the calibration, or from -o's file.", metavar="NAME"
-    )
     force: bool = force_flag()
 
 

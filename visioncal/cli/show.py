@@ -11,14 +11,10 @@ from visioncal.cli.console import say
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.result_options import ShowOptions
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence
 from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
 from visioncal.interchange.result_files import load_result, load_stored
 from visioncal.results.views import worst_view
-
-# The first bytes of every rerun recording.
-_MAGIC = b"RRF2"
 
 
 def show_command(options: ShowOptions) -> None:
@@ -107,20 +103,8 @@ def find_recording(path: Path) -> Path:
             f"{shlex.quote(str(path)) if is_session else 'SESSION'} -o OUT; then visioncal show "
             "OUT --viewer.",
         )
-    why_not = absence(file)
-    if why_not:
-        raise DataError(f"{file} {why_not}.", culprits=[str(file)])
-    try:
-        with file.open("rb") as stream:
-            magic = stream.read(len(_MAGIC))
-    except OSError as error:
-        raise DataError(
-            f"{file} cannot be read: {error.strerror or error}.", culprits=[str(file)]
-        ) from error
-    if magic != _MAGIC:
-        raise DataError(
-            f"{file} is no recording: its first bytes are not those of an .rrd.",
-            culprits=[str(file)],
-            next_step=f"Give the {RECORDING} that visioncal calibrate wrote.",
-        )
+    # Imported late, so that --help stays fast.
+    from visioncal.present.recording.rrd_messages import scan
+
+    scan(file)
     return file

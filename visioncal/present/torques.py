@@ -27,16 +27,16 @@ def torque_table(identified: "Identified") -> Table:
     """Torque errors of each joint: of the fit, and of predictions for unseen motion."""
     (first, *_), validation = identified.streams, identified.validation
     figures: dict[str, FloatArray | None] = {
-        "torque [N m]": first.torque_nm,
-        "noise [N m]": first.noise_nm,
-        "error, fitted [N m]": first.rms_nm,
+        "torque": first.torque_nm,
+        "noise": first.noise_nm,
+        "fitted": first.rms_nm,
     }
     if validation is not None:
         figures |= {
-            "error, unseen [N m]": validation.rms_nm,
-            "of the torque [%]": 100.0 * validation.shares,
-            "as bodies [N m]": validation.consistent_rms_nm,
-            "known before [N m]": validation.known_rms_nm,
+            "unseen": validation.rms_nm,
+            "% of it": 100.0 * validation.shares,
+            "as bodies": validation.consistent_rms_nm,
+            "before": validation.known_rms_nm,
         }
     columns = [
         [significant(None)] * identified.robot.joint_count

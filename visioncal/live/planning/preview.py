@@ -6,7 +6,7 @@ from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.live.planning.messages import plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
-from visioncal.present.recording.preview import MotionPart, MotionPreview, Preview, PreviewStop
+from visioncal.present.recording.preview import MotionPreview, Preview, PreviewStop
 
 # Drawn samples per second: sweeps are long, and slow.
 _EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0
@@ -70,7 +70,6 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     motions = {"excitation": excitation.series.sampled(_EXCITATION_HZ)}
     if plan.sweeps is not None:
         motions["sweeps"] = plan.sweeps.sampled(_SWEEPS_HZ)
-    parts = [MotionPart(name, motion, allowed.torques(motion)) for name, motion in motions.items()]
     boxes = [
         Obstacle(body.name, body.link_from_body, body.size_m)
         for body in allowed.bodies
@@ -78,4 +77,4 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     ]
     name = f"motions for {allowed.robot.name}"
     note = "\n\n".join([f"# {name}", *(f"- {word}" for word in plan_words(plan))])
-    return MotionPreview(name, allowed.robot, parts, boxes, allowed.share.floor_m, note)
+    return MotionPreview(name, allowed.robot, motions, boxes, allowed.share.floor_m, note)

@@ -12,20 +12,6 @@ JOINT = (68, 80, 100)
 DETECTED = (50, 220, 110)
 PREDICTED = (80, 160, 255)
 RESIDUAL = (255, 70, 60)
-UNCERTAINTY = (190, 120, 255)
-
-# The nominal arm, before its calibration.
-STATED = (190, 140, 60)
-# From the smallest to the largest sigma, evenly spaced, all bright on a dark background.
-SCALE = (
-    (105, 65, 255),
-    (150, 75, 240),
-    (190, 75, 210),
-    (230, 85, 150),
-    (250, 125, 95),
-    (253, 180, 60),
-    (245, 245, 80),
-)
 
 # Background lines and labels of charts.
 GRID = (128, 134, 146)

@@ -58,8 +58,6 @@ STOP_NOTE = "/notes/stop"
 
 # A motion over time.
 MOTION_TIMELINE = "motion"
-MOTION = "/motion"
-MOTION_KINDS = ("position_deg", "speed_deg_s", "acceleration_deg_s2", "torque_nm")
 
 # Plots and text.
 RESIDUALS = "/residuals"

@@ -1,6 +1,6 @@
 """Previews of plans: stops and motions before they are driven."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -186,21 +186,12 @@ def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPart:
-    """One motion of a plan."""
-
-    name: str  # Its name.
-    motion: JointMotion  # Joint motion, from time zero.
-    torques_nm: FloatArray | None  # (m, n) torques of the nominal arm [N m]; None where unknown.
-
-
-@dataclass(frozen=True, eq=False)
 class MotionPreview:
     """Content of a preview of planned motions."""
 
     name: str  # Name of the recording.
     robot: Robot  # The arm.
-    parts: Sequence[MotionPart]  # Motions in their order, one after the other on the timeline.
+    motions: Mapping[str, JointMotion]  # By name, one after the other on the timeline.
     obstacles: Sequence[Obstacle]  # Obstacles in the cell.
     floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
     note: str  # Text of the plan in Markdown.
@@ -208,8 +199,8 @@ class MotionPreview:
     @property
     def places_m(self) -> FloatArray:
         """(k, 3) positions of the base and of the flange along all motions [m]."""
-        paths = [self.robot.base_from_flange(part.motion.q)[:, :3, 3] for part in self.parts]
-        return np.vstack([np.zeros(3), *paths])
+        ways = [self.robot.base_from_flange(motion.q)[:, :3, 3] for motion in self.motions.values()]
+        return np.vstack([np.zeros(3), *ways])
 
 
 def write_motion_preview(
@@ -225,35 +216,20 @@ def write_motion_preview(
     Raises:
         DataError: The file cannot be written.
     """
-    size_m = float(np.median(np.linalg.norm(preview.places_m[1:], axis=1)))
+    places_m, robot, start_s = preview.places_m, preview.robot, 0.0
+    size_m = float(np.median(np.linalg.norm(places_m[1:], axis=1)))
     with replacing_file(path) as aside, Recorder(aside) as recorder:
-        stream, start_s = recorder.stream, 0.0
+        stream = recorder.stream
         stream.send_recording_name(preview.name)
         recorder.lay_out(blueprint)
         log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
         stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
-        names = list(preview.robot.joint_names)
-        # A joint has the same colour in all curves.
-        tints = [colours.SCALE[joint % len(colours.SCALE)] for joint in range(len(names))]
-        for kind in paths.MOTION_KINDS:
-            lines = rr.SeriesLines(names=names, colors=tints)
-            stream.log(f"{paths.MOTION}/{kind}", lines, static=True)
-        for index, part in enumerate(preview.parts):
-            motion = part.motion
-            scene = Scene.planned(preview.robot, states_of(preview.robot, motion.q), size_m)
-            scene.log_static(stream)
-            colour = colours.THIS_VIEW if index == 0 else colours.USED
-            flange_m = preview.robot.base_from_flange(motion.q)[:, :3, 3]
-            line = rr.LineStrips3D([flange_m], colors=colour, radii=_LINE * size_m)
-            in_base = rr.CoordinateFrame(paths.BASE_FRAME)
-            stream.log(f"{paths.WAY}/{part.name}", in_base, line, static=True)
-            # In the recording's resolution, so that curves and arm agree to the last bit.
+        line = rr.LineStrips3D([places_m[1:]], colors=colours.THIS_VIEW, radii=_LINE * size_m)
+        stream.log(paths.WAY, rr.CoordinateFrame(paths.BASE_FRAME), line, static=True)
+        Scene.planned(robot, {}, size_m).log_static(stream)
+        for motion in preview.motions.values():
             times = np.round(1e9 * (start_s + motion.times_s)).astype("timedelta64[ns]")
+            scene = Scene.planned(robot, states_of(robot, motion.q), size_m)
             scene.log_views(stream, dict(enumerate(times)), paths.MOTION_TIMELINE)
-            curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
-            curves += [] if part.torques_nm is None else [part.torques_nm]
-            for kind, values in zip(paths.MOTION_KINDS, curves, strict=False):
-                columns = rr.Scalars.columns(scalars=values)
-                send_rows(stream, f"{paths.MOTION}/{kind}", times, columns, paths.MOTION_TIMELINE)
             start_s += float(motion.times_s[-1])
             recorder.keep()

@@ -1,4 +1,4 @@
-"""Layouts of previews of plans, and of identified dynamics, in the rerun viewer."""
+"""Layouts of previews of plans in the rerun viewer."""
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -12,13 +12,6 @@ from visioncal.present.viewer.layout import (
     space_view,
     with_panels,
 )
-
-_TITLES = {
-    "position_deg": "Joint angles [deg]",
-    "speed_deg_s": "Speeds [deg/s]",
-    "acceleration_deg_s2": "Accelerations [deg/s\N{SUPERSCRIPT TWO}]",
-    "torque_nm": "Torques of the nominal arm [N m]",
-}
 
 
 def plan_blueprint(preview: Preview) -> rrb.Blueprint:
@@ -57,27 +50,9 @@ def plan_blueprint(preview: Preview) -> rrb.Blueprint:
 def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
     """Layout of the preview of motions."""
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
-    cell = space_view(
-        "The flange's way: exciting motion in orange, sweeps in blue",
-        [f"+ {entity}/**" for entity in entities],
-        eye_on(preview.places_m),
-    )
+    contents = [f"+ {entity}/**" for entity in entities]
+    cell = space_view("The flange's way", contents, eye_on(preview.places_m))
     note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
-    kinds: tuple[str, ...] = paths.MOTION_KINDS
-    if any(part.torques_nm is None for part in preview.parts):
-        kinds = kinds[:-1]
-    # One legend suffices: a joint has the same colour in all curves.
-    curves = [
-        rrb.TimeSeriesView(
-            name=_TITLES[kind],
-            origin=f"{paths.MOTION}/{kind}",
-            plot_legend=rrb.PlotLegend(visible=kind == kinds[0]),
-        )
-        for kind in kinds
-    ]
-    both = rrb.Horizontal(
-        rrb.Vertical(cell, note, row_shares=[2, 1]),
-        rrb.Vertical(*curves, row_shares=[2, *(1 for _ in curves[1:])]),
-        column_shares=[1, 1],
+    return with_panels(
+        rrb.Horizontal(cell, note, column_shares=[2, 1]), timeline=paths.MOTION_TIMELINE
     )
-    return with_panels(both, paths.MOTION_TIMELINE)
