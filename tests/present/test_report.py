@@ -190,17 +190,11 @@ def test_pictures_of_one_row_are_drawn(size):
     assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
 
 
-def test_many_corners_become_a_bitmap():
+def test_many_corners_are_thinned():
     many = made_up(90, images=True)
     html = render(many.calibration, None, many.evidence)
-    # As vectors, 88 views of 40 corners would be 3520 dots; the other figures have one a view or
-    # direction, and a residual's axis.
-    assert html.count("<use ") < 2000
-    # The colour scale is a bitmap, too.
-    uri = max(re.findall(r'href="data:image/png;base64,([^"]+)"', html), key=len)
-    bitmap = cv2.imdecode(np.frombuffer(base64.b64decode(uri), np.uint8), cv2.IMREAD_UNCHANGED)
-    # Dots on nothing.
-    assert 0.0 < np.mean(bitmap[:, :, 3] > 0) < 1.0
+    # 88 views of 40 corners; the other charts have a dot a view.
+    assert 1500 < html.count("h0") < 3300
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present import result_parts
 from visioncal.present.network_layout import pairs
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Edge, Rms
@@ -196,13 +195,15 @@ def spectrum_facts(uncertainty: UncertaintyResult) -> tuple[Fact, ...]:
 
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
-    """Noise levels, with their 95 % intervals where known."""
-    facts = []
-    for of, levels in result_parts.noise(calibration).items():
-        for name, value in levels.sigmas.items():
+    """Noise levels of each sensor and each robot, with their 95 % intervals where known."""
+    named, facts = calibration.by_name, []
+    intervals = {} if named.uncertainty is None else named.uncertainty.noise_95
+    for of, levels in named.noise.items():
+        who = f"robot {of}" if of in named.flanges.values() else of
+        for name, value in levels.items():
             suffix = next((unit for unit in _UNITS if name.endswith(unit)), "")
-            label = f"{of} {name.removesuffix(suffix).replace('_', ' ')}".strip()
-            interval = " to ".join(map(significant, levels.intervals.get(name, ())))
+            label = f"{who} {name.removesuffix(suffix).replace('_', ' ')}".strip()
+            interval = " to ".join(map(significant, intervals.get(of, {}).get(name, ())))
             size = f"{significant(value)} {_UNITS.get(suffix, '')}".strip()
             facts.append(Fact(label, size, f"95 %: {interval}" if interval else ""))
     return tuple(facts)

@@ -36,12 +36,6 @@ def pairs(views: Iterable[ViewResult]) -> tuple[SeenPair, ...]:
     return tuple(summaries)
 
 
-def weakest_frame(tree: FrameTree) -> str:
-    """The frame whose pose on its parent has the largest sigma, at the end of the session."""
-    edges = {name: tree.edge_of(name) for name in tree.last if name not in tree.flanges}
-    return max(edges, key=lambda frame: edges[frame].sigma_mm, default="")
-
-
 def sigma_words(tree: FrameTree, frame: str) -> str:
     """Sigma of a frame's pose on its parent, in words."""
     if frame == tree.reference:

@@ -13,7 +13,6 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Target
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.evidence import ViewEvidence
-from visioncal.results.sections import Intervals
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.session.frames import CELL
@@ -27,14 +26,6 @@ class FrameHierarchy:
     # (4, 4) `parent_from_frame` of the frames that no robot moves on their parent.
     matrices: Mapping[str, FloatArray]
     robots: Mapping[str, str]  # Robot name by its flange's frame.
-
-
-@dataclass(frozen=True)
-class Levels:
-    """Noise levels by name, as `pixel_px`, and their 95 % intervals where known."""
-
-    sigmas: Mapping[str, float]
-    intervals: Intervals
 
 
 def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
@@ -72,17 +63,6 @@ def stated_boards(session: Session | None) -> dict[str, Target]:
         return {}
     boards = {**session.plates, **session.boards}
     return {"target": boards[""], **boards} if "" in boards else boards
-
-
-def noise(calibration: Calibration) -> dict[str, Levels]:
-    """Noise levels of each sensor and each robot."""
-    named = calibration.by_name
-    intervals = {} if named.uncertainty is None else named.uncertainty.noise_95
-    robots = named.flanges.values()
-    return {
-        f"robot {name}" if name in robots else name: Levels(levels, intervals.get(name, {}))
-        for name, levels in named.noise.items()
-    }
 
 
 def frames(calibration: Calibration | None) -> FrameHierarchy:

@@ -17,13 +17,13 @@ def preview_of(plan: Plan, name: str) -> Preview:
     cell = plan.cell
     history = [np.nan if accuracy.is_open else accuracy.mm for accuracy in plan.design.history]
     return Preview(
-        name,
         cell.mount,
-        cell.robot,
-        cell.camera,
         cell.target,
+        cell.camera,
         cell.x,
         cell.z,
+        name,
+        cell.robot,
         tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
         np.array(history),
         tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),

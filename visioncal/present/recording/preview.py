@@ -11,7 +11,7 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.core.files import replacing_file
 from visioncal.core.transforms import apply, invert
-from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
@@ -44,16 +44,11 @@ class PreviewStop:
 
 
 @dataclass(frozen=True, eq=False)
-class Preview:
+class Preview(Seen):
     """Content of a plan's preview."""
 
     name: str  # Name of the recording.
-    mount: Mount  # Where the camera is.
     robot: Robot  # The arm.
-    camera: Camera  # The camera's intrinsics.
-    target: Target  # The board.
-    x: FloatArray  # (4, 4) estimated pose of the camera, on the flange or in the base [m].
-    z: FloatArray  # (4, 4) estimated pose of the board, in the base or on the flange [m].
     stops: Sequence[PreviewStop]  # Stops in driving order.
     # Predicted sigma by number of stops; NaN where something is undetermined [mm].
     sigmas_mm: FloatArray
@@ -91,13 +86,12 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
     Raises:
         DataError: The file cannot be written.
     """
-    seen = Seen(preview.mount, preview.target, preview.camera, preview.x, preview.z)
     path_q, reached = _path(preview)
     states = states_of(preview.robot, path_q)
-    way = Scene.planned(preview.robot, states, preview.size_m, seen)
+    way = Scene.planned(preview.robot, states, preview.size_m, preview)
     steps = dict(zip((stop.view for stop in preview.stops), reached, strict=True))
     stops = {view: states[step] for view, step in steps.items()}
-    scene = Scene.planned(preview.robot, stops, preview.size_m, seen)
+    scene = Scene.planned(preview.robot, stops, preview.size_m, preview)
     with replacing_file(path) as aside, Recorder(aside) as recorder:
         stream = recorder.stream
         stream.send_recording_name(preview.name)

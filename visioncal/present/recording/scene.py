@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
-from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present import result_parts
 from visioncal.present.recording import board, colours, paths
@@ -26,8 +25,6 @@ _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
 # Lengths of axes relative to the flange's: of other frames, and of tools.
 _AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
 _OTHER_AXES, _TOOL_AXES = 0.7, 0.5
-# Size of the small frusta that mark all views.
-_SMALL_FRUSTUM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +110,7 @@ class Seen:
 
     mount: Mount  # Where the camera is.
     target: Target  # The board.
-    camera: Camera | None  # Intrinsics; None where unknown.
+    camera: Camera  # Its intrinsics.
     x: FloatArray  # (4, 4) estimated pose of the camera, on the flange or in the base [m].
     z: FloatArray  # (4, 4) estimated pose of the board, in the base or on the flange [m].
 
@@ -177,7 +174,7 @@ class Scene:
             FrameHierarchy(parents, matrices, {"flange": ""}),
             {"flange": states},
             {} if robot is None else {"": robot},
-            {} if seen is None or seen.camera is None else {paths.CAM_FRAME: seen.camera},
+            {} if seen is None else {paths.CAM_FRAME: seen.camera},
             {} if seen is None else {paths.TARGET_FRAME: seen.target},
             size_m,
         )
@@ -217,7 +214,6 @@ class Scene:
         for flange, robot in self.frames.robots.items():
             stops = paths.part_of(paths.STOPS, robot)
             frame = rr.CoordinateFrame(self.frames.parents[flange])
-            shapes = self._shapes_on(flange)
             for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
                 poses = {
                     view: state.pose
@@ -234,10 +230,6 @@ class Scene:
                     show_labels=labelled or None,
                 )
                 stream.log(f"{stops}/{name}", frame, points, static=True)
-                strips = [apply(pose, shape) for pose in poses.values() for shape in shapes]
-                if strips:
-                    lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
-                    stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
 
     def log_views(
         self, stream: rr.RecordingStream, rows: Mapping[int, Row], timeline: str = paths.TIMELINE
@@ -304,22 +296,6 @@ class Scene:
 
     def _carried_by(self, flange: str) -> list[str]:
         return [name for name, parent in self.frames.parents.items() if parent == flange]
-
-    def _shapes_on(self, flange: str) -> list[FloatArray]:
-        """What a single robot's flange carries, as (k, 3) lines in its frame."""
-        # The shapes of several robots would hide each other.
-        if self.frames.robots[flange]:
-            return []
-        shapes = {
-            frame: _frustum(camera, _SMALL_FRUSTUM * self.size_m)
-            for frame, camera in self.cameras.items()
-        }
-        shapes |= {frame: [board.closed_outline(target)] for frame, target in self.boards.items()}
-        return [
-            apply(self.frames.matrices[child], shape)
-            for child in self._carried_by(flange)
-            for shape in shapes.get(child, ())
-        ]
 
     def _log_image_plane(self, stream: rr.RecordingStream, camera: Camera, frame: str) -> None:
         """Places the image in a camera's frame."""

@@ -108,7 +108,7 @@ def torques(prediction: Prediction) -> tuple[Figure, str]:
         error_axes.plot(times, errors[:, joint], color=BAD, linewidth=0.7)
         axes.set_ylabel(f"joint {joint + 1}\n[N m]")
         few_ticks(axes, y=3)
-        few_ticks(error_axes, y=3)
+        few_ticks(error_axes, 4, 3)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     entries = [("line", MUTED, "measured"), ("line", ACCENT, "predicted")]

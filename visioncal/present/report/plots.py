@@ -23,11 +23,13 @@ from visioncal.results.views import rms_of
 from visioncal.session import Session
 
 # Width of a drawing, and room for labels to its left and right [px].
-_WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 75.0
+_WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 105.0
 # Height of a panel with its gap, and of its scale [px].
 _PANEL, _SCALE = 120.0, 92.0
-# Most steps of a scale, and most labels of views.
-_MOST_STEPS, _MOST_LABELS = 4, 25
+# Distance of words above each other [px].
+_LINE_HEIGHT = 14.0
+# Most steps of a scale, most labels of views, and most dots of a chart.
+_MOST_STEPS, _MOST_LABELS, _MOST_DOTS = 4, 25, 3000
 # Scales ignore the few largest points, which would compress the others.
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
 # Height of a bar chart over its largest used bar.
@@ -104,7 +106,7 @@ class Panel:
         self.drawing.text(14.0, middle, label, more=f'transform="rotate(-90 14 {middle:.1f})"')
 
     def draw_level(self, value: float, words: str, colour: str, dashes: str) -> None:
-        """Draws a dashed line at a value, with words to its right."""
+        """Draws a dashed line at a value of at least zero, with words to its right."""
         y = float(self.y(value))
         style = f'stroke-dasharray="{dashes}"'
         self.drawing.path(colour, 1.2, f"M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}", style)
@@ -145,11 +147,14 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
         if rms is not None:
             panel.draw_level(rms, f"rms {significant(rms)}", "ink", "5 4")
         if limit is not None and not is_cell:
+            words, y = f"doubt from {limit:g}", float(panel.y(limit))
             if limit < panel.high:
-                panel.draw_level(limit, f"doubt from {limit:g}", "bad", "1 4")
+                panel.draw_level(limit, "", "bad", "1 4")
             else:
-                words = f"doubt from {limit:g} \N{UPWARDS ARROW}"
-                drawing.text(_WIDTH - _RIGHT, top - 4.0, words, "end")
+                words, y = f"{words} \N{UPWARDS ARROW}", top
+            near = rms is not None and abs(y - panel.y(rms)) < _LINE_HEIGHT
+            y += _LINE_HEIGHT * (1.0 if near and limit < (rms or 0.0) else -1.0 if near else 0.0)
+            drawing.text(_WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
         drawing.text(_LEFT, top - 8.0, seer, "start")
         # With several cameras, each panel has other views.
         if is_cell or index == len(shown) - 1:
@@ -228,7 +233,8 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
         for is_used, colour in ((True, "accent"), (False, "bad")):
             points = [xy for view, xy in chart.points.items() if (view in used) is is_used]
             if points:
-                path = dots(*drawn(np.vstack(points)).T)
+                places = drawn(np.vstack(points))
+                path = dots(*places[:: -(-len(places) // _MOST_DOTS)].T)
                 drawing.path(colour, 2.2 if chart.name == "image" else 5.0, path, _ROUND)
     return drawing.svg("Coverage: corners, viewing directions, rotation axes", side + 20.0)
 
