@@ -803,25 +803,3 @@ def _shifted(count, sigma_m):
     shifts = np.zeros((count, 4, 4))
     shifts[:, :3, 3] = sigma_m * np.random.default_rng(3).standard_normal((count, 3))
     return shifts
-
-
-def test_a_tool_is_removed_by_its_name(out, tmp_path):
-    touches = touched(Job(axes=3), 1).touches
-    for name in ("gripper", "needle"):
-        assert tcp(tmp_path, touches, "-c", out, "--name", name).status == 0
-    visioncal("export", out, "--to", "ur-tcp").refused("flange_from_needle")
-    visioncal("tcp", "-c", out, "--remove", "needle").good()
-    assert list(Calibration.load(out).frames) == ["flange_from_gripper"]
-    assert list(read_calibration(out / "recording.rrd").frames) == ["flange_from_gripper"]
-    assert visioncal("export", out, "--to", "ur-tcp").status == 0
-    visioncal("tcp", "-c", out, "--remove", "needle").refused("has no tool 'needle'")
-    visioncal("fixture", "-c", out, "--remove", "gripper").refused("has no fixture 'gripper'")
-    visioncal("tcp", "-c", out).refused("touches of it")
-    visioncal("tcp", "--remove", "gripper").refused("from where")
-    visioncal("tcp", tmp_path / "touches.csv", "-c", out, "--remove", "gripper").refused(
-        "--remove measures nothing"
-    )
-    file = tmp_path / "frames.json"
-    assert tcp(tmp_path, touches, "-o", file, "--name", "gripper").status == 0
-    assert visioncal("tcp", "-o", file, "--remove", "gripper").status == 0
-    assert not FrameFile.load(file).frames

@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from support.commands import visioncal
 from support.foreign_samples import streams
 from support.samples import made_up
-from typer.testing import CliRunner
 
 from visioncal.calibration.run import calibrate
-from visioncal.cli.app import app
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import convert
 from visioncal.present.recording import write_recording
@@ -140,16 +137,6 @@ def misread(tmp_path):
     ]
     Session.assemble(session.document, session.columns, cells, session.images).save(tmp_path / "mm")
     return session
-
-
-@pytest.mark.usefixtures("misread")
-def test_no_answer_writes_nothing(tmp_path, monkeypatch):
-    terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr("visioncal.cli.convert.sys", terminal)
-    command = ["convert", str(tmp_path / "mm"), str(tmp_path / "no"), "--guess"]
-    with pytest.raises(DataError, match=r"there was no answer.*--yes"):
-        CliRunner().invoke(app, command, input="", catch_exceptions=False)
-    assert not (tmp_path / "no").exists()
 
 
 def test_a_session_whose_poses_are_misread_is_mended(misread, tmp_path):

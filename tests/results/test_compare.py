@@ -189,6 +189,7 @@ def test_a_calibration_does_not_differ_from_itself():
     calibration = made_up(4).calibration
     comparison = compare(calibration, calibration)
     assert comparison.same_session
+    assert comparison.is_equal
     assert not comparison.is_change
     assert "share its noise" in comparison.findings[0]
     # Exact data has no spread: rounding is no change either.

@@ -1,10 +1,7 @@
 """`visioncal convert`."""
 
-import sys
 from dataclasses import replace
 from functools import partial
-
-import typer
 
 from visioncal.calibration.guess import Candidate
 from visioncal.cli.console import print_table, say
@@ -16,6 +13,12 @@ from visioncal.interchange.formats import (
     ImportOptions,
     PoseImportOptions,
     convert,
+)
+
+# Options that are named as the import's.
+_AS_TYPED = (
+    *("camera_file", "mount", "target", "intrinsics"),
+    *("images", "resolution", "tip"),
 )
 
 
@@ -31,13 +34,7 @@ def convert_command(options: ConvertOptions) -> None:
             written.camera_inverse,
         ),
         image=written.image_column,
-        camera_file=written.camera_file,
-        mount=written.mount,
-        target=written.target,
-        intrinsics=written.intrinsics,
-        images=written.images,
-        resolution=written.resolution,
-        tip=written.tip,
+        **{name: getattr(written, name) for name in _AS_TYPED},
     )
     choose = partial(_chosen, yes=options.yes) if options.guess else None
     # A choice shows its own progress.
@@ -70,7 +67,7 @@ def import_options(poses: RobotPoseOptions) -> ImportOptions:
 
 
 def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
-    """Tries other readings, prints them, and returns the clearly best or confirmed one."""
+    """Tries other readings, prints them, and returns the clearly best one with --yes."""
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
     print_table(
@@ -98,20 +95,10 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
             "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as declared; "
             "visioncal doctor then looks for what happened midway.",
         )
-    if yes:
-        return guess.best
-    if not sys.stdin.isatty():
+    if not yes:
         raise DataError(
             "Nothing was written: another reading closes the chain better than the declared one.",
             culprits=[guess.best.words],
             next_step="Take it with --yes.",
         )
-    try:
-        is_confirmed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
-    except typer.Abort as error:
-        raise DataError(
-            "Nothing was written: there was no answer.", next_step="Take the reading with --yes."
-        ) from error
-    if not is_confirmed:
-        raise DataError("Nothing was written: the reading was declined.")
     return guess.best

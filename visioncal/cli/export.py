@@ -1,5 +1,6 @@
 """`visioncal export`."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import typer
@@ -23,19 +24,8 @@ def export_command(options: ExportOptions) -> None:
     load = None
     if options.mass_kg is not None and options.cog_mm is not None:
         load = Load(options.mass_kg, options.cog_mm)
-    selection = Selection(
-        options.edge,
-        options.inverse,
-        options.parent,
-        options.child,
-        options.number,
-        load,
-        options.convention,
-        options.calibration_hash,
-        options.part.camera,
-        options.part.robot,
-        options.part.target,
-    )
+    given = {**vars(options), **vars(options.part), "load": load}
+    selection = Selection(**{field.name: given[field.name] for field in fields(Selection)})
     written = document(load_exportable(options.source), options.to, selection)
     bad = check_usable(written.verdict, "what is exported", force=options.force)
     for warning in (*bad, *written.warnings):

@@ -515,7 +515,7 @@ class ConvertOptions:
     dest: Path = argument("An .rrd, or the folder to write.")
     written: ForeignOptions
     force: bool = force_flag()
-    guess: bool = _doubt("Try other readings of the poses, and ask.", "--guess", default=False)
+    guess: bool = _doubt("Try other readings, and print them.", "--guess", default=False)
     yes: bool = _doubt(
         "Take the best one where it stands out clearly.", "--yes", default=False, needs="guess"
     )

@@ -1,24 +1,19 @@
 """`visioncal touch-test`."""
 
 import shlex
-import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.cli.console import (
     EXIT_BAD,
     answer,
-    asked,
     check_usable,
     print_json,
     report_written,
-    say,
     warn,
 )
 from visioncal.cli.parsing import numbers_in, refuse_given
@@ -71,18 +66,11 @@ def touch_test_command(options: TouchTestOptions) -> None:
             warn(warning)
     points = located.points
     targets = [_target(result, located, point, 1e-3 * options.height_mm) for point in points]
-    if options.gaps_mm is not None:
-        count = options.gaps_mm.count(",") + 1
-        gaps = [*numbers_in(options.gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
-    elif sys.stdin.isatty() and not options.as_json:
-        say(_FORM)
-        gaps = []
-        for point, target in zip(points, targets, strict=True):
-            _report_point(point, target, say)
-            gaps.append(_gap())
-    else:
+    if options.gaps_mm is None:
         _report(points, targets, as_json=options.as_json)
         return
+    form = ",".join("abcdefghij"[: options.gaps_mm.count(",") + 1])
+    gaps = [*numbers_in(options.gaps_mm, "--gaps-mm", form)]
     test = evaluate_gaps(points, gaps, touching)
     extended = replace(result, touch_test=test)
     written = rewrite_result(calibration if calibration.is_dir() else calibration.parent, extended)
@@ -135,41 +123,13 @@ def _report(
         return
     answer(_FORM)
     for point, target in zip(points, targets, strict=True):
-        _report_point(point, target, answer)
+        x, y, z = 1e3 * point.base_m
+        answer(
+            f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
+            f"{figure(point.radius95_mm)} mm"
+        )
+        for name in ("hover", "touch"):
+            place, turn = target[name][:3], target[name][3:]
+            numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
+            answer(f"  {name}: {', '.join(numbers)}")
     answer("Enter the gaps with --gaps-mm, in this order.")
-
-
-def _report_point(point: TouchPoint, target: dict[str, Any], show: Callable[[str], None]) -> None:
-    """Prints a point's position, and the targets of the robot."""
-    x, y, z = 1e3 * point.base_m
-    show(
-        f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
-        "mm"
-    )
-    for name in ("hover", "touch"):
-        place, turn = target[name][:3], target[name][3:]
-        numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
-        show(f"  {name}: {', '.join(numbers)}")
-
-
-def _gap() -> float:
-    """Asks until a length is typed."""
-    while True:
-        line = _line("  gap [mm]: ")
-        with suppress(ValueError):
-            gap = float(line.replace(",", "."))
-            if 0.0 <= gap < np.inf:
-                return gap
-        say("  A length of 0 mm or more is needed, as 0.2.")
-
-
-def _line(question: str) -> str:
-    """Asks, and returns the typed line."""
-    try:
-        return asked(question)
-    except EOFError:
-        raise DataError(
-            "touch-test: the gaps are at their end, and nothing was kept.",
-            culprits=["stdin"],
-            next_step="Give all with --gaps-mm.",
-        ) from None

@@ -331,16 +331,6 @@ def _size_m(
     return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)
 
 
-def _frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
-    """Edges of a camera's field of view to a depth [m], as lines in its frame."""
-    width, height = camera.resolution
-    fx, fy, cx, cy = camera.matrix
-    corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
-    plane = (corners_px - [cx, cy]) / [fx, fy]
-    rim = depth_m * np.column_stack([plane, np.ones(5)])
-    return [rim, *(np.stack([np.zeros(3), corner]) for corner in rim[:4])]
-
-
 def _log_poses(
     stream: rr.RecordingStream,
     parent: str,

@@ -26,7 +26,6 @@ from visioncal.present.report.plotting import (
     few_ticks,
     legend,
     panels,
-    strokes,
 )
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
@@ -154,6 +153,6 @@ def _draw_friction(
     curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
     curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
     modelled = friction_at(identified, curve)[:, joint]
-    strokes(axes, *samples.T, MUTED, 2.5)
+    axes.plot(*samples.T, ".", color=MUTED, alpha=0.5, markersize=3.0)
     axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
     few_ticks(axes, 5, 5)

@@ -45,7 +45,7 @@ _STYLE: Any = {
     "axes.spines.right": False, "legend.frameon": False, "figure.dpi": 72.0,
     "figure.facecolor": "none", "axes.facecolor": "none",
     "axes.xmargin": 0.06, "axes.ymargin": 0.06, "image.cmap": "plasma",
-    "text.parse_math": False, "path.simplify": False, "axes.formatter.useoffset": False,
+    "text.parse_math": False, "axes.formatter.useoffset": False,
 }  # fmt: skip
 # matplotlib's settings belong to the process, and threads may write reports at once.
 _LOCK = Lock()
@@ -106,16 +106,6 @@ def panels(
     left, bottom, right, top = np.array(margins_in) / (2 * [width_in, height_in])
     figure.subplots_adjust(left, bottom, 1.0 - right, 1.0 - top, wspace=0.12, hspace=0.16)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
-
-
-def strokes(
-    axes: Axes, x: FloatArray, y: FloatArray, colour: str, width: float, length: float = 0.0
-) -> None:
-    """Draws (n,) points as dots, or as dashes of a `length` along x, by one path for all."""
-    ends = np.stack([x - 0.5 * length, x + 0.5 * length, np.full(len(x), np.nan)], axis=1)
-    heights = np.repeat(y, 3)
-    caps = {"solid_capstyle": "butt" if length else "round"}
-    axes.plot(ends.ravel(), heights, "-", color=colour, linewidth=width, **caps)
 
 
 def scattered(axes: Axes, xy: FloatArray, values: FloatArray, **options: Any) -> PathCollection:  # noqa: ANN401
