@@ -96,7 +96,8 @@ def _cell(rng: np.random.Generator, seed: int) -> Cell:
     rows = _choice(rng, {"poses": 25, "joints": 35, "both": 40})
     seen = "poses" if _chance(rng, 0.18) and not options.second else "images"
     lens = {} if estimated else {"intrinsics": _choice(rng, {"auto": 5, "hold": 3, "refine": 2})}
-    if not estimated and _chance(rng, 0.3):
+    # A lens that is held, or behind poses measured elsewhere, has to be right.
+    if seen == "images" and lens.get("intrinsics", "hold") != "hold" and _chance(rng, 0.5):
         options = replace(options, lens_mismatch_px=5e-4 * camera.matrix[0])
         lens["matrix_sigma_px"] = 5e-4 * float(camera.matrix[0])
     known = model in ("built-in", "mein Arm é.toml")
