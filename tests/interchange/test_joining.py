@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.kept import assert_same, assert_same_evidence
+from support.refusals import raised
 from support.samples import made_up, tool_frame, with_frames
 
 from visioncal.calibration.run import Run, run
@@ -61,18 +62,6 @@ def test_all_files_are_as_before_with_the_frames(sample, folder):
     assert "data:image/jpeg" in report
 
 
-def test_frames_can_be_taken_out_again(sample, folder):
-    # The report names the folder, and this one is a copy.
-    rewrite_result(folder, sample.calibration)
-    before = contents(folder)
-    rewrite_result(folder, with_frames(sample).calibration)
-    rewrite_result(folder, sample.calibration)
-    after = contents(folder)
-    # A recording bears an id and the time of its making.
-    for name in ("calibration.json", "report.html"):
-        assert after[name] == before[name]
-
-
 def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
     write_session(simulate(CellOptions(views=12)), tmp_path / "cell", images=False)
     session = Session.load(tmp_path / "cell")
@@ -88,31 +77,11 @@ def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
     assert np.array_equal(again.joint_covariance, first.calibration.joint_covariance)
 
 
-def test_a_result_without_its_recording_keeps_the_rest(sample, folder):
-    (folder / "recording.rrd").unlink()
-    files = rewrite_result(folder, with_frames(sample).calibration).files
-    assert [file.name for file in files] == ["calibration.json", "report.html"]
-    assert sorted(contents(folder)) == ["calibration.json", "report.html"]
-    assert Calibration.load(folder).frames.keys() == with_frames(sample).calibration.frames.keys()
-    assert "There is no recording.rrd beside" in (folder / "report.html").read_text("utf-8")
-
-
-def test_a_recording_of_another_result_is_left_alone(sample, folder):
-    other = replace(sample.calibration, created="2026-11-21T00:00:00+00:00")
-    other.save(folder / "calibration.json")
-    before = contents(folder)
-    rewrite_result(folder, replace(other, frames=with_frames(sample).calibration.frames))
-    assert contents(folder)["recording.rrd"] == before["recording.rrd"]
-    assert "holds another one" in (folder / "report.html").read_text("utf-8")
-
-
 def test_results_of_another_session_are_refused(sample, folder):
     before = contents(folder)
     other = replace(sample.calibration, session_sha256="0" * 64)
-    with pytest.raises(DataError, match="holds the result of another session"):
-        rewrite_result(folder, other)
-    with pytest.raises(DataError, match="does not exist"):
-        rewrite_result(folder / "absent", sample.calibration)
+    raised(DataError, "holds the result of another session", rewrite_result, folder, other)
+    raised(DataError, "does not exist", rewrite_result, folder / "absent", sample.calibration)
     assert contents(folder) == before
 
 
@@ -160,12 +129,5 @@ def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
     replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
     (out / "frames.json").write_text("not frames", encoding="utf-8")
     before = contents(out)
-    with pytest.raises(DataError, match=r"frames\.json, line 1.* is no JSON"):
-        calibrate_command(options(pairs, out))
+    raised(DataError, r"frames\.json, line 1.* is no JSON", calibrate_command, options(pairs, out))
     assert contents(out) == before
-
-
-def test_an_unreadable_result_has_nothing_to_lose(tmp_path):
-    (tmp_path / "calibration.json").write_text("an earlier result", encoding="utf-8")
-    assert frames_to_keep(tmp_path) is None
-    assert frames_to_keep(tmp_path / "nowhere") is None

@@ -1,0 +1,228 @@
+"""AprilGrids and circles: numbered as their makers do, exact, told from other pages."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.boards import any_page, aprilgrid, circles, printed
+from support.marks import slow
+from support.rendered import Shot, photograph
+
+from visioncal.calibration.run import run
+from visioncal.core.transforms import invert, log
+from visioncal.interchange.formats.intrinsics import read_target_description
+from visioncal.session import Session
+from visioncal.simulation import (
+    BOARDS,
+    CAMERAS,
+    CellOptions,
+    prepare_scene,
+    render,
+    simulate,
+    write_session,
+)
+from visioncal.vision.boards import DetectedCorners, NotFound, find_target
+from visioncal.vision.targets import (
+    corner_positions,
+    rotations,
+    target_document,
+    target_from_document,
+)
+
+GRID = aprilgrid(5, 3)
+SHOT = Shot(square_px=50, noise=2)
+# Kalibr's code of tag 0, row by row from its upper left; a set bit is light (t36h11 of its
+# kalibr_create_target_pdf).
+CODE_0 = 0xD5D628584
+
+
+def test_the_page_is_kalibrs():
+    """Tag 0 at the lower left, its code upright, and a square off each corner of each tag."""
+    sheet, page = any_page(GRID), printed(GRID, 200)
+    per_m = 1e3 * 200 / 25.4
+
+    def grey(x_m, y_m):
+        x, y = np.array(sheet.origin_mm) / 1e3 + [x_m, y_m]
+        return int(page[int(y * per_m), int(x * per_m)])
+
+    tag, pitch = GRID.square_m, 1.3 * GRID.square_m
+    top = 2 * pitch
+    for number in range(36):
+        row, column = divmod(number, 6)
+        light = CODE_0 >> (35 - number) & 1
+        assert (grey((column + 2.5) * tag / 10, top + (row + 2.5) * tag / 10) > 128) == light
+    for x in range(6):
+        for y in range(4):
+            assert grey(x * pitch - 0.15 * tag, y * pitch - 0.15 * tag) < 50
+    assert grey(1.15 * tag, 0.5 * tag) > 200
+
+
+def test_corners_are_numbered_by_their_tags():
+    places = corner_positions(GRID) / GRID.square_m
+    assert len(places) == 4 * 15
+    np.testing.assert_allclose(places[0], [0.0, 2.6, 0.0])
+    np.testing.assert_allclose(places[4 * 14 + 1], [6.2, 0.0, 0.0])
+    assert target_from_document(target_document(GRID), "board") == GRID
+
+
+# Errors are rms of a coordinate [px]; the template's own noise is half of what is allowed.
+@pytest.mark.parametrize(
+    ("shot", "most_px"),
+    [
+        slow(SHOT, 0.01),
+        slow(replace(SHOT, square_px=25), 0.015),
+        (replace(SHOT, disc_px=2), 0.015),
+        (replace(SHOT, tilt_deg=60), 0.015),
+        slow(replace(SHOT, gamma=0.45, bend=0.1), 0.015),
+        (replace(SHOT, bayer=True), 0.03),
+    ],
+)
+def test_corners_are_as_exact_as_the_image(shot, most_px):
+    image, truth = photograph(GRID, shot, 1)
+    seen = find_target(image, GRID)
+    assert isinstance(seen, DetectedCorners), seen
+    assert len(seen.ids) > 50
+    error = seen.px - truth[seen.ids]
+    assert np.sqrt(np.mean(error**2)) < most_px
+    # Nothing that all corners share: their mean is as good as their number allows.
+    assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"columns": 6}, "do not lie as the target describes"),
+        ({"rows": 2}, "the grid has tag 1[0-4] besides the target's 5 x 2"),
+        ({"spacing": 0.25}, "are 0.30 of their side apart, and the target says spacing = 0.25"),
+        ({"marker_id": 30}, r"most tags seen \(0, 1, 2, 3, 4\) are none of the target's"),
+    ],
+)
+def test_another_page_is_named(change, words):
+    image = np.pad(photograph(GRID, SHOT, 2)[0], 60, constant_values=210)
+    found = find_target(image, replace(GRID, **change))
+    assert isinstance(found, NotFound)
+    assert found.misfit
+    assert re.search(words, found.reason), found.reason
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
+def test_a_cell_is_calibrated_with_it(tmp_path, mount):
+    cell = simulate(CellOptions(target=BOARDS["aprilgrid"], views=12, mount=mount, seed=4))
+    write_session(cell, tmp_path / "s")
+    result = run(Session.load(tmp_path / "s")).calibration
+    assert result.verdict.status == "good"
+    error = np.concatenate(
+        [log(invert(result.edges[name].matrix) @ true) for name, true in cell.transforms.items()]
+    )
+    # Twelve values, to one case in a thousand.
+    assert error @ np.linalg.solve(result.joint_covariance, error) < 32.9
+
+
+def test_the_grid_of_a_kalibr_target_in_one_word():
+    expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
+    assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected
+
+
+SHIFTED, EVEN = circles(4, 7, asymmetric=True, diameter_m=0.014), circles(6, 5)
+CIRCLES_SHOT = Shot(square_px=24, noise=2)
+
+
+def numbered(seen, truth):
+    """The centres as found, in the numbering of the truth: an even grid may be turned."""
+    away = [np.abs(value - truth).max() for value in (seen.px, seen.px[::-1])]
+    return seen.px if away[0] < away[1] else seen.px[::-1]
+
+
+def test_circles_are_ordered_as_opencvs():
+    places = corner_positions(SHIFTED) / SHIFTED.square_m
+    expected = [(2 * j + i % 2, i, 0) for i in range(7) for j in range(4)]
+    np.testing.assert_allclose(places, expected, atol=1e-12)
+    assert target_from_document(target_document(SHIFTED), "board") == SHIFTED
+
+
+@pytest.mark.parametrize(
+    ("target", "count"),
+    [(SHIFTED, 1), (circles(4, 6, asymmetric=True), 2), (EVEN, 2), (circles(5, 5), 4)],
+)
+def test_the_turns_are_those_that_leave_the_page_as_it_is(target, count):
+    turns = rotations(target)
+    assert len(turns) == count
+    assert all(sorted(turn) == list(range(len(turn))) for turn in turns)
+
+
+# Errors are rms of a coordinate [px]; the template's own noise is half of what is allowed. Those of
+# an ellipse's centre would be 0.1 and more in the tilted and the bent picture.
+@pytest.mark.parametrize("target", [SHIFTED, EVEN])
+@pytest.mark.parametrize(
+    ("shot", "most_px"),
+    [
+        (CIRCLES_SHOT, 0.008),
+        slow(replace(CIRCLES_SHOT, disc_px=3), 0.015),
+        (replace(CIRCLES_SHOT, tilt_deg=60, square_px=40), 0.01),
+        slow(replace(CIRCLES_SHOT, bend=0.15, ink_px=1), 0.01),
+        (replace(CIRCLES_SHOT, bayer=True), 0.025),
+    ],
+)
+def test_centres_are_as_exact_as_the_image(target, shot, most_px):
+    image, truth = photograph(target, shot, 1)
+    seen = find_target(image, target)
+    assert isinstance(seen, DetectedCorners), seen
+    assert len(seen.ids) == len(truth)
+    error = numbered(seen, truth) - truth
+    assert np.sqrt(np.mean(error**2)) < most_px
+    # Nothing that all centres share: their mean is as good as their number allows.
+    assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
+
+
+def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
+    # 0.11 m before a board of 0.24 m it looks at circles from up to 66 degrees aside.
+    cell = simulate(
+        CellOptions(target=BOARDS["symmetric-circles"], camera=CAMERAS["fisheye"], views=12, seed=1)
+    )
+    truth = cell.exact_corners[2].px
+    seen = find_target(render(prepare_scene(cell), 2), cell.options.target)
+    error = numbered(seen, truth) - truth
+    assert np.sqrt(np.mean(error**2)) < 0.015
+
+
+@pytest.mark.parametrize("change", [{"columns": 5}, {"asymmetric": False}])
+def test_another_page_of_circles_is_refused(change):
+    found = find_target(photograph(SHIFTED, CIRCLES_SHOT, 2)[0], replace(SHIFTED, **change))
+    assert isinstance(found, NotFound)
+    assert "circles is seen" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("target", "mount"),
+    [
+        (BOARDS["circles"], "eye-to-hand"),
+        slow(BOARDS["symmetric-circles"], "eye-in-hand"),
+        slow(BOARDS["circles"], "eye-in-hand"),
+        slow(BOARDS["symmetric-circles"], "eye-to-hand"),
+    ],
+)
+def test_a_cell_is_calibrated_with_circles(tmp_path, mount, target):
+    cell = simulate(CellOptions(target=target, views=12, mount=mount, seed=5))
+    write_session(cell, tmp_path / "s")
+    result = run(Session.load(tmp_path / "s")).calibration
+    # Of centres to 0.004 px the lens's last digits may be a point to settle.
+    assert result.verdict.status in ("good", "check")
+    assert sum(view.used for view in result.views) >= 11
+    # An even grid has two frames.
+    errors = []
+    for turn in (np.eye(4), TURNED if not target.asymmetric else np.eye(4)):
+        edges = {
+            name: true @ turn if name.endswith("target") else true
+            for name, true in cell.transforms.items()
+        }
+        error = np.concatenate(
+            [log(invert(result.edges[edge].matrix) @ edges[edge]) for edge in edges]
+        )
+        errors.append(error @ np.linalg.solve(result.joint_covariance, error))
+    # Twelve values, to one case in a thousand.
+    assert min(errors) < 32.9
+
+
+TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
+TURNED[:2, 3] = corner_positions(BOARDS["symmetric-circles"])[-1, :2]
