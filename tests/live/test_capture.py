@@ -13,14 +13,13 @@ import pytest
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from support.marks import slow
 from support.recorded import QUICK, REPEATABILITY_M, facts_of, recorded
+from support.refusals import raised
 
 from visioncal.calibration.run import run
-from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
-from visioncal.core.types import Corners
 from visioncal.live.capture import journal as journal_module
-from visioncal.live.capture.assessment import Coach, JointPoseCheck
+from visioncal.live.capture.assessment import JointPoseCheck
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -120,15 +119,6 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
     assert np.linalg.norm(off) < 1e-3
 
 
-def test_a_camera_that_stands_still_is_recorded_likewise(tmp_path):
-    plan = fake_plan(3, mount="eye-to-hand")
-    arm, camera = fake_devices(plan)
-    recorded(tmp_path / "live", plan, arm, camera)
-    session = Session.load(tmp_path / "live")
-    assert session.mount == "eye-to-hand"
-    assert len(session.views) == 3
-
-
 @pytest.mark.parametrize(
     "hidden", [False, slow(True)], ids=["told by the arm", "seen in the image"]
 )
@@ -145,33 +135,9 @@ def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):
     arm, camera = fake_devices(plan, trembling_s=1e6, tremble_rad=1e-3)
     with pytest.raises(DataError, match=r"3 stops in a row.*nothing came to rest in 1 s"):
         recorded(
-            tmp_path / "live",
-            plan,
-            arm,
-            camera,
-            replace(QUICK, still=Stillness(patience_s=1.0)),
+            tmp_path / "live", plan, arm, camera, replace(QUICK, still=Stillness(patience_s=1.0))
         )
     assert not (tmp_path / "live" / "session.toml").exists()
-
-
-@pytest.mark.slow
-def test_a_knock_between_frames_throws_all_of_them_away(plan, tmp_path):
-    arm, camera = fake_devices(plan)
-    frame, knocks = camera.frame, []
-
-    def knocked(**words):
-        # A knock that the encoders do not see, in the middle of the first view's frames.
-        if camera.frames == 12 and not knocks:
-            knocks.append(camera.frames)
-            arm.hidden, arm.tremble_rad = True, 2e-3
-            arm.trembling_s = arm.clock.now() - arm.begun + 0.5
-        return frame(**words)
-
-    camera.frame = knocked
-    recorded(tmp_path / "live", plan, arm, camera, CaptureOptions(frames=8))
-    session = Session.load(tmp_path / "live")
-    assert knocks
-    assert max(errors_m(session, camera)) < REPEATABILITY_M
 
 
 @pytest.mark.parametrize(
@@ -193,13 +159,12 @@ def test_a_failure_on_the_way_halts_and_leaves_a_session(plan, tmp_path, failure
             arm.failure, arm.fails_at = failure, 0.5
 
     arm.start_move = failing
-    with pytest.raises(DriverError, match=words) as caught:
-        recorded(tmp_path / "live", plan, arm, camera)
+    caught = raised(DriverError, words, recorded, tmp_path / "live", plan, arm, camera)
     assert arm.halted == 1
     # The watchdog looks every 20 ms, the failure came half a second after the start.
     assert arm.clock.now() - moves[-1] < 0.6
-    assert "3 views are safe in" in caught.value.message
-    assert "--resume" in caught.value.next_step or "cable" in caught.value.next_step
+    assert "3 views are safe in" in caught.message
+    assert "--resume" in caught.next_step or "cable" in caught.next_step
     assert len(Session.load(tmp_path / "live").views) == 3
 
 
@@ -288,8 +253,7 @@ def test_ways_from_elsewhere_are_looked_at(plan):
     flange = plan.cell.robot.base_from_flange(far.q[None])[0]
     box = Box("post", compose(np.eye(3), flange[:3, 3]), np.full(3, 0.02))
     walled = replace(plan, cell=replace(plan.cell, boxes=(box,)))
-    with pytest.raises(DataError, match=r"no clear way leads there .*post"):
-        checked_path(walled, far, first.q + 0.1)
+    raised(DataError, r"no clear way leads there .*post", checked_path, walled, far, first.q + 0.1)
 
 
 def test_a_plan_for_another_arm_is_not_driven(plan):
@@ -333,8 +297,7 @@ def test_a_full_disk_is_told_and_leaves_the_session(plan, tmp_path, monkeypatch)
     monkeypatch.setattr(journal_module.shutil, "disk_usage", room)
     # It is told on the way, not when the next view is there.
     words = r"live: too little room: 0\.0 MB are free.* for the next view"
-    with pytest.raises(DataError, match=words):
-        recorded(tmp_path / "live", plan, arm, camera)
+    raised(DataError, words, recorded, tmp_path / "live", plan, arm, camera)
     assert arm.halted == 1
     assert len(Session.load(tmp_path / "live").views) >= 3
 
@@ -378,9 +341,8 @@ def test_folders_of_something_else_are_left_alone(plan, tmp_path):
     arm, camera = fake_devices(plan)
     folder = tmp_path / "live"
     recorded(folder, plan, arm, camera)
-    with pytest.raises(DataError, match="exists and is not empty") as caught:
-        recorded(folder, plan, arm, camera)
-    assert "--resume" in caught.value.next_step
+    caught = raised(DataError, "exists and is not empty", recorded, folder, plan, arm, camera)
+    assert "--resume" in caught.next_step
     camera.name, arm.name = "another camera", "fake ur10e"
     with pytest.raises(DataError, match='arm was "fake ur5e" and is "fake ur10e"; camera was'):
         recorded(folder, plan, arm, camera, resume=True)
@@ -407,25 +369,6 @@ def test_a_disk_without_room_for_all_views_is_told_before_anything_moves(
     # With room made, it begins.
     monkeypatch.undo()
     recorded(tmp_path / "live", plan, arm, camera)
-
-
-def test_the_coach_asks_for_what_is_missing(plan):
-    lens = fake_devices(plan)[1].lens
-    coach = Coach(plan.cell.target, lens.resolution, lens)
-    assert coach.advice() == "another place, with the board large in the image"
-    ids = np.arange(40)
-    board = np.stack(np.meshgrid(np.arange(8), np.arange(5)), axis=-1).reshape(-1, 2)
-    for view in range(3):
-        # Straight from above, in the upper left of the image.
-        coach.add(Corners(view, ids, 20.0 + 25.0 * board + view, 0.7))
-    assert "steepest view leans by 0 deg only" in coach.advice()
-    assert coach.words().startswith("coverage 15 %, tilts to 0 deg")
-    for view, stop in enumerate(plan.stops):
-        arm, camera = fake_devices(plan)
-        arm.q0 = stop.q
-        found, _ = find_corners(camera.frame().image, plan.cell.target, view)
-        coach.add(found)
-    assert "where it was not yet" in coach.advice()
 
 
 class Hand:
@@ -482,3 +425,23 @@ def _capture(folder, plan, arm, camera):
     cell = LiveCell(arm, (camera,), arm.clock)
     planned = plan.cell
     return Capture(cell, planned.target, planned.robot, camera.lens, journal, QUICK, None)
+
+
+@pytest.mark.slow
+def test_a_knock_between_frames_throws_all_of_them_away(plan, tmp_path):
+    arm, camera = fake_devices(plan)
+    frame, knocks = camera.frame, []
+
+    def knocked(**words):
+        # A knock that the encoders do not see, in the middle of the first view's frames.
+        if camera.frames == 12 and not knocks:
+            knocks.append(camera.frames)
+            arm.hidden, arm.tremble_rad = True, 2e-3
+            arm.trembling_s = arm.clock.now() - arm.begun + 0.5
+        return frame(**words)
+
+    camera.frame = knocked
+    recorded(tmp_path / "live", plan, arm, camera, CaptureOptions(frames=8))
+    session = Session.load(tmp_path / "live")
+    assert knocks
+    assert max(errors_m(session, camera)) < REPEATABILITY_M

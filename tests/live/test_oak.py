@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.refusals import raised
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers import oak
@@ -153,15 +154,6 @@ def test_what_is_wished_is_set_from_the_start(monkeypatch):
     assert seen.level[1] == dai.ImgFrame.Type.GRAY8
 
 
-def test_it_focuses_where_the_factory_calibrated(monkeypatch):
-    _, seen = a_device(monkeypatch, lens=120)
-    camera = OakCamera(DeviceSetup((640, 400)))
-    camera.close()
-    assert seen.initial.getLensPosition() == 120
-    assert camera.settings["focus"] == 120
-    assert camera.settings["factory_intrinsics"].endswith("for focus 120")
-
-
 def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
     a_device(monkeypatch, coefficients=(-0.1, 0.05, 1e-3, -1e-3, 0.01))
     camera = OakCamera(DeviceSetup((2028, 1140)))
@@ -170,15 +162,6 @@ def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
     assert camera.factory.matrix == pytest.approx([1500.25, 1500.75, 1015.125, 569.25], abs=1e-3)
     assert camera.factory.distortion == pytest.approx([-0.1, 0.05, 1e-3, -1e-3, 0.01], abs=1e-8)
     assert camera.settings["factory_intrinsics"] == "read from the device"
-
-
-def test_a_device_without_calibration_is_used_without(monkeypatch):
-    device, _ = a_device(monkeypatch)
-    device.calibration = dai.CalibrationHandler()
-    camera = OakCamera(DeviceSetup((640, 400)))
-    camera.close()
-    assert camera.factory is None
-    assert "no calibration of CAM_A" in camera.settings["factory_intrinsics"]
 
 
 def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
@@ -192,8 +175,7 @@ def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
 def test_a_device_without_that_camera_is_refused_and_let_go(monkeypatch):
     device, _ = a_device(monkeypatch)
     device.sensor.socket = dai.CameraBoardSocket.CAM_B
-    with pytest.raises(DriverError, match="no camera on CAM_A; it has CAM_B"):
-        OakCamera()
+    raised(DriverError, "no camera on CAM_A; it has CAM_B", OakCamera)
     assert device.is_closed
 
 
@@ -202,7 +184,6 @@ def test_without_a_device_it_tells_of_the_cable_and_the_rule(monkeypatch):
         raise RuntimeError("No available devices")
 
     monkeypatch.setattr(oak, "depthai", lambda: SimpleNamespace(Device=none))
-    with pytest.raises(DriverError, match="No available devices") as caught:
-        OakCamera()
-    assert "cable" in caught.value.next_step
-    assert "03e7" in caught.value.next_step
+    caught = raised(DriverError, "No available devices", OakCamera)
+    assert "cable" in caught.next_step
+    assert "03e7" in caught.next_step

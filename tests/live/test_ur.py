@@ -10,6 +10,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from support.refusals import raised
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import MovingArm
@@ -107,8 +108,7 @@ def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller)
 def test_watching_needs_no_remote_control_and_moves_nothing(controller):
     controller.inject("remote-off")
     try:
-        with pytest.raises(DriverError, match="local control"):
-            UrArm(controller.host)
+        raised(DriverError, "local control", UrArm, controller.host)
         with closing(UrArm(controller.host, watch_only=True)) as arm:
             before = arm.state()
             assert before.flange_from_tool[:3, 3] == pytest.approx(TCP[:3])
@@ -140,8 +140,7 @@ def test_a_motion_that_is_stopped_is_told_with_what_to_press(controller, fault, 
         assert arm.moving()
         controller.inject(fault)
         try:
-            with pytest.raises(DriverError, match=message):
-                wait_while(arm.moving)
+            raised(DriverError, message, wait_while, arm.moving)
             assert arm.state().safety == safety
             with pytest.raises(DriverError, match=message):
                 arm.start_move(arm.state().q, speed=SLOW, acceleration=1.0)
@@ -161,12 +160,9 @@ def test_a_controller_that_dies_in_a_motion_is_noticed():
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
         assert arm.moving()
         controller.inject("link-lost")
-        with pytest.raises(DriverError, match=r"is lost: .*switched off, or its cable is out"):
-            wait_while(arm.moving)
-        with pytest.raises(DriverError, match="is lost"):
-            arm.state()
-        with pytest.raises(DriverError, match="is lost"):
-            arm.start_move(FAR, speed=SLOW, acceleration=1.0)
+        raised(DriverError, r"is lost: .*switched off, or its cable is out", wait_while, arm.moving)
+        raised(DriverError, "is lost", arm.state)
+        raised(DriverError, "is lost", arm.start_move, FAR, speed=SLOW, acceleration=1.0)
         arm.halt()
 
 
@@ -174,8 +170,7 @@ def test_a_controller_that_falls_silent_in_a_motion_is_noticed():
     with spawn() as controller, closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
         controller.inject("silent")
-        with pytest.raises(DriverError, match="has sent nothing for"):
-            wait_while(arm.moving)
+        raised(DriverError, "has sent nothing for", wait_while, arm.moving)
         arm.halt()
 
 
@@ -209,8 +204,6 @@ def test_a_wrong_motion_is_refused_before_it_is_sent(controller):
     with closing(UrArm(controller.host)) as arm:
         with pytest.raises(DriverError, match="A UR has six joints"):
             arm.start_move(np.zeros(7), speed=1.0, acceleration=1.0)
-        with pytest.raises(DriverError, match="at 9 rad/s"):
-            arm.start_move(np.zeros(6), speed=9.0, acceleration=1.0)
+        raised(DriverError, "at 9 rad/s", arm.start_move, np.zeros(6), speed=9.0, acceleration=1.0)
     arm.close()
-    with pytest.raises(DriverError, match="was closed"):
-        arm.state()
+    raised(DriverError, "was closed", arm.state)

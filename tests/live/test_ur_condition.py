@@ -6,13 +6,13 @@ import threading
 from contextlib import contextmanager
 
 import pytest
+from support.refusals import raised
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Stopwatch
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.drivers.ur_net import (
     check_states_come,
-    connect,
     read_condition,
     read_tool_offset,
 )
@@ -49,8 +49,7 @@ FAULTS = [
 def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fault, message):
     controller.inject(fault)
     try:
-        with pytest.raises(DriverError, match=message):
-            read_condition(controller.host).check_moves()
+        raised(DriverError, message, read_condition(controller.host).check_moves)
     finally:
         controller.inject("none")
     read_condition(controller.host).check_moves()
@@ -59,10 +58,8 @@ def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fa
 def test_a_frozen_controller_is_said_to_be_silent(controller):
     controller.inject("silent")
     try:
-        with pytest.raises(DriverError, match="does not answer: timed out"):
-            read_condition(controller.host)
-        with pytest.raises(DriverError, match="sends no states"):
-            check_states_come(controller.host)
+        raised(DriverError, "does not answer: timed out", read_condition, controller.host)
+        raised(DriverError, "sends no states", check_states_come, controller.host)
     finally:
         controller.inject("none")
 
@@ -107,34 +104,10 @@ def test_an_unfit_version_is_told(version, message):
     assert refusal.value.next_step
 
 
-def test_another_service_at_the_port_is_no_controller():
-    host = free_host()
-    with (
-        listening(host, 29999, b"SSH-2.0-OpenSSH_9.2\r\n"),
-        pytest.raises(DriverError, match="greets with 'SSH-"),
-    ):
-        read_condition(host)
-    with (
-        listening(host, 30004, b"HTTP/1.1 400 Bad Request\r\n\r\n" + b" " * 0x4854),
-        pytest.raises(DriverError, match="does not speak version 2 of RTDE"),
-    ):
-        check_states_come(host)
-
-
 def test_closed_ports_and_unknown_names_are_told_apart():
-    with pytest.raises(DriverError, match=r"port 29999 \(the dashboard\) is closed"):
-        read_condition(free_host())
+    raised(DriverError, r"port 29999 \(the dashboard\) is closed", read_condition, free_host())
     with pytest.raises(DriverError, match=r"no-such-robot\.invalid cannot be reached"):
         read_condition("no-such-robot.invalid")
-
-
-def test_an_address_that_nobody_has_is_unreachable(monkeypatch):
-    def no_route(*_, **__):
-        raise OSError(113, "No route to host")
-
-    monkeypatch.setattr(socket, "create_connection", no_route)
-    with pytest.raises(DriverError, match=r"cannot be reached .* No route to host.*cable"):
-        connect("192.0.2.1", 29999, "the dashboard")
 
 
 def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
@@ -150,3 +123,17 @@ def test_what_a_stall_takes_is_left_out():
     assert [round(watch.read(), 6) for _ in range(4)] == [0.05, 0.1, 0.3, 0.35]
     watch.restart()
     assert round(watch.read(), 6) == 0.1
+
+
+def test_another_service_at_the_port_is_no_controller():
+    host = free_host()
+    with (
+        listening(host, 29999, b"SSH-2.0-OpenSSH_9.2\r\n"),
+        pytest.raises(DriverError, match="greets with 'SSH-"),
+    ):
+        read_condition(host)
+    with (
+        listening(host, 30004, b"HTTP/1.1 400 Bad Request\r\n\r\n" + b" " * 0x4854),
+        pytest.raises(DriverError, match="does not speak version 2 of RTDE"),
+    ):
+        check_states_come(host)

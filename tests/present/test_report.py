@@ -1,6 +1,5 @@
-"""The report: complete, self-contained, and safe against what sessions may be called."""
+"""Reports and certificates: complete, self-contained, safe against what sessions may be called."""
 
-import base64
 import re
 import shutil
 from dataclasses import replace
@@ -8,21 +7,27 @@ from html import unescape
 
 import cv2
 import numpy as np
+import pypdfium2
 import pytest
+from support import browser
+from support.aligned_cells import made_up_cell
+from support.commands import visioncal
 from support.findings import CONTRADICTS, with_contradiction
+from support.fuzz.broken_sessions import sound_session
 from support.pages import Page, section
 from support.samples import REJECTED, made_up
 
 from visioncal.calibration.run import Run, run
-from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
-from visioncal.present.recording import write_recording
+from visioncal.present.network_layout import pairs
 from visioncal.present.recording.notes import view_markdown
-from visioncal.present.report.page import render, write_report
+from visioncal.present.report.page import render, write_certificate, write_report
 from visioncal.present.report.thumbnails import thumbnail
+from visioncal.present.tables import Table, TableRow
+from visioncal.results import ViewResult
 from visioncal.results.views import worst_view
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -106,22 +111,6 @@ def test_report_without_its_recording_says_so(outputs, tmp_path):
     assert "Pictures" not in page.words.replace(stored.note, "")
 
 
-def test_recording_of_another_result_is_not_mixed_in(sample, outputs, tmp_path):
-    shutil.copy(outputs / "recording.rrd", tmp_path)
-    replace(sample.calibration, created="2026-11-21T00:00:00+00:00").save(
-        tmp_path / "calibration.json"
-    )
-    stored = load_stored(tmp_path)
-    assert "holds another one" in stored.note
-    assert stored.session is None
-
-
-def test_session_alone_has_no_report(sample, tmp_path):
-    write_recording(tmp_path / "session.rrd", sample.session, None, (), None)
-    with pytest.raises(DataError, match="without a result"):
-        load_stored(tmp_path / "session.rrd")
-
-
 def test_names_and_reasons_are_text(sample, html):
     page = Page(html)
     assert sample.session.name in page.words
@@ -143,20 +132,6 @@ def test_identifiers_of_figures_stay_apart(html):
     assert {value.removeprefix("#") for value in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
         identifiers
     )
-
-
-def test_pictures_show_the_best_the_worst_and_the_rejected(sample, html):
-    words = Page(html).words
-    used = [view for view in sample.calibration.views if view.used and view.rms_px is not None]
-    best, worst = min(used, key=lambda item: item.rms_px), max(used, key=lambda item: item.rms_px)
-    assert f"Best used view: {best.view}," in words
-    assert f"Worst used view: {worst.view}," in words
-    assert re.search(r"drawn \d+ times longer", words)
-    uris = re.findall(r'href="data:image/jpeg;base64,([^"]+)"', html)
-    assert len(uris) == 2 + len(REJECTED)
-    for uri in uris:
-        jpeg = np.frombuffer(base64.b64decode(uri), np.uint8)
-        assert cv2.imdecode(jpeg, cv2.IMREAD_COLOR) is not None
 
 
 def test_spoilt_images_do_not_spoil_the_report(sample):
@@ -181,34 +156,91 @@ def test_pictures_lie_as_their_pixels_are_stored():
     assert (picture.width, picture.height) == (64, 40)
 
 
-@pytest.mark.parametrize("size", [(65_000, 1), (1, 70_000), (20_000, 3)])
-def test_pictures_of_one_row_are_drawn(size):
-    """Reduced by their width they have no row left, and a JPEG has a longest side."""
-    width, height = size
-    picture = thumbnail(np.full((height, width, 3), 200, np.uint8), None, "", 0, 1)
-    assert (picture.width, picture.height) == size
-    assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
+CELL = made_up_cell(5)
 
 
-def test_many_corners_are_thinned():
-    many = made_up(90, images=True)
-    html = render(many.calibration, None, many.evidence)
-    # 88 views of 40 corners; the other charts have a dot a view.
-    assert 1500 < html.count("h0") < 3300
+def render_cell(found):
+    return render(found, None, ())
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0996, "0.10"),
-        (0.3349, "0.33"),
-        (96.4, "96"),
-        (1234.5, "1234"),
-        (0.0, "0"),
-        (2e-9, "<0.0001"),
-        (None, "\N{EN DASH}"),
-        (float("inf"), "inf"),
-    ],
-)
-def test_significant_digits(value, text):
-    assert significant(value) == text
+def text_of(html):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", html))
+
+
+def test_observations_are_counted_by_who_saw_whom():
+    of_top = {"seer": "cam_top", "seen": "target_plate"}
+    views = (
+        ViewResult(0, True, residual_mm=3.0, residual_deg=0.1, **of_top, stop=0),
+        ViewResult(1, True, residual_mm=4.0, residual_deg=0.3, **of_top, stop=1),
+        ViewResult(2, False, "disagrees", residual_mm=90.0, residual_deg=9.0, **of_top, stop=2),
+        ViewResult(3, False, "blurred", seer="cam_hand", seen="target_plate", stop=2),
+    )
+    first, second = pairs(views)
+    assert (first.used, first.left_out, first.rms.mm) == (2, 1, 12.5**0.5)
+    assert (second.used, second.rms) == (0, None)
+    words = text_of(render_cell(replace(CELL, views=views)))
+    assert "cam_top target_plate 2 1" in words
+    assert "view 2 not used cam_top of target_plate: disagrees" in words
+
+
+def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
+    sample = made_up()
+    page = tmp_path / "certificate.html"
+    signed = {"operator": "A. Smith <1>", "serial number, camera": "18443010"}
+    write_certificate(page, sample.calibration, sample.session, signed)
+    words = Page(page.read_text("utf-8")).words
+    for name in (
+        "bench <1> & 2",
+        "Check before use",
+        "serial number, camera 18443010",
+        "operator A. Smith <1>",
+        "board charuco_9x6_30mm 9 x 6, 30 mm",
+        "flange_from_cam (31.000, -12.000, 81.000) mm",
+        sample.calibration.session_sha256,
+        "Calibrated by, date",
+    ):
+        assert name in words
+    # It is one page, however many views there are: they are counted, not listed.
+    many = replace(sample.calibration, views=sample.calibration.views * 50)
+    write_certificate(page, many, None, {})
+    assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed here")
+def test_it_prints_on_one_page(tmp_path):
+    sample = made_up()
+    page = tmp_path / "certificate.html"
+    write_certificate(
+        page,
+        sample.calibration,
+        sample.session,
+        {"operator": "A. Smith", "serial number, camera": "1"},
+    )
+    with browser.chromium(tmp_path / "profile") as chromium:
+        chromium.visit(page.as_uri())
+        (printed,) = pypdfium2.PdfDocument(chromium.printed())
+    # A4, in points of 1/72 inch; a browser rounds to a pixel of 3/4 point.
+    assert printed.get_size() == pytest.approx((595.3, 841.9), abs=1.0)
+    words = printed.get_textpage().get_text_range()
+    assert "Checked by, date" in words
+
+
+def test_a_result_comes_out_again_of_its_recording(tmp_path):
+    session = sound_session(tmp_path / "session")
+    out = tmp_path / "out"
+    assert visioncal("calibrate", session, "-o", out).status == 0
+    page = tmp_path / "certificate.html"
+    visioncal("show", out, "--certificate", "--serial", "robot=7", "-o", page).good()
+    assert "serial number, robot 7" in Page(page.read_text("utf-8")).words
+    assert visioncal("show", out, "--operator", "me").status == 2
+    assert visioncal("show", out, "--certificate", "--serial", "7").status == 2
+    assert load_stored(out).session is not None
+
+
+def test_columns_in_which_nothing_is_known_are_left_out():
+    unknown = significant(None)
+    rows = [("a", unknown, "1", ""), TableRow(("a heading",)), ("b", unknown, "2", "")]
+    table = Table.of(("what", "deg", "mm", "note"), rows, (0, 3))
+    assert table.titles == ("what", "mm")
+    assert table.words == (0,)
+    assert [row.cells for row in table.rows] == [("a", "1"), ("a heading",), ("b", "2")]

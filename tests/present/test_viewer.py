@@ -1,4 +1,4 @@
-"""What a recording shows: its layout, the cell and the charts, and how the viewer draws them."""
+"""What a recording shows: layout, cell, charts, arms, tools and fixtures."""
 
 from dataclasses import replace
 
@@ -9,15 +9,26 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import RigidTransform, Rotation
+from support.arm_documents import calibrated, stays_stated, with_holdout
 from support.drawn import column
-from support.samples import made_up, with_frames
+from support.findings import with_findings
+from support.kept import assert_same_evidence
+from support.samples import BASE_FROM_FIXTURE, FLANGE_FROM_TOOL, made_up, with_frames
 
 from visioncal.core.transforms import exp, invert
 from visioncal.present import coverage
-from visioncal.present.recording import arm, board, paths, write_recording
+from visioncal.present.recording import (
+    arm,
+    board,
+    notes,
+    paths,
+    read_calibration,
+    read_evidence,
+    write_recording,
+)
 from visioncal.present.result_parts import placement
 from visioncal.present.viewer import blueprint
-from visioncal.results import Edge
+from visioncal.results import Edge, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.boards import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
@@ -72,14 +83,8 @@ def views_of(container):
         yield from views_of(content)
 
 
-def tabs(sample):
-    root = blueprint(sample.session, sample.calibration).root_container
-    return {tab.name: [view.name for view in views_of(tab)] for tab in root.contents}
-
-
 @pytest.mark.parametrize(
-    "name",
-    ["images and joints", "poses alone", "no joints", "tools and fixtures"],
+    "name", ["images and joints", "poses alone", "no joints", "tools and fixtures"]
 )
 def test_every_panel_shows_something(name, samples, recordings):
     layout = blueprint(samples[name].session, samples[name].calibration)
@@ -87,46 +92,6 @@ def test_every_panel_shows_something(name, samples, recordings):
     for view in views_of(layout.root_container):
         below = f"{view.origin.rstrip('/')}/"
         assert any(f"{entity}/".startswith(below) for entity in logged), view.name
-
-
-def test_panels_are_those_that_the_session_has_something_for(samples):
-    everything = tabs(samples["images and joints"])
-    first = next(iter(everything))
-    assert {"Cell", "Verdict", "This view"} < set(everything[first])
-    assert any(view.startswith("Image") for view in everything[first])
-    poses = str(tabs(samples["poses alone"]))
-    assert "Image" not in poses
-    assert "px" not in poses
-    assert "in the image" not in poses
-    assert "Tools and fixtures" not in str(everything)
-    assert "Tools and fixtures" in tabs(samples["tools and fixtures"])[first]
-
-
-def test_views_that_were_not_used_are_marked_in_the_plots(samples, recordings):
-    rejected = {
-        place
-        for place, view in enumerate(samples["images and joints"].calibration.views)
-        if not view.used
-    }
-    for plot in (paths.POSITION_MM, paths.ORIENTATION_DEG, paths.REPROJECTION_PX):
-        marks = [
-            column(recordings["images and joints"], f"{plot}/{name}", "Scalars:scalars")
-            for name in (paths.REJECTED, paths.BEYOND)
-        ]
-        assert {place for mark in marks for place in mark} == rejected
-
-
-def test_a_view_without_target_takes_the_marks_of_the_last_off(recordings):
-    # View 3 of the sample found no corners.
-    file = recordings["images and joints"]
-    for entity, component in (
-        (paths.SEEN_TARGET, "LineStrips3D:strips"),
-        (f"{paths.IMAGE_COVERAGE}/{paths.THIS_VIEW}", "Points2D:positions"),
-        (f"{paths.DIRECTIONS}/{paths.THIS_VIEW}", "Points2D:positions"),
-    ):
-        drawn = column(file, entity, component)
-        assert len(drawn[2]) > 0
-        assert len(drawn[3]) == 0
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -202,25 +167,6 @@ def test_the_arm_reaches_from_the_base_to_the_flange(tmp_path):
     np.testing.assert_allclose(ends, frames[:, :3, 3], atol=1e-6)
 
 
-def test_a_view_without_joints_has_a_line_to_its_flange_in_the_place_of_the_arm(samples, tmp_path):
-    sample, file = samples["poses alone"], tmp_path / "one_without.rrd"
-    views = list(sample.session.views)
-    views[1] = without_joints(sample).session.views[1]
-    session = replace(sample.session, views=tuple(views))
-    write_recording(file, session, sample.calibration, sample.evidence, None)
-    drawn = column(file, f"{paths.ROBOT}/links", "Capsules3D:lengths")
-    balls = column(file, f"{paths.ROBOT}/joints", "Ellipsoids3D:centers")
-    lines = column(file, f"{paths.ROBOT}/reach", "LineStrips3D:strips")
-    for row in range(len(views)):
-        # What is not drawn is an empty part, which takes that of the view before off.
-        assert len(drawn[row]) == (0 if row == 1 else 7)
-        assert len(balls[row]) == (0 if row == 1 else 6)
-        assert len(lines[row]) == (1 if row == 1 else 0)
-    flange_m = session.views[1].base_from_flange().translation
-    # Single precision of lengths of about 1 m.
-    np.testing.assert_allclose(lines[1][0], [np.zeros(3), flange_m], atol=1e-6)
-
-
 def test_directions_lie_on_the_side_that_the_camera_is_on():
     # 0.5 m above the board, moved 30 degrees towards the target's x and looking back at it.
     tilt = Rotation.from_euler("y", -30, degrees=True)
@@ -239,3 +185,79 @@ def test_axes_of_rotation_and_their_reverse_are_one_point():
     np.testing.assert_allclose(np.abs(points[1]), [[90.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(np.abs(points[2]), [[90.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(points[3], [[0.0, 0.0]], atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return made_up()
+
+
+def with_arm(sample, document):
+    return with_findings(sample, {"kinematics": document})
+
+
+def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
+    calibration = with_arm(sample, with_holdout())
+    path = tmp_path / "recording.rrd"
+    layout = blueprint(sample.session, calibration)
+    write_recording(path, sample.session, calibration, sample.evidence, layout)
+    read = read_calibration(path)
+    assert read is not None
+    assert to_document(read) == to_document(calibration)
+    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    assert paths.ARM_NOTE in entities
+    assert "Arm" in [tab.name for tab in layout.root_container.contents]
+
+
+def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
+    path = tmp_path / "recording.rrd"
+    calibration = with_arm(sample, calibrated())
+    write_recording(path, sample.session, calibration, sample.evidence, None)
+    q = sample.session.views[4].joints_rad
+    ours = calibration.calibrated_robot.link_frames(q)[:, :3, 3]
+    drawn = column(path, f"{paths.ROBOT}/links", "Capsules3D:translations")[4]
+    np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
+
+
+def test_a_stated_arm_has_no_tab_but_a_word(sample):
+    calibration = with_arm(sample, stays_stated())
+    layout = blueprint(sample.session, calibration)
+    assert "Arm" not in [tab.name for tab in layout.root_container.contents]
+    assert "The arm stays as stated" in notes.result_markdown("figures", calibration)
+
+
+@pytest.fixture(scope="module")
+def framed():
+    return with_frames(made_up())
+
+
+@pytest.fixture(scope="module")
+def framed_file(framed, tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    write_recording(path, framed.session, framed.calibration, framed.evidence, None)
+    return path
+
+
+def test_recordings_give_the_frames_back(framed, framed_file):
+    calibration = read_calibration(framed_file)
+    assert calibration is not None
+    assert to_document(calibration) == to_document(framed.calibration)
+    assert to_document(calibration)["frames"].keys() == framed.calibration.frames.keys()
+    assert_same_evidence(framed.evidence, read_evidence(framed_file))
+
+
+@pytest.mark.parametrize(
+    ("child", "parent", "expected"),
+    [("tool", "flange", FLANGE_FROM_TOOL), ("fixture", "base", BASE_FROM_FIXTURE)],
+)
+def test_frames_hang_where_they_belong(framed_file, child, parent, expected):
+    entity = f"{paths.FRAMES}/{child}"
+    assert column(framed_file, entity, "Transform3D:parent_frame")[0].tolist() == [parent]
+    assert column(framed_file, entity, "Transform3D:child_frame")[0].tolist() == [child]
+    place_m = column(framed_file, entity, "Transform3D:translation")[0][0]
+    # Columns first, as rerun keeps matrices.
+    turn = column(framed_file, entity, "Transform3D:mat3x3")[0][0].reshape(3, 3).T
+    # Single precision of lengths under 1 m.
+    np.testing.assert_allclose(place_m, expected.translation, atol=1e-6)
+    np.testing.assert_allclose(turn, expected.rotation.as_matrix(), atol=1e-6)
+    assert column(framed_file, entity, "CoordinateFrame:frame")[0].tolist() == [child]
