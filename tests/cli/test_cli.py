@@ -1,25 +1,33 @@
-"""The commands as a user runs them: exit status, messages, and the files that appear."""
+"""Commands as a user runs them: exit status, messages, streams, and advice that is typed."""
 
 import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
-from contextlib import redirect_stderr
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
+from unittest.mock import patch
 
+import numpy as np
 import pytest
-from support.commands import every_command, started, visioncal
+from support.advice import failures, printed_commands
+from support.commands import every_command, started, turned_poses, visioncal, write_poses
+from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
+from support.marks import slow
 from typer.main import get_command
 
 import visioncal as visioncal_package
-from visioncal.calibration.run import STAGES
+from visioncal.calibration.run import STAGES, calibrate
 from visioncal.calibration.stages.kinematics import ASKED
-from visioncal.cli import progress
-from visioncal.cli.app import app
+from visioncal.cli import dynamics, progress
+from visioncal.cli.app import app, main
+from visioncal.cli.summary import truth_rows
 from visioncal.core.choices import (
     SIMULATED_ARMS,
     SIMULATED_CELLS,
@@ -28,8 +36,11 @@ from visioncal.core.choices import (
 )
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert
 from visioncal.core.types import Mount
+from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.live.planning.purposes import PURPOSES
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     CellOptions,
@@ -39,16 +50,14 @@ from visioncal.simulation import (
     truth_path,
     write_session,
 )
+from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
+from visioncal.simulation.records import cell_session
 
 # As a user has it.
 DRAWS = True
-
-
-@pytest.fixture(scope="module")
-def poor(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("poor") / "one axis"
-    options = CellOptions(views=6, motion="one_axis", seed=1)
-    return write_session(simulate(options), folder, images=False)
+FILES = ["calibration.json", "recording.rrd", "report.html"]
+# What moves a terminal's cursor, colours it, or turns the direction of its text.
+STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
 
 
 def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path):
@@ -65,149 +74,6 @@ def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path
     assert "daniilidis" in done.out
 
 
-def test_json_goes_to_stdout_and_is_the_file(rendered, tmp_path):
-    bare = ("--no-report", "--no-recording", "--json")
-    done = visioncal("calibrate", rendered, "-o", tmp_path / "out", *bare)
-    assert done.status == 0, done.err
-    assert json.loads(done.out) == json.loads((tmp_path / "out/calibration.json").read_text())
-
-
-def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "calibration.json").write_text("an earlier result")
-    done = started("calibrate", poor, "-o", out)
-    assert done.status == 2
-    assert done.out == ""
-    assert "the camera's offset along the tool's" in done.err
-    assert "Traceback" not in done.err
-    assert [path.name for path in out.iterdir()] == ["calibration.json"]
-    assert (out / "calibration.json").read_text() == "an earlier result"
-
-
-def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
-    error = DataError(
-        f"model is {'x' * 100_000}; a name is needed.\nLine 2.", culprits=["y" * 9000]
-    )
-    assert len(error.message) < 2100
-    assert error.message.startswith("model is xxx")
-    assert error.message.endswith("xxx; a name is needed.\nLine 2.")
-    assert len(error.culprits[0]) < 400
-    assert len(DataError("\n".join(["y" * 9000] * 10)).message) < 3200
-
-
-def test_an_error_as_json_has_its_parts(poor, tmp_path):
-    done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json")
-    assert done.status == 2
-    error = json.loads(done.out)["error"]
-    assert error["class"] == "DegenerateError"
-    assert error["culprits"]
-    assert "Add 3 or more views" in error["next"]
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_result_in_the_place_of_a_session_names_its_recording(tmp_path):
-    (tmp_path / "recording.rrd").touch()
-    done = visioncal("calibrate", tmp_path, "-o", tmp_path / "out")
-    assert done.status == 2
-    assert f"name {tmp_path}/recording.rrd" in done.err
-
-
-def test_nothing_is_rendered_for_a_folder_that_is_not_empty(tmp_path, monkeypatch):
-    (tmp_path / "mine.txt").touch()
-    monkeypatch.setattr("visioncal.cli.simulate.simulate", None)
-    done = visioncal("simulate", tmp_path)
-    assert done.status == 2
-    assert "exists and is not empty" in done.err
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("--need-mm", "abc"),
-        ("--solver", "foo"),
-        ("--nosuch", "x"),
-    ],
-)
-def test_a_wrong_option_is_an_error_as_json(option, value, poor, tmp_path):
-    done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json", option, value)
-    assert done.status == 2
-    error = json.loads(done.out)["error"]
-    assert option.strip("-") in error["message"]
-    assert option.strip("-") in error["culprits"][0]
-    assert error["next"]
-
-
-# Options that each command with --json needs before it can look for its input.
-NEEDED = {
-    "correct": ["-c", "nowhere"],
-    "diff": ["nowhere"],
-    "dynamics gains": ["--loaded", "nowhere", "--mass-kg", 1, "--com-mm", "0,0,0"],
-    "dynamics payload": ["--against", "nowhere"],
-    "dynamics validate": ["--against", "nowhere"],
-    "locate": ["-c", "nowhere"],
-    "record": ["-o", "new", "--arm", "manual", "--camera", "folder:nowhere", "--target", "no"],
-    "touch-test": ["-c", "nowhere"],
-    "verify": ["--against", "nowhere"],
-}
-
-
-def test_errors_as_json_have_one_form(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with_json = [
-        name for name, value in every_command() if "as_json" in {p.name for p in value.params}
-    ]
-    assert len(with_json) == 17
-    for name in with_json:
-        source = [] if name == "record" else ["nowhere"]
-        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
-        assert done.status == 2, name
-        error = json.loads(done.out)["error"]
-        # Who logs stderr sees it, too.
-        assert error["message"] in done.err
-        assert set(error) == {"class", "message", "culprits", "next"}
-        assert "no" in error["message"]
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_written_is_named(rendered, tmp_path):
-    (tmp_path / "taken").write_text("a file where the folder should be")
-    done = visioncal("calibrate", rendered, "-o", tmp_path / "taken")
-    assert done.status == 2
-    assert "taken" in done.err
-    assert "Traceback" not in done.err
-
-
-def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
-    warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
-    assert warm.status == 0, warm.err
-    session = Session.load(tmp_path / "warm")
-    # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
-    assert len(session.views) == 12 + 19 * 6
-    assert {"current6_a", "ambient_c"} < set(session.streams["heat"].columns)
-    heat = json.loads((tmp_path / "warm.truth.json").read_text())["heat"]
-    assert len(heat["growth_per_k"]) == 6
-    loads = ("--payload-kg", 0, "--payload-kg", 5)
-    bending = ("--stiffness-knm", 10, "--no-images", "--views", 4)
-    assert visioncal("simulate", tmp_path / "bent", *bending, *loads).status == 0
-    carried = [view.numbers["payload_kg"] for view in Session.load(tmp_path / "bent").views]
-    assert carried == [0.0, 5.0, 0.0, 5.0]
-    truth = read_truth(tmp_path / "bent")
-    assert truth.options["compliance_rad_per_nm"] == [1e-4] * 6
-
-
-def test_simulate_writes_a_session_and_its_truth_beside_it(tmp_path):
-    folder = tmp_path / "cell"
-    done = visioncal("simulate", folder, "--views", 4, "--mount", "eye-to-hand", "--no-images")
-    assert done.status == 0, done.err
-    assert truth_path(folder).exists()
-    assert not any("truth" in path.name for path in folder.rglob("*"))
-    assert set(read_truth(folder).transforms) == {"base_from_cam", "flange_from_target"}
-    again = visioncal("simulate", folder, "--views", 4, "--no-images")
-    assert again.status == 2
-    assert "cell" in again.err
-
-
 @pytest.mark.slow
 def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -218,35 +84,6 @@ def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     # What to do next can be typed as it is printed.
     assert "visioncal plan demo/session --add 5" in done.out
     assert (tmp_path / "demo/result/report.html").stat().st_size > 10_000
-
-
-def test_steps_are_said_in_words_and_counted_by_what_they_go_through():
-    steps = progress.Steps()
-    said = []
-    for report in (("detect", 2, 10), ("detect", 1, 40), ("detect", 40, 40), ("solve", 7, 10)):
-        steps.report(*report)
-        said.append(steps.line)
-    board = "detect the board"
-    assert said == [board, f"{board}: 1 of 40", f"{board}: 40 of 40", "solve for all frames"]
-
-
-def test_every_step_has_words():
-    sources = Path(visioncal_package.__file__).parent.rglob("*.py")
-    called = r"""progress\(\s*"(\w+)","""
-    named = {value for path in sources for value in re.findall(called, path.read_text("utf-8"))}
-    assert {"detect", "render", "excitation", "path"} <= named
-    assert progress.WORDS.keys() == named | {stage.name for stage in STAGES}
-
-
-def test_without_a_terminal_the_step_at_work_is_a_line(monkeypatch):
-    err = io.StringIO()
-    monkeypatch.setattr(progress, "PAUSE_S", 0.001)
-    with redirect_stderr(err), progress.shown_progress(quiet=False) as report:
-        report("detect", 2, 10)
-        report("detect", 12, 57)
-        while "12 of 57" not in err.getvalue():
-            time.sleep(0.001)
-    assert err.getvalue().splitlines()[-1] == "detect the board: 12 of 57 (0 s)"
 
 
 def test_ctrl_c_is_status_130(tmp_path, monkeypatch):
@@ -290,45 +127,485 @@ def test_help_lists_what_can_be_chosen(name):
         assert set(choices) <= words, option
 
 
+@pytest.fixture(scope="module")
+def poor(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("poor") / "one axis"
+    options = CellOptions(views=6, motion="one_axis", seed=1)
+    return write_session(simulate(options), folder, images=False)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory) -> Path:
+    """A session of pose pairs, which are calibrated in no time."""
+    folder = tmp_path_factory.mktemp("pairs") / "cell"
+    return write_session(simulate(CellOptions(views=12, seed=1)), folder, images=False)
+
+
+def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibration.json").write_text("an earlier result")
+    done = started("calibrate", poor, "-o", out)
+    assert (done.status, done.out) == (2, "")
+    assert "the camera's offset along the tool's" in done.err
+    assert "Traceback" not in done.err
+    assert [path.name for path in out.iterdir()] == ["calibration.json"]
+    assert (out / "calibration.json").read_text() == "an earlier result"
+    done = visioncal("calibrate", poor, "-o", tmp_path / "new", "--json")
+    assert done.status == 2
+    error = json.loads(done.out)["error"]
+    assert error["class"] == "DegenerateError"
+    assert error["culprits"]
+    assert "Add 3 or more views" in error["next"]
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_message_leaves_out_the_middle_of_what_nobody_reads():
+    words = f"model is {'x' * 100_000}; a name is needed.\nLine 2."
+    error = DataError(words, culprits=["y" * 9000])
+    assert len(error.message) < 2100
+    assert error.message.startswith("model is xxx")
+    assert error.message.endswith("xxx; a name is needed.\nLine 2.")
+    assert len(error.culprits[0]) < 400
+    assert len(DataError("\n".join(["y" * 9000] * 10)).message) < 3200
+
+
+def test_what_stands_in_the_way_is_named(pairs, tmp_path, monkeypatch):
+    (tmp_path / "recording.rrd").touch()
+    (tmp_path / "taken").write_text("a file where the folder should be")
+    # Nothing is rendered for a folder that is not empty.
+    monkeypatch.setattr("visioncal.cli.simulate.simulate", None)
+    for words, said in (
+        (("calibrate", tmp_path, "-o", tmp_path / "out"), f"name {tmp_path}/recording.rrd"),
+        (("calibrate", pairs, "-o", tmp_path / "taken"), "taken"),
+        (("simulate", tmp_path), "exists and is not empty"),
+    ):
+        done = visioncal(*words)
+        assert done.status == 2
+        assert said in done.err
+        assert "Traceback" not in done.err
+
+
+# Options that each command with --json needs before it can look for its input.
+NEEDED = {
+    "correct": ["-c", "nowhere"],
+    "diff": ["nowhere"],
+    "dynamics gains": ["--loaded", "nowhere", "--mass-kg", 1, "--com-mm", "0,0,0"],
+    "dynamics payload": ["--against", "nowhere"],
+    "dynamics validate": ["--against", "nowhere"],
+    "locate": ["-c", "nowhere"],
+    "record": ["-o", "new", "--arm", "manual", "--camera", "folder:nowhere", "--target", "no"],
+    "touch-test": ["-c", "nowhere"],
+    "verify": ["--against", "nowhere"],
+}
+
+
+def test_errors_as_json_have_one_form(poor, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with_json = [
+        name for name, value in every_command() if "as_json" in {p.name for p in value.params}
+    ]
+    assert len(with_json) == 17
+    for name in with_json:
+        source = [] if name == "record" else ["nowhere"]
+        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
+        assert done.status == 2, name
+        error = json.loads(done.out)["error"]
+        # Who logs stderr sees it, too.
+        assert error["message"] in done.err
+        assert set(error) == {"class", "message", "culprits", "next"}
+        assert "no" in error["message"]
+    for option, value in (("--need-mm", "abc"), ("--solver", "foo"), ("--nosuch", "x")):
+        done = visioncal("calibrate", poor, "-o", tmp_path / "out", "--json", option, value)
+        assert done.status == 2
+        error = json.loads(done.out)["error"]
+        assert option.strip("-") in error["message"]
+        assert option.strip("-") in error["culprits"][0]
+        assert error["next"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
+    warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
+    assert warm.status == 0, warm.err
+    session = Session.load(tmp_path / "warm")
+    # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
+    assert len(session.views) == 12 + 19 * 6
+    assert {"current6_a", "ambient_c"} < set(session.streams["heat"].columns)
+    heat = json.loads((tmp_path / "warm.truth.json").read_text())["heat"]
+    assert len(heat["growth_per_k"]) == 6
+    folder = tmp_path / "bent"
+    bending = ("--stiffness-knm", 10, "--no-images", "--views", 4, "--mount", "eye-to-hand")
+    loads = ("--payload-kg", 0, "--payload-kg", 5)
+    assert visioncal("simulate", folder, *bending, *loads).status == 0
+    carried = [view.numbers["payload_kg"] for view in Session.load(folder).views]
+    assert carried == [0.0, 5.0, 0.0, 5.0]
+    truth = read_truth(folder)
+    assert truth.options["compliance_rad_per_nm"] == [1e-4] * 6
+    # The truth lies beside it.
+    assert truth_path(folder).exists()
+    assert not any("truth" in path.name for path in folder.rglob("*"))
+    assert set(truth.transforms) == {"base_from_cam", "flange_from_target"}
+
+
+def test_steps_are_said_in_words_and_without_a_terminal_in_lines(monkeypatch):
+    steps, said, err = progress.Steps(), [], io.StringIO()
+    for report in (("detect", 2, 10), ("detect", 1, 40), ("detect", 40, 40), ("solve", 7, 10)):
+        steps.report(*report)
+        said.append(steps.line)
+    board = "detect the board"
+    assert said == [board, f"{board}: 1 of 40", f"{board}: 40 of 40", "solve for all frames"]
+    sources = Path(visioncal_package.__file__).parent.rglob("*.py")
+    called = r"""progress\(\s*"(\w+)","""
+    named = {value for path in sources for value in re.findall(called, path.read_text("utf-8"))}
+    assert {"detect", "render", "excitation", "path"} <= named
+    assert progress.WORDS.keys() == named | {stage.name for stage in STAGES}
+    monkeypatch.setattr(progress, "PAUSE_S", 0.001)
+    with redirect_stderr(err), progress.shown_progress(quiet=False) as report:
+        report("detect", 2, 10)
+        report("detect", 12, 57)
+        while "12 of 57" not in err.getvalue():
+            time.sleep(0.001)
+    assert err.getvalue().splitlines()[-1] == "detect the board: 12 of 57 (0 s)"
+
+
 def test_names_that_help_lists_are_those_of_the_files():
     assert cell_names() == SIMULATED_CELLS
 
 
-def test_arrow_does_not_load_pandas_while_a_command_runs():
-    pytest.importorskip("pandas", reason="the extra pandas is not installed")
-    code = """if True:
-        import sys
-        import pyarrow
-        from visioncal.cli import app as application
-
-        def command():
-            # Of another type than arrow would find, so that it looks at what it was given.
-            assert pyarrow.array([1, 2], pyarrow.uint8()).to_pylist() == [1, 2]
-            assert "pandas" not in sys.modules
-
-        application.app = command
-        application.main()
-        import pandas
-        assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1
-    """
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+PANDAS = """
+    import sys
+    import pyarrow
+    # Of another type than arrow would find, so that it looks at what it was given.
+    assert pyarrow.array([1, 2], pyarrow.uint8()).to_pylist() == [1, 2]
+    print("pandas" in sys.modules)
+"""
+BLAS = """
+    import numpy, scipy.linalg, threadpoolctl
+    print({it["num_threads"] for it in threadpoolctl.threadpool_info()})
+"""
 
 
-def test_blas_begins_one_thread_in_commands():
-    code = """if True:
-        from visioncal.cli import app as application
-
-        def command():
-            import numpy, scipy.linalg, threadpoolctl
-            print({it["num_threads"] for it in threadpoolctl.threadpool_info()})
-
-        application.app = command
-        application.main()
-    """
+@pytest.mark.parametrize(
+    ("before", "command", "after", "said"),
+    [
+        # Arrow does not load pandas while a command runs, and does so afterwards.
+        (
+            "import pyarrow",
+            PANDAS,
+            "import pandas\n"
+            'assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1',
+            "False",
+        ),
+        ("", BLAS, "", "{1}"),
+    ],
+    ids=["pandas", "threads of BLAS"],
+)
+def test_libraries_are_kept_small_in_commands(before, command, after, said):
+    code = (
+        f"{before}\nfrom visioncal.cli import app as it\n\ndef command():\n{command}\n"
+        f"it.app = command\nit.main()\n{after}\n"
+    )
     limits = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"}
     environment = {it: value for it, value in os.environ.items() if it not in limits}
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == said
+
+
+def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
+    # No cell of this kind reaches it: the probability of the need is zero.
+    out, need = tmp_path / "out", ("--need-mm", "0.001")
+    done = visioncal("calibrate", pairs, "-o", out, *need, "--json")
+    assert done.status == 3
+    assert json.loads(done.out)["verdict"]["status"] == "bad"
+    drawn = ("--no-report", "--workers", 1)
+    assert visioncal("batch", pairs, "-o", tmp_path / "many", *need, *drawn).status == 3
+    assert visioncal("batch", pairs, "-o", tmp_path / "other", *drawn).status == 0
+    first, *others = Calibration.load(out).verdict.reasons
+    for command in (
+        f"export {out} --to ur",
+        f"correct {pairs}/views.csv --against {out}",
+        f"locate {pairs} -c {out}",
+        f"locate -c {out} --pixel 640,400 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0",
+    ):
+        words = command.split()
+        refused = visioncal(*words)
+        assert (refused.status, refused.out) == (3, "")
+        assert "is bad" in refused.err
+        assert "--force" in refused.err
+        assert first in refused.err
+        assert not any(reason in refused.err for reason in others)
+        forced = visioncal(*words, "--force")
+        assert forced.status != 3
+        if words[0] == "export":
+            assert forced.status == 0, forced.err
+            assert "is bad" in forced.err
+        else:
+            machine = visioncal(*words, "--json")
+            assert machine.status == 3
+            assert json.loads(machine.out)["error"]["class"] == "VerdictError"
+
+
+def full():
+    return Path("/dev/full").open("w", encoding="utf-8")
+
+
+def unread():
+    """A pipe whose reader has gone."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    return os.fdopen(writing, "w", encoding="utf-8")
+
+
+def status(out, err, *arguments) -> int:
+    words = ["visioncal", *map(str, arguments)]
+    with patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+HAS_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+
+
+@HAS_FULL
+@pytest.mark.parametrize(
+    ("out", "err", "options", "ends", "said"),
+    [
+        (full, io.StringIO, ["--json"], 2, "stdout cannot be written: No space left on device."),
+        (io.StringIO, full, [], 0, None),
+        # A reader that has gone ends the command quietly.
+        (unread, io.StringIO, ["--json"], 141, ""),
+        # Streams that were closed before are no error.
+        (nullcontext, nullcontext, ["--json"], 0, None),
+    ],
+    ids=["full stdout", "full stderr", "no reader", "closed"],
+)
+def test_broken_streams_take_no_result_away(pairs, tmp_path, out, err, options, ends, said):
+    with out() as stdout, err() as stderr:
+        assert status(stdout, stderr, "calibrate", pairs, "-o", tmp_path, *options) == ends
+        if said is not None:
+            told = stderr.getvalue()
+            assert said in told
+            assert bool(said) == bool(told)
+    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+
+
+@HAS_FULL
+def test_every_command_ends_so():
+    for arguments in (["--help"], ["--version"], ["calibrate", "none", "--json"]):
+        err = io.StringIO()
+        with full() as out:
+            assert status(out, err, *arguments) == 2
+        assert err.getvalue().count("stdout cannot be written") == 1
+        with unread() as out:
+            assert status(out, io.StringIO(), *arguments) == 141
+    # An error that cannot be printed keeps its status.
+    for arguments in (["calibrate", "none"], ["calibrate", "--nonsense"]):
+        with full() as err:
+            assert status(io.StringIO(), err, *arguments) == 2
+
+
+def test_a_lens_that_is_held_has_no_ratio_of_error_and_sigma():
+    found = calibrate(cell_session(simulate(CellOptions(views=12)), "cell", seen="corners"))
+    held = replace(found.camera, covariance=np.zeros((9, 9)))
+    edges = {name: edge.matrix for name, edge in found.edges.items()}
+    rows = [*truth_rows(replace(found, camera=held), edges, held.camera)]
+    assert [ratio for *_, ratio in rows][-4:] == ["", "", "", ""]
+
+
+READERS = """
+    calibrate {} -o out; convert {} out; show {}; export {} --to ros; diff {} {};
+    verify {} --against {}; locate {} -c {}; show {} --viewer; tcp {} --robot-model ur10e;
+    dynamics identify {}; target check {}
+"""
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "pipe.rrd", "pipe.json"])
+def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(name, tmp_path, monkeypatch):
+    """Names that no file has, and files that might never end, at every command that reads."""
+    monkeypatch.chdir(tmp_path)
+    if name.startswith("pipe"):
+        os.mkfifo(name)
+    for command in READERS.split(";"):
+        done = visioncal(*(word.format(tmp_path / name) for word in command.split()))
+        assert done.status == 2, command
+        assert done.err.startswith("error: ")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_name_does_not_steer_the_terminal(pairs, tmp_path):
+    cell, out = shutil.copytree(pairs, tmp_path / "cell"), tmp_path / "out"
+    document, result = cell / "session.toml", out / "calibration.json"
+    named = r'name = "\u001b[31mred\u0007\u202e\nand \u009b1m"'
+    text, count = re.subn("^name = .*$", lambda _: named, document.read_text(), flags=re.M)
+    assert count == 1
+    document.write_text(text)
+    for call in (
+        ("doctor", cell),
+        ("calibrate", cell, "-o", out),
+        ("show", out, "-o", tmp_path / "report.html"),
+        ("show", out, "--certificate", "-o", tmp_path / "certificate.html"),
+        ("verify", cell, "--against", out, "-o", tmp_path / "check"),
+        # Nor that of a result from elsewhere.
+        ("verify", cell, "--against", result),
+    ):
+        if call[-1] == result:
+            written = re.sub(r'"name": ".*?\[31m', r'"name": "\\u001b[31m', result.read_text())
+            assert r"\u001b[31m" in written
+            result.write_text(written)
+        done = visioncal(*call)
+        assert done.status == 0
+        assert not STEERING.search(done.out + done.err), call
+    pages = [page.read_text() for page in sorted(tmp_path.rglob("*.html"))]
+    assert len(pages) >= 3
+    assert all("[31mred" in page and not STEERING.search(page) for page in pages)
+
+
+# Of each kind of advice one; the others are slow.
+QUICK = ("two rows exchanged",)
+# Read as they are, as tests of tables show: what is then printed is that of semicolons.
+ALIKE = ("decimal commas", "a byte-order mark", "empty rows")
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder that the commands are typed in: some write beside it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else slow(name) for name in BROKEN if name not in ALIKE]
+)
+def test_of_broken_sessions(place, name):
+    broken_session(place / "session", BROKEN[name])
+    said = [
+        visioncal(*pair) for pair in (("doctor", "session"), ("calibrate", "session", "-o", "out"))
+    ]
+    assert {done.status for done in said} <= {0, 2, 3}
+    # What both print is run once.
+    assert list(failures("".join(done.said for done in said))) == []
+
+
+WRONG_PLACES = {
+    "a session's table for a result": (
+        ("export", "session/views.csv", "--to", "ros"),
+        "session/views.csv begins with 'view,",
+        "nothing need be changed",
+    ),
+    "a result for a session": (("convert", "out", "copy"), "no session, but a result", "recording"),
+    "no folder": (("calibrate", "session", "-o", ""), "-o is empty", "variable"),
+    "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
+    "touches for a drawing": (
+        ("fixture", "session/views.csv", "--cad", "session/views.csv", "--tool", "none"),
+        "views.csv has rotations",
+        "Name the touches first",
+    ),
+    "no arm": (("simulate", "x", "--robot", "foo"), "ur10e, generic-6r-1800 are", "Name one"),
+    "readings to plan for": (("plan", "tracker", "--add", "3"), "is of an instrument", "30 deg"),
+    "readings to look in": (
+        ("locate", "tracker", "-c", "tracked"),
+        "is of an instrument",
+        "visioncal verify",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_PLACES)
+def test_of_what_is_given_in_the_wrong_place(place, name):
+    words, said, advised = WRONG_PLACES[name]
+    write_session(simulate(CellOptions(views=8, seed=4)), place / "session", images=False)
+    if "out" in words:
+        for file in ("calibration.json", "recording.rrd"):
+            (place / "out" / file).parent.mkdir(exist_ok=True)
+            (place / "out" / file).touch()
+    if "tracker" in words:
+        assert visioncal("simulate", "tracker", "--instrument", "point").status == 0
+    if "tracked" in words:
+        assert visioncal("calibrate", "tracker", "-o", "tracked").status == 0
+    done = visioncal(*words)
+    assert done.status == 2
+    assert said in done.said
+    assert advised in done.said
+    assert list(failures(done.said)) == []
+
+
+@pytest.mark.slow
+def test_of_verify(place):
+    whole = Session.load(write_session(simulate(CellOptions(views=20, seed=5)), place / "all"))
+    replace(whole, views=whole.views[:15]).save(place / "fit")
+    assert visioncal("calibrate", "fit", "-o", "out").status == 0
+    for name, last, change in (
+        ("few", 18, lambda row: row),
+        ("knocked", 20, lambda row: row | {"x_m": str(float(row["x_m"]) + 0.01)}),
+    ):
+        replace(whole, views=whole.views[15:last]).save(place / name)
+        edit_rows(place / name, lambda rows, change=change: [*map(change, rows)])
+        done = visioncal("verify", name, "--against", "out")
+        assert printed_commands(done.said), name
+        assert list(failures(done.said)) == []
+
+
+def test_of_a_tool(place):
+    rng = np.random.default_rng(3)
+    above, tip = np.eye(3), np.array([0.02, 0.01, 0.15])
+    tips = np.tile([0.4, 0.1, 0.2], (8, 1)) + rng.normal(scale=1e-4, size=(8, 3))
+    poses = turned_poses(rng, tips, tip, above)
+    write_poses(place / "inverse.csv", invert(poses))
+    write_poses(place / "touches.csv", poses)
+    for words in (
+        ("tcp", "inverse.csv", "-o", "frames.json"),
+        ("tcp", "touches.csv", "-o", "frames.json", "--force", "--touch-noise-mm", "0.01"),
+    ):
+        done = visioncal(*words)
+        assert done.status == 0
+        assert printed_commands(done.said), done.said
+        assert list(failures(done.said)) == []
+
+
+def test_of_a_fixture(place):
+    assert visioncal("simulate", "cell", "--touches", "--no-images").status == 0
+    assert visioncal("calibrate", "cell", "-o", "out").status == 0
+    assert visioncal("tcp", "cell/touches.csv", "-c", "out", "--name", "gripper").status == 0
+    points = (place / "cell/points.csv").read_text("utf-8").splitlines()
+    view, name, x, *others = points[4].split(",")
+    points[4] = ",".join((view, name, str(float(x) + 0.004), *others))
+    (place / "missed.csv").write_text("\n".join(points), "utf-8")
+    asked = ("fixture", "cell/points.csv", "--cad", "cell/cad.csv", "-c", "out")
+    for words in (
+        ("fixture", "missed.csv", *asked[2:], "--name", "jig"),
+        (*asked, "--name", "tray", "--touch-noise-mm", "0.005"),
+        (*asked, "--name", "bin", "--touch-noise-mm=0.005"),
+    ):
+        done = visioncal(*words)
+        assert done.status == 0
+        (again,) = printed_commands(done.said)
+        # The advice's value stands behind what was typed, and counts.
+        assert ("--touch-noise-mm" in again) == ("--touch-noise" in words[-1] + words[-2])
+        # That of a value as one word is that of two.
+        if "bin" not in words:
+            assert list(failures(done.said)) == []
+
+
+@pytest.mark.slow
+def test_of_dynamics(place, monkeypatch):
+    # The motion that is planned need not be a good one: a short search will do.
+    monkeypatch.setattr(
+        dynamics,
+        "ExcitationRequest",
+        lambda *words, **more: replace(ExcitationRequest(*words, **more), starts=1, steps=3),
     )
-    assert done.stdout.strip() == "{1}"
+    rng = np.random.default_rng(2)
+    built = real_dynamics("ur5e", rng)
+    streams = {"sweeps": record(built, slow_sweep(6, rng, seconds=30.0), rng)}
+    exercise_session("ur5e", streams).save(place / "session")
+    done = visioncal("dynamics", "identify", "session", "-o", "out")
+    assert done.status == 0
+    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.said)
+    assert list(failures(done.said)) == []
