@@ -1,0 +1,672 @@
+"""Whole cells: frames and their sigmas, what is wrong with them, priors, drift and clocks."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.commands import visioncal
+from support.drawn import column
+from support.problems import observed, pose, world
+from support.refusals import raised
+from support.swept_cells import AHEAD_S, cell_of
+from support.whole_cells import OPTIONS, recorded
+
+from visioncal.calibration.run import calibrate
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Target
+from visioncal.interchange.formats.rereading import exchange_views
+from visioncal.present.recording import paths, read_evidence
+from visioncal.results import Calibration
+from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
+from visioncal.simulation import (
+    BOARDS,
+    BoardAt,
+    CameraAt,
+    NetworkOptions,
+    cell_session,
+    fine_camera,
+    simulate,
+    wide_camera,
+    write_session,
+)
+from visioncal.simulation.arms import Heat
+from visioncal.simulation.layout import InstrumentAt, Moved, PointAt
+
+# Looks the same after half a turn: both counts are even.
+ALIKE = Target("checkerboard_8x6_25mm", "checkerboard", 8, 6, 0.025, 2.5e-5)
+FLOOR = BoardAt("floor", place_m=(0.0, 0.0, 0.05))
+LEFT = CameraAt("left", place_m=(0.0, -1.0, 1.1))
+PLAIN = NetworkOptions(stops=20)
+ROBOTS = PLAIN.robots
+# Chi-square of six, and of twelve, exceed these in one case of a thousand.
+MOST, MOST_OF_TWELVE = 22.5, 32.9
+
+
+def session_of(cell, **document):
+    """The session of a cell, of which something more is said."""
+    session = cell_session(cell, "cell", seen="names")
+    return replace(session, document={**session.document, **document})
+
+
+def solved(cell, session=None, level="auto", **document):
+    """The calibration of a cell, from its corners."""
+    corners = {corner.view: corner for corner in cell.corners}
+    return calibrate(session or session_of(cell, **document), corners=corners, level=level)
+
+
+def off(cell, found, first, second):
+    """Distance [m] of a frame from where it is in another, and the squared error in sigmas."""
+    edge = found.between(first, second)
+    away = log(invert(cell.between(first, second)) @ edge.matrix)
+    return np.linalg.norm(away[3:]), float(away @ np.linalg.solve(edge.covariance, away))
+
+
+def reason(found, words):
+    """The one reason of a verdict with these words."""
+    (said,) = (reason for reason in found.verdict.reasons if words in reason)
+    return said
+
+
+@pytest.fixture(scope="module")
+def clean():
+    cell = simulate(PLAIN)
+    return cell, solved(cell)
+
+
+def test_a_sound_cell_is_as_near_as_its_covariance_says_and_is_good(clean):
+    cell, found = clean
+    away_m, squared = off(cell, found, "base_a", "base_b")
+    # 2e-4 m: four sigma of what twenty stops tell at a metre.
+    assert away_m < 2e-4
+    assert squared < MOST
+    assert found.tree.edge_of("base_b").sigma_mm < 0.1
+    assert off(cell, found, "cam_left", "cam_right")[1] < MOST
+    assert all(view.used for view in found.views)
+    assert not found.cell.moved
+    assert found.cell.reference == "base_a"
+    noise, sigma_px = found.cell.noise, cell.options.pixel_sigma_px
+    assert noise["cam_left"]["pixel_px"] == pytest.approx(sigma_px, rel=0.1)
+    # Twenty stops tell a robot's to some 15 %.
+    assert [noise[name]["translation_mm"] for name in "ab"] == pytest.approx([0.03] * 2, rel=0.5)
+    assert found.verdict.status == "good"
+
+
+@pytest.fixture(scope="module")
+def three():
+    """The session of a cell of three cameras: two or more see by way of a robot at most stops."""
+    right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=fine_camera())
+    cameras = (*OPTIONS.cameras, right)
+    return recorded(simulate(replace(OPTIONS, cameras=cameras, stops=16)))
+
+
+def test_a_sound_cell_says_how_good_it_is(three):
+    found = calibrate(three)
+    assert found.verdict.status == "good"
+    good_for, agree = found.verdict.reasons
+    assert good_for.startswith("It is good for tasks of ")
+    used = sum(view.used for view in found.views)
+    assert agree.startswith(
+        f"All {used} used views agree. Checked with views that were not used in the fit:"
+    )
+    assert "offset along the cell's" in agree
+
+
+def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean):
+    _, found = clean
+    there, back = found.between("cam_left", "base_b"), found.between("base_b", "cam_left")
+    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
+    assert not found.between("base_a", "base_a").covariance.any()
+    ends, edges = ("cam_left", "target_plate_b"), list(found.edges)
+    poses = {"b": exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, 0.6]))}
+    chain, step = found.between(*ends, poses), 1e-6
+    jacobian = np.zeros((6, 6 * len(edges)))
+    for at, (edge, twist) in enumerate((edge, twist) for edge in edges for twist in np.eye(6)):
+        moved = replace(found.edges[edge], matrix=found.edges[edge].matrix @ exp(step * twist))
+        there = replace(found, edges={**found.edges, edge: moved}).between(*ends, poses).matrix
+        jacobian[:, at] = log(invert(chain.matrix) @ there) / step
+    expected = jacobian @ found.joint_covariance @ jacobian.T
+    # Forward differences of 1e-6 are exact to 1e-6 of themselves.
+    np.testing.assert_allclose(chain.covariance, expected, rtol=1e-4, atol=1e-13)
+    with pytest.raises(DataError, match="moves with robot 'b': its pose is needed"):
+        found.between(*ends)
+    with pytest.raises(DataError, match="no frame 'cam_lft'"):
+        found.between("cam_lft", "base_a")
+
+
+def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
+    pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
+    cell = simulate(replace(PLAIN, moved=pushes, swapped_rows=1, stray_images=3, seed=3))
+    found = solved(cell)
+    moved = [(value.frame, value.first_stop) for value in found.cell.moved]
+    assert moved == [("target_floor", 9), ("cam_right", 12)]
+    # A pushed frame's own place is known to 0.1 mm.
+    assert [value.shift_mm for value in found.cell.moved] == pytest.approx([5.0] * 2, abs=0.4)
+    reasons = {view.view: view.reason for view in found.views if not view.used}
+    assert sorted(reasons) == list(cell.wrong_views)
+    assert sum("exchanged" in reason for reason in reasons.values()) == 2
+    assert sum("its image is of stop" in reason for reason in reasons.values()) == 3
+    assert found.verdict.status == "check"
+    assert reason(found, "cam_right was bumped between stops 11 and 12")
+    away_m, squared = off(cell, found, "base_a", "base_b")
+    assert squared < MOST
+    assert away_m < 2.5e-4
+
+
+@pytest.mark.slow
+def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found():
+    """The later push is found first."""
+    pushes, frame = (Moved("target_floor", 4), Moved("target_floor", 10)), "target_floor"
+    found = solved(simulate(replace(PLAIN, moved=pushes, seed=3)))
+    befores = [f"{frame}_until_stop_3", f"{frame}_until_stop_9"]
+    assert [value.before for value in found.cell.moved] == befores
+    assert [(value.last_stop, value.first_stop) for value in found.cell.moved] == [(3, 4), (9, 10)]
+    assert {f"cell_from_{before}" for before in (*befores, frame)} < set(found.edges)
+
+
+def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
+    cell = simulate(replace(PLAIN, moved=(Moved("base_b", 10),)))
+    found = solved(cell)
+    words = reason(found, "pushed")
+    assert "did not stand at stop 10 and after where its pose says" in words
+    assert "as if base_b had been pushed by 5" in words
+    assert not found.cell.moved
+    assert off(cell, found, "base_a", "base_b")[1] < MOST
+
+
+def test_one_wrong_pose_of_a_robot_is_named(three):
+    of_b = [view for view in three.views if view.text.get("target") == "plate_b"]
+    seen = [view.stop for view in of_b]
+    stop = next(stop for stop in seen if stop > 2 and seen.count(stop) > 1)
+    mine = [view.number for view in of_b if view.stop == stop]
+
+    def pushed(view):
+        if view.stop != stop or view.text.get("robot") != "b" or "x_m" not in view.numbers:
+            return view
+        told = {name: number for name, number in view.numbers.items() if name in POSE}
+        return replace(view, numbers=told | {"x_m": told["x_m"] + 0.02})
+
+    found = calibrate(replace(three, views=tuple(map(pushed, three.views))))
+    said = reason(found, "Robot b did not stand")
+    assert f"at stop {stop} where its pose says: all {len(mine)} views" in said
+    assert "moved by 20 mm" in said
+    assert all(str(value) in said for value in mine)
+    assert found.verdict.status == "check"
+    # What a fault explains is not said once more of each camera.
+    assert not any("were left out; view" in reason for reason in found.verdict.reasons)
+    why = {view.view: view.reason for view in found.views if not view.used}
+    assert sorted(why) == mine
+    assert all(f"the pose of robot b at stop {stop} is wrong" in name for name in why.values())
+
+
+def test_a_robot_whose_poses_are_misread_is_named_first(three):
+    def turned(view):
+        """With w first: what other programs write into the same columns."""
+        numbers = {name: number for name, number in view.numbers.items() if name in POSE}
+        if view.text.get("robot") == "b" and numbers:
+            order = [numbers[name] for name in ("qw", "qx", "qy", "qz")]
+            numbers |= dict(zip(POSE[3:], order, strict=True))
+        return replace(view, numbers=numbers)
+
+    with pytest.raises(DegenerateError) as refused:
+        calibrate(replace(three, views=tuple(map(turned, three.views))))
+    words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, robot and camera"
+    assert str(refused.value).startswith(words)
+    assert "rows of robot b in views.csv" in refused.value.next_step
+
+
+def test_points_of_targets_that_are_exchanged_are_refused(three):
+    """A checkerboard of 54 points under the name of a ChArUco board of 40, and the reverse."""
+    session = three
+    targets = dict(session.target_document)
+    targets["floor"], targets["plate_b"] = targets["plate_b"], targets["floor"]
+    rows = [[view.cell(column) for column in session.columns] for view in session.views]
+    with pytest.raises(DataError, match="has no point 40; its 40 points"):
+        Session.assemble(
+            session.document,
+            session.columns,
+            rows,
+            session.images,
+            target_document=targets,
+            corners=session.corner_table,
+        )
+
+
+def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
+    cell = simulate(
+        replace(PLAIN, boards=tuple(replace(board, target=ALIKE) for board in PLAIN.boards))
+    )
+    found = solved(cell)
+    assert all(view.used for view in found.views)
+    for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
+        assert off(cell, found, *frames)[1] < MOST
+
+
+@pytest.mark.slow
+def test_boards_of_three_sizes_are_found_beside_arms_that_err():
+    """What all three have in common the arms' links may have, too: free together none is clear."""
+    robots = tuple(replace(robot, offset_sigma_rad=1e-3) for robot in ROBOTS)
+    scales = {"floor": 1.002, "plate_a": 0.999, "plate_b": 1.001}
+    boards = tuple(replace(board, scale=scales[board.name]) for board in PLAIN.boards)
+    found = solved(simulate(replace(PLAIN, robots=robots, boards=boards, seed=5)))
+    shapes = {name: found.boards[name].shape["scale"] for name in scales}
+    # Against each other they are known to some hundred-thousandths.
+    assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
+    assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)
+    # 0.03 mm is planted: sizes that stay wrong count as ten times that.
+    assert max(found.cell.noise[name]["translation_mm"] for name in "ab") < 0.06
+
+
+def test_a_lens_that_is_stated_wrong_is_refined(clean):
+    cell, _ = clean
+    cameras = session_of(cell).document["cameras"]
+    wrong = np.add(cameras["left"]["matrix"], [8.0, 8.0, -3.0, 4.0])
+    left = {**cameras["left"], "matrix": wrong.tolist(), "intrinsics": "auto"}
+    found = solved(cell, cameras=cameras | {"left": left})
+    got, said = found.cell.lenses["cam_left"], reason(found, "the given intrinsics do not fit")
+    assert said.startswith("cam_left: ")
+    assert "were refined" in said
+    sigma = np.sqrt(np.diag(got.covariance))[:4]
+    assert np.all(np.abs(got.camera.matrix - LEFT.camera.matrix) < 5 * sigma)
+    assert off(cell, found, "base_a", "base_b")[1] < MOST
+
+
+def test_cameras_in_the_hand_and_poses_that_are_given():
+    cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
+    cell = simulate(replace(PLAIN, cameras=cameras, boards=(FLOOR,)))
+    found = calibrate(cell_session(cell, "cell", seen="poses"))
+    away_m, squared = off(cell, found, "base_a", "base_b")
+    assert away_m < 1e-3
+    # The noise of the given poses is estimated, too: fewer are told than they are.
+    assert squared < 40.0
+    # A board that is seen squarely turns unseen: errors of its pose have no single size.
+    assert all(view.used for view in found.views)
+
+
+POINTS = (
+    PointAt("n1", "cell", (0.2, 0.3, 0.1)),
+    PointAt("n2", "cell", (-0.2, 0.35, 0.2)),
+    PointAt("n3", "cell", (0.1, -0.4, 0.15)),
+    PointAt("fa", "a", (0.05, 0.02, 0.08)),
+    PointAt("fb", "b", (0.03, -0.04, 0.09)),
+)
+TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 1.2), 2.5))
+
+
+def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
+    cell = simulate(NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12))
+    # The second stands alone but for the points in the cell.
+    kept = [read for read in cell.readings if read.instrument == "t1" or read.point[0] == "n"]
+    found = solved(replace(cell, readings=tuple(kept)))
+    for frames in (("base_a", "base_b"), ("instrument_t1", "instrument_t2")):
+        assert off(cell, found, *frames)[1] < MOST
+    # Places alone were read: a point's axes are its parent's by choice.
+    assert not found.tree.edge_of("point_n1").oriented
+    assert all(view.residual_deg is None for view in found.views)
+    # Some 250 coordinates tell what a tracker's noise is of what is said of it, to 5 %.
+    assert found.cell.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
+
+
+def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
+    cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=8))
+    untied = solved(cell).cell.untied
+    (remedy,) = {value.remedy for value in untied if value.frame == "instrument_t1"}
+    assert "read points on a robot's flange" in remedy
+
+
+@pytest.mark.slow
+def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
+    robots = tuple(replace(robot, offset_sigma_rad=1e-3) for robot in ROBOTS)
+    cell = simulate(replace(PLAIN, robots=robots))
+    reported = solved(cell, level="hand-eye")
+    assert sum("follow the arm's posture" in reason for reason in reported.verdict.reasons) == 2
+    found = solved(cell)
+    assert found.verdict.status == "good"
+    for robot in ("a", "b"):
+        kinematics, real = found.cell.robots[robot].arm, cell.robots[robot]
+        assert kinematics.level == "offsets"
+        true = real.true_arm.offset - real.arm.offset
+        zeros = [value for value in kinematics.parameters if value.name == "theta_rad"]
+        told = np.array([zero.change for zero in zeros])
+        # Others than the first and the last are known to some 0.05 mrad by this many stops.
+        assert told[1:-1] == pytest.approx(true[1:-1], abs=2.5e-4)
+        surprises = (told - true) / [zero.sigma for zero in zeros]
+        assert np.abs(surprises).max() < 4.5  # one of twelve in ten thousand sessions
+        one, q = found.of("cam_left", robot, f"target_plate_{robot}"), real.joints
+        poses = kinematics.robot.base_from_flange(q)
+        np.testing.assert_allclose(one.standing(q), poses, atol=1e-12)
+    assert off(cell, found, "cam_left", "cam_right")[1] < MOST
+    after, before = (it.between("cam_left", "cam_right").sigma_mm for it in (found, reported))
+    # Well under a half: what the arms err by puts the given lenses in doubt, too.
+    assert after < 0.45 * before
+
+
+@pytest.mark.slow
+def test_frames_that_take_up_a_calibrated_arms_zeros_are_no_doubt():
+    slipped = replace(ROBOTS[1], offset_sigma_rad=5e-3)
+    found = solved(simulate(replace(PLAIN, robots=(ROBOTS[0], slipped), stops=24)))
+    # No stop tells the zeros of the first joint and of the last one from a base and a plate that
+    # are turned, and more stops would not: both are as uncertain as zeros of 5 mrad (0.29 deg),
+    # whose size is estimated from four others to a third.
+    assert found.cell.robots["b"].arm.level == "offsets"
+    assert found.edges["cell_from_base_b"].sigma_deg > 0.2
+    assert found.edges["flange_b_from_target_plate_b"].sigma_deg > 0.2
+    assert found.verdict.status == "good", found.verdict.reasons
+
+
+def test_a_robot_without_joints_stays_as_it_reports_itself():
+    cell = simulate(replace(PLAIN, stops=8))
+    session = session_of(cell)
+    bare = [
+        replace(view, numbers={name: it for name, it in view.numbers.items() if name in POSE})
+        for view in session.views
+    ]
+    bare = replace(session, views=tuple(bare))
+    found = solved(cell, bare, level="offsets")
+    assert sum("stays as it reports itself" in reason for reason in found.verdict.reasons) == 2
+    with pytest.raises(DataError, match="level 'all'"):
+        calibrate(bare, level="all")
+
+
+def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
+    cell = simulate(replace(PLAIN, boards=PLAIN.boards[:2], stops=8))
+    caught = raised(DegenerateError, "nothing ties base_b to base_a", solved, cell)
+    assert "let cam_left, cam_right see a board on flange_b" in caught.next_step
+
+
+def test_a_camera_that_one_standing_view_ties_is_refused():
+    far = replace(LEFT, place_m=(0.0, -1.5, 1.6))
+    boards, cameras = (FLOOR, BoardAt("plate_b", "b")), (far, CameraAt("hand", on="a"))
+    cell = simulate(NetworkOptions(cameras=cameras, boards=boards, stops=12, pixel_sigma_px=0.3))
+    kept = [sight for sight in cell.sights if (sight.camera, sight.board) != ("hand", "plate_b")]
+    caught = raised(DegenerateError, "cam_left", solved, replace(cell, sights=tuple(kept)))
+    assert "cam_left" in caught.next_step
+
+
+def test_a_camera_that_a_board_ties_either_way_round_is_refused():
+    beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
+    boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
+    cell = simulate(NetworkOptions(ROBOTS[:1], cameras=(LEFT, beside), boards=boards, stops=12))
+    kept = [sight for sight in cell.sights if (sight.camera, sight.board) != ("right", "plate_a")]
+    with pytest.raises(DegenerateError, match="cam_right may be in two places: target_floor looks"):
+        solved(replace(cell, sights=tuple(kept)))
+
+
+def turned(tilt_deg, stops=14, noise=1.0, turn_deg=35.0, prior=None):
+    """A session of measured poses in which robot b is tilted by so much, and turned about z."""
+    rng = np.random.default_rng(3)
+    cell = world(rng, stops, seen=1.0)
+    angles = rng.uniform(-1.0, 1.0, (stops, 3)) * [tilt_deg, tilt_deg, turn_deg]
+    places = np.array([0.9, 0.1, 0.45]) + rng.uniform(-0.2, 0.2, (stops, 3))
+    flanges = [pose(*pair) for pair in zip(angles, places, strict=True)]
+    cell.flanges["b"] = np.linalg.inv(cell.truth["base_b"]) @ np.array(flanges)
+    problem = observed(cell, rng, noise=noise)
+    seen, rows, told = problem.observations, [], set()
+    for at, (camera, target, stop) in enumerate(cell.pairs):
+        row = {"view": at, "stop": stop, "camera": camera[4:], "target": target[7:]}
+        # Each robot's pose stands once a stop.
+        robot = {"target_a": "a", "target_b": "b"}.get(target)
+        fresh = robot is not None and (robot, stop) not in told
+        told.add((robot, stop))
+        row["robot"] = robot if fresh else ""
+        row |= pose_row(problem.poses[robot][stop]) if fresh else dict.fromkeys(POSE, "")
+        row |= {f"cft_{name}": value for name, value in pose_row(seen.measured[at]).items()}
+        rows.append(row)
+    document = {
+        "schema": 1,
+        "name": "turned",
+        "cameras": {"left": {}, "right": {}},
+        "robots": {"a": {}, "b": {}},
+        "targets": {name: {"target": "charuco_9x6_30mm"} for name in ("floor", "a", "b")},
+        "frames": {
+            **dict.fromkeys(("cam_left", "cam_right", "target_floor"), "cell"),
+            "target_a": "flange_a",
+            "target_b": "flange_b",
+        },
+        "prior": {"flange_b_from_target_b": prior} if prior else {},
+    }
+    cells = [[str(value) for value in row.values()] for row in rows]
+    return cell, Session.assemble(document, list(rows[0]), cells, MemoryImages({}))
+
+
+def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
+    words = "offset along the cell's z has a predicted"
+    caught = raised(DegenerateError, words, calibrate, turned(0.3)[1])
+    assert "base_b's offset along the cell's z" in caught.culprits
+    assert "all 14 stops of robot b turn about base_b's z to within 0." in caught.message
+
+
+def test_noise_refuses_nothing():
+    # Thirty times a usual camera's and robot's.
+    found = calibrate(turned(35.0, noise=30.0)[1])
+    assert found.verdict.status == "bad"
+    assert any("Weakly determined by the motion" in reason for reason in found.verdict.reasons)
+    assert reason(found, "Left out of the fit, views disagree")
+
+
+def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
+    height = {"z_m": 0.06, "sigma_m": 1e-4}
+    cell, session = turned(0.0, stops=8, turn_deg=115.0, prior=height)
+    edge = calibrate(session).between("base_a", "base_b")
+    away = log(invert(cell.truth["base_b"]) @ edge.matrix)
+    assert away @ np.linalg.solve(edge.covariance, away) < MOST
+    assert edge.sigma_mm < 1.0
+    with pytest.raises(DegenerateError, match="differ in position only") as caught:
+        calibrate(turned(0.0, stops=8, turn_deg=0.0)[1])
+    assert caught.value.next_step == (
+        "To tie base_b: add 3 or more stops in which flange_b is tilted by 20 to 40 degrees about "
+        "different axes, not only about one."
+    )
+
+
+def whole(matrix, sigma_m, sigma_rad):
+    """A transform as a prior states it."""
+    turn = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
+    place = dict(zip(("x_m", "y_m", "z_m"), matrix[:3, 3].tolist(), strict=True))
+    return place | {"sigma_m": sigma_m, "quaternion_xyzw": turn, "sigma_rad": sigma_rad}
+
+
+def test_a_prior_narrows_what_it_is_of_and_is_named_where_it_is_wrong(clean):
+    cell, before = clean
+    height = float(cell.between("base_a", "base_b")[2, 3])
+    found = solved(cell, prior={"base_a_from_base_b": {"z_m": height, "sigma_m": 1e-6}})
+    after = found.between("base_a", "base_b")
+    turn = after.matrix[:3, :3]
+    sigma_m = np.sqrt(np.diag(turn @ after.covariance[3:, 3:] @ turn.T))
+    assert after.matrix[2, 3] == pytest.approx(height, abs=4e-6)
+    assert sigma_m[2] <= 1.01e-6
+    assert after.sigma_mm < before.between("base_a", "base_b").sigma_mm
+    assert found.verdict.status == "good"
+    found = solved(cell, prior={"base_a_from_base_b": {"z_m": height + 0.02, "sigma_m": 1e-3}})
+    doubt = reason(found, "contradicted")
+    assert "z_m of base_a_from_base_b" in doubt
+    said_mm, sigma_mm = map(float, re.search(r"alone say (\S+) mm to (\S+) mm", doubt).groups())
+    # Four of the sigmas that are stated: one run in fifteen thousand.
+    assert abs(said_mm - 1e3 * height) < 4 * sigma_mm < 0.4
+    assert found.verdict.status == "check"
+
+
+@pytest.mark.slow
+def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing(clean):
+    """A stereo rig: the right camera is known from the left one, and sees a board by itself."""
+    cell, _ = clean
+    session = session_of(cell)
+    # Of the right camera, what it sees of the floor is left; and of the left one all else.
+    kept = [
+        view
+        for view in session.views
+        if (view.text.get("camera") == "right") == (view.text.get("target") == "floor")
+    ]
+    loose = solved(cell, replace(session, views=tuple(kept)))
+    assert {untied.frame for untied in loose.cell.untied} == {"cam_right", "target_floor"}
+    rig = whole(cell.between("cam_left", "cam_right"), 1e-4, 1e-4)
+    session = session_of(cell, prior={"cam_left_from_cam_right": rig})
+    found = solved(cell, replace(session, views=tuple(kept)))
+    assert not found.cell.untied
+    assert off(cell, found, "base_a", "target_floor")[1] < MOST
+    # Nobody moves before the right camera: its board may be of any size.
+    assert not any("than stated" in reason for reason in found.verdict.reasons)
+    assert 0.1 < found.between("cam_left", "cam_right").sigma_mm < 0.2
+
+
+HEIGHT = {"z_m": 0.1, "sigma_m": 1e-3}
+
+
+@pytest.mark.parametrize(
+    ("name", "prior", "words"),
+    [
+        ("base_a_from_camleft", HEIGHT, "Did you mean cam_left"),
+        ("base_a_from_target_plate_a", HEIGHT, "robot a moves one"),
+        ("cam_left_from_cam_left", HEIGHT, "they are one"),
+        (
+            "cam_left_from_cam_right",
+            HEIGHT | {"sigma_rad": 1e-3},
+            "quaternion_xyzw and sigma_rad together",
+        ),
+    ],
+)
+def test_a_prior_of_no_fixed_place_is_refused(clean, name, prior, words):
+    with pytest.raises(DataError) as raised:
+        solved(clean[0], prior={name: prior})
+    assert words in f"{raised.value.message} {raised.value.next_step}"
+
+
+@pytest.fixture(scope="module")
+def warm():
+    """Two robots before two cameras, one of them cold at the first of 40 stops; with its drift."""
+    cell = simulate(
+        NetworkOptions(
+            robots=(replace(ROBOTS[0], warms_up=True), ROBOTS[1]),
+            cameras=tuple(replace(camera, camera=fine_camera()) for camera in PLAIN.cameras),
+            boards=PLAIN.boards,
+            stops=40,
+            pace_s=150.0,
+        )
+    )
+    return cell, solved(cell, level="thermal")
+
+
+@pytest.mark.slow
+def test_frames_are_those_of_the_cold_arm(warm):
+    cell, found = warm
+    without = solved(cell, level="hand-eye")
+    for frame in ("base_b", "cam_left"):
+        assert off(cell, found, "base_a", frame)[1] < MOST
+        # Drift of some 0.3 mm that is taken for a base that creeps moves them by several sigmas.
+        assert off(cell, without, "base_a", frame)[1] > MOST
+
+
+def test_an_arm_of_a_cell_drifts_with_its_own_temperatures(warm, tmp_path):
+    cell, found = warm
+    found.save(tmp_path / "calibration.json")
+    drift = Calibration.load(tmp_path / "calibration.json").of("left", "a").drift
+    heat, names = Heat.drawn(0), ("growth_per_k", "drift_rad_per_k")
+    away = np.concatenate([getattr(drift, name) - getattr(heat, name) for name in names])
+    assert away @ np.linalg.solve(drift.covariance[:12, :12], away) < MOST_OF_TWELVE
+    thermal = found.cell.robots["a"].thermal
+    assert thermal.residual_mm.with_drift < 0.7 * thermal.residual_mm.without
+    assert len(thermal.views) > 30
+    assert reason(found, "Robot a: the arm drifts with its temp")
+    # A robot without temperatures stays as it is.
+    assert found.cell.robots["b"].thermal is None
+    assert not any(reason.startswith("Robot b: the arm drift") for reason in found.verdict.reasons)
+    budget = found.cell.uncertainty.budget_mm["flange_a_from_target_plate_a"]
+    assert 0.0 < budget["temperature of a"] < budget["total"]
+    with pytest.raises(DataError, match=r"robot a: level 'thermal' needs .* temp1_c"):
+        solved(cell, replace(session_of(cell), streams={}), "thermal")
+    with pytest.raises(DataError, match="warms up needs pace_s"):
+        replace(cell.options, pace_s=0.0)
+
+
+def test_a_camera_that_sees_a_moving_robot_by_a_clock_of_its_own_is_placed():
+    robots = tuple(replace(robot, offset_sigma_rad=1e-3) for robot in ROBOTS)
+    cell = cell_of(NetworkOptions(robots, stops=16, seed=4))
+    session, pair = session_of(cell), "cam_side and robot b"
+    found = solved(cell, session)
+    clock = found.cell.details.clocks[pair]
+    assert clock.method == "motion"
+    assert clock.sigma_s < 1e-4
+    # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
+    assert abs(clock.camera_minus_robot_s - AHEAD_S) < 3 * clock.sigma_s
+    assert found.of("side", "b").clock == clock
+    assert found.of("left", "b").clock is None
+    assert off(cell, found, "cam_left", "cam_side")[1] < MOST
+    # Its lens is estimated, with a field and a focus of its own.
+    assert found.between("cam_left", "cam_side").sigma_mm < 0.3
+    assert sum(view.used for view in found.views if view.seer == "cam_side") > 30
+    assert found.session_sha256 == session.digest()
+    with pytest.raises(DataError, match=r"clocks\.sied is of no camera"):
+        solved(cell, clocks={"sied": {"camera_minus_robot_s": 0.02}})
+
+
+def wide(width, height, focal):
+    matrix = np.array([focal, focal, 0.5 * width, 0.5 * height])
+    return replace(wide_camera(), resolution=(width, height), matrix=matrix)
+
+
+PICTURED = NetworkOptions(
+    cameras=(
+        CameraAt("left", place_m=(0.0, -0.5, 0.9), camera=wide(800, 600, 760.0)),
+        CameraAt(
+            "right", place_m=(0.1, 0.45, 0.95), camera=wide(640, 480, 560.0), state_intrinsics=False
+        ),
+    ),
+    boards=(
+        BoardAt(
+            "plate_a", "a", target=replace(BOARDS["checkerboard"], name="6x5", columns=6, rows=5)
+        ),
+        BoardAt("plate_b", "b", target=replace(BOARDS["charuco"], name="5x4", columns=5, rows=4)),
+    ),
+    stops=8,
+    lens_views=6,
+    swapped_rows=1,
+)
+
+
+def test_pictures_of_several_cameras_are_one_cell(tmp_path):
+    cell, out = simulate(PICTURED), tmp_path / "out"
+    session = Session.load(write_session(cell, tmp_path / "cell"))
+    assert visioncal("calibrate", tmp_path / "cell", "-o", out).status == 0
+    found = Calibration.load(out)
+    for frame in ("base_b", "cam_left", "cam_right"):
+        edge = found.between("base_a", frame)
+        off = log(np.linalg.inv(edge.matrix) @ cell.between("base_a", frame))
+        # Six squared sigmas are exceeded once in 4e5; pictures of small boards are not ideal.
+        assert off @ np.linalg.solve(edge.covariance, off) < 60.0, frame
+    # Both rows whose pictures were exchanged are left out.
+    left_out = {view.view: view.reason for view in found.views if not view.used}
+    assert all("disagrees" in left_out[view] for view in cell.wrong_views)
+    assert found.cell.lenses["cam_right"].estimated
+    assert not found.cell.lenses["cam_left"].estimated
+    # What was detected lies over the image of the camera that saw it.
+    recording = out / "recording.rrd"
+    assert Session.load(recording).digest() == session.digest()
+    seen = read_evidence(recording)
+    assert [view.view for view in seen] == [view.number for view in session.views]
+    frames = column(recording, paths.DETECTED, "CoordinateFrame:frame")
+    cameras = enumerate(view.text["camera"] for view in session.views)
+    of_camera = {row: f"image_of_cam_{camera}" for row, camera in cameras}
+    assert {row: str(frame[0]) for row, frame in frames.items()} == of_camera
+    assert "Worst used view" in (out / "report.html").read_text()
+
+
+def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
+    # The images of one camera at two stops.
+    views = [view for view in three.views if view.text["target"] == "plate_b"]
+    of_one = [view.number for view in views if view.text["camera"] == views[0].text["camera"]]
+    first, second = of_one[1], of_one[3]
+    swapped = exchange_views(three, first, second)
+    findings = calibrate(swapped).verdict.findings
+    (wrong,) = (finding for finding in findings if finding.kind == "exchanged_views")
+    assert set(wrong.views) == {first, second}
+    assert f"--exchange {first},{second}" in wrong.do.command
+    mended = exchange_views(swapped, first, second)
+    assert len(mended.declaration.corrected) == 2
+    now, was = ({view.number: view.numbers for view in it.views} for it in (mended, three))
+    assert now == was
+    other = next(view.number for view in three.views if view.text["target"] != "plate_b")
+    with pytest.raises(DataError, match=r"of another .*target"):
+        exchange_views(three, first, other)
