@@ -1,0 +1,624 @@
+"""Frames and tools from points and touches: the fit, its noise and numbering, what is refused."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.marks import slow
+from support.parts import (
+    away,
+    even,
+    jacobian,
+    moved,
+    noise_of,
+    pairs_of,
+    placed,
+    some_drawing,
+    some_frame,
+)
+from support.touched import (
+    EXACT,
+    POINTS,
+    TIP,
+    TURN,
+    Job,
+    error_of,
+    relabelled,
+    slipped,
+)
+from support.touched import touched as touches_of
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import FloatArray
+from visioncal.estimation.group_outliers import distances, find_inlier_groups
+from visioncal.estimation.numbering import find_numbering
+from visioncal.estimation.pivot import fit_pivot, tool_problem
+from visioncal.estimation.pointfit import PointPairs, fit_features, fit_points, fixture_problem
+from visioncal.estimation.points import Groups, Placement, fit_groups
+from visioncal.estimation.problem_parts import Noise
+from visioncal.estimation.procrustes import align, procrustes_residual
+from visioncal.estimation.robust import small_sets
+
+TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])
+SIGMA = 1e-4
+NOISE_M = 1e-4
+ONE_EACH = ("origin", "x", "xy")
+NAMES = [f"P{at}" for at in range(40)]
+ROBOT = Noise.of_robot(5e-5, 3e-5)
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Groups `slopes @ x = values`, of which the last residual may be unobserved."""
+
+    jacobian: np.ndarray
+    values: np.ndarray
+    observed: np.ndarray
+    known: np.ndarray
+
+    def guesses(self):
+        """Solves for all groups, and for sets of three."""
+        yield self._solve(np.arange(len(self.values)))
+        yield from (self._solve(rows) for rows in small_sets(len(self.values), 3))
+
+    def linearise(self, state):
+        """Gives the residuals and their slopes."""
+        residuals = np.where(self.observed, self.jacobian @ state - self.values, 0.0)
+        return Groups(
+            residuals, self.jacobian * self.observed[:, :, None], self.observed, self.known
+        )
+
+    def move(self, state, step):
+        """Takes a step."""
+        return state + step
+
+    def _solve(self, rows):
+        seen = self.observed[rows]
+        return np.linalg.lstsq(self.jacobian[rows][seen], self.values[rows][seen], rcond=None)[0]
+
+
+def lines(seed, count=10, sigma=SIGMA, partial=False):
+    rng = np.random.default_rng(seed)
+    slopes = rng.standard_normal((count, 3, 6))
+    observed = np.ones((count, 3), dtype=bool)
+    observed[::2, 2] = not partial
+    values = slopes @ TRUTH + sigma * rng.standard_normal((count, 3))
+    return Lines(slopes, values, observed, np.zeros((count, 3, 3)))
+
+
+def some_touches(rng: np.random.Generator, frame: FloatArray, kinds: Sequence[str]) -> PointPairs:
+    """Exact touches of a fixture's features, named 0, 1 ..."""
+    ranges = {
+        "origin": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+        "x": ([0.2, 0.0, 0.0], [0.4, 0.0, 0.0]),
+        "xy": ([-0.1, 0.1, 0.0], [0.3, 0.3, 0.0]),
+    }
+    local = np.array([rng.uniform(*ranges[kind]) for kind in kinds])
+    names = tuple(str(at) for at in range(len(kinds)))
+    return replace(
+        pairs_of(np.zeros_like(local), placed(frame, local)), labels=names, kinds=tuple(kinds)
+    )
+
+
+def feature_bound(frame: FloatArray, touches: PointPairs, sigma_m: float) -> FloatArray:
+    """Least covariance (6, 6) of a frame from touches with even noise.
+
+    Where a touch lies on the axis or in the plane is unknown beside the frame.
+    """
+    local = placed(np.linalg.inv(frame), touches.measured)
+    free = {"origin": 0, "x": 1, "xy": 2}
+    total = np.zeros((6, 6))
+    for point, kind in zip(local, touches.kinds, strict=True):
+        size = 6 + free[kind]
+
+        def touched(step, point=point):
+            return placed(
+                moved(frame, step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
+            )
+
+        by_step = jacobian(touched, size)[0] / sigma_m
+        whole = by_step.T @ by_step
+        across = whole[:6, 6:]
+        total += whole[:6, :6] - across @ np.linalg.solve(whole[6:, 6:], across.T)
+    return np.linalg.inv(total)
+
+
+def uneven(rng: np.random.Generator, count: int) -> FloatArray:
+    """Covariances (n, 3, 3) of points that a camera saw: ten times worse along some direction."""
+    root = 5e-5 * np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    root[:, :, 0] *= 10.0
+    return root @ np.swapaxes(root, 1, 2)
+
+
+def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
+    """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
+    by_step = jacobian(lambda array: placed(moved(frame, array), nominal), 6)
+    return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
+
+
+def featured(seed, kinds, noise_m=NOISE_M):
+    """A frame, and touches of its features."""
+    rng = np.random.default_rng(seed)
+    frame = some_frame(rng)
+    return frame, noisy(some_touches(rng, frame, kinds), rng, noise_m)
+
+
+def of_features():
+    rng = np.random.default_rng(2)
+    return fixture_problem(featured(2, ONE_EACH * 2)[1]), Placement(some_frame(rng))
+
+
+def of_points(scaled):
+    rng = np.random.default_rng(2)
+    pairs = pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3)))
+    state = Placement(some_frame(rng), scale=1.3 if scaled else 1.0)
+    return fixture_problem(pairs, scaled=scaled), state
+
+
+def of_a_tool(oriented):
+    # Where the touches close: elsewhere the derivatives leave out what noise would add.
+    made = touches_of(Job(tips=3, points=2, axes=2, contact_m=0.0), 2)
+    state = Placement(compose(TURN.as_matrix(), TIP), POINTS[:2])
+    return tool_problem(made.touches, ROBOT, oriented=oriented), state
+
+
+@pytest.mark.parametrize(
+    ("of", "more"),
+    [
+        (of_features, ()),
+        (of_points, (False,)),
+        (of_points, (True,)),
+        (of_a_tool, (False,)),
+        (of_a_tool, (True,)),
+    ],
+)
+def test_derivatives_are_those_of_the_residuals(of, more):
+    problem, state = of(*more)
+    slopes = problem.linearise(state).jacobian
+    found = jacobian(
+        lambda step: problem.linearise(problem.move(state, step)).residuals, slopes.shape[2]
+    )
+    # Central differences of lengths near a metre are exact to some 1e-9.
+    assert np.abs(slopes - found).max() < 1e-8
+
+
+@pytest.mark.parametrize("off_m", [0.0, 2e-4])
+@pytest.mark.parametrize(
+    ("local", "axis", "words"),
+    [
+        ([[0.0, 0, 0], [0, 0, 0], [0.1, 0.2, 0]], (1, 0), "mm from the origin"),
+        ([[0.0, 0, 0], [0.3, 0, 0], [0.1, 0, 0]], (2, 1), r"about its x .*mm from the x axis"),
+    ],
+    ids=["x", "xy"],
+)
+def test_touches_that_tell_no_direction_are_refused(local, axis, words, off_m):
+    frame, points = some_frame(np.random.default_rng(9)), np.array(local)
+    points[axis] = off_m
+    touches = replace(featured(9, ONE_EACH)[1], measured=placed(frame, points))
+    with pytest.raises(DegenerateError, match=words):
+        fit_features(touches)
+
+
+@pytest.mark.parametrize("kind", ["x", "xy"])
+def test_features_that_contradict_each_other_are_refused(kind):
+    frame, touches = featured(11, (*ONE_EACH, kind), 0.0)
+    local = placed(np.linalg.inv(frame), touches.measured)
+    local[3] *= [-1.0, -1.0, 1.0]
+    with pytest.raises(DataError, match=f"kind {kind} lie on both sides") as caught:
+        fit_features(replace(touches, measured=placed(frame, local)))
+    assert "3" in caught.value.culprits
+    _, touches = featured(7, ("origin", "origin", "x", "xy"))
+    points = touches.measured.copy()
+    points[1] += 0.05 * np.array([0.6, 0.0, 0.8])
+    # Half of 50 mm at each of the two, and nothing at the others: 25 mm / sqrt(2).
+    with pytest.raises(DataError, match=r"contradict each other: they are 1[78]") as caught:
+        fit_features(replace(touches, measured=points))
+    assert caught.value.culprits[0] in {"0", "1"}
+
+
+def test_wrong_touches_of_an_axis_are_left_out_where_others_tell():
+    for axes, at, left_out in ((3, 11, [11]), (1, 10, [])):
+        made = touches_of(Job(axes=axes), 5)
+        aside = 5e-3 * made.truly[at].apply(TURN.apply([1, 0, 0]))
+        fit = fit_pivot(slipped(made.touches, at, aside))
+        assert rejected(fit) == left_out
+        # A lone touch of an axis is not accused.
+        assert left_out or not fit.agreement.beyond[10:].any()
+
+
+def tips_alone(made):
+    return made.touches
+
+
+def without(*rows):
+    return lambda made: made.touches.subset(~np.isin(np.arange(len(made.touches)), rows))
+
+
+def of_another_point(made):
+    return replace(relabelled(made.touches, 10, 1), names=("A", "B"))
+
+
+def moved_by(row, tip_m, reach):
+    """The flange of a touch moved so that the tool's point stays on its axis."""
+
+    def spoil(made):
+        by = np.array(tip_m) + reach * made.reached[row]
+        return slipped(made.touches, row, made.truly[row].apply(TURN.apply(by)))
+
+    return spoil
+
+
+def small_turns(made):
+    rng = np.random.default_rng(4)
+    leans = np.deg2rad(0.6) * rng.standard_normal((10, 3))
+    rotations = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(leans)
+    place = POINTS[0] - rotations.apply(TIP) + 5e-4 * rng.standard_normal((10, 3))
+    return replace(made.touches, base_from_flange=compose(rotations.as_matrix(), place))
+
+
+@pytest.mark.parametrize(
+    ("job", "spoil", "words"),
+    [
+        (Job(tips=2), tips_alone, "2 touches of kind point"),
+        (Job(axes=1), without(11), "none of kind xz"),
+        (Job(axes=1), without(10), "none of kind z:"),
+        (Job(axes=1), of_another_point, "touch 10 of kind z is of point 'B'"),
+        (
+            Job(axes=1),
+            moved_by(10, [0.0, 0.0, -2e-3], 1.0),
+            "of kind z or xz have their points too near",
+        ),
+        (
+            Job(axes=3),
+            moved_by(11, [0.0, 0.0, 0.0], 2.0),
+            r"kind z lie on both sides: 11 on .* than 10, 12",
+        ),
+        (Job(), small_turns, r"sigma of .* mm \(limit 5\).*turn by at most"),
+        (Job(tips=4, contact_m=0.02, cone_deg=20.0), tips_alone, r"at a scatter of 1\d mm"),
+    ],
+    ids=[
+        "too few", "no xz", "no z", "another point", "too near", "both sides", "small", "scatter"
+    ],
+)  # fmt: skip
+def test_touches_that_tell_no_tool_are_refused(job, spoil, words):
+    with pytest.raises((DataError, DegenerateError), match=words):
+        fit_pivot(spoil(touches_of(job, 1)))
+
+
+def shifted(problem, at, by):
+    values = problem.values.copy()
+    values[at] += by
+    return Lines(problem.jacobian, values, problem.observed, problem.known)
+
+
+@pytest.mark.parametrize("partial", [slow(False), True])
+def test_the_covariance_is_the_scatter(partial):
+    squared, levels = [], []
+    for seed in range(200):
+        problem = lines(seed, partial=partial)
+        fit = fit_groups(problem)
+        error = fit.state - TRUTH
+        squared.append(error @ np.linalg.solve(fit.covariance, error))
+        levels.append(fit.sigma**2)
+    freedom = problem.observed.sum() - 6
+    assert fit.freedom == freedom
+    # Six times an F of (6, freedom): its mean over 200 fits stays within five standard errors.
+    mean = 6 * freedom / (freedom - 2)
+    covariance = np.sqrt(12 * (freedom + 4) / (freedom - 4)) * freedom / (freedom - 2)
+    assert abs(np.mean(squared) - mean) < 5 * covariance / np.sqrt(200)
+    # Restricted likelihood is unbiased here; a chi-square of so many has this standard error.
+    assert abs(np.mean(levels) / SIGMA**2 - 1) < 5 * np.sqrt(2 / freedom / 200)
+
+
+def test_without_freedom_the_expected_level_stands():
+    problem = lines(0, count=2)
+    fit = fit_groups(problem, expected_sigma=3e-4)
+    assert fit.freedom == 0
+    assert fit.sigma == 3e-4
+    blind = find_inlier_groups(problem, 3e-4)
+    assert blind.mask.all()
+    # Nothing predicts either group from the other.
+    assert not blind.beyond.any()
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(5, 1), (10, 1), (10, 3), (20, 6)])
+def test_just_the_wrong_groups_are_left_out(count, wrong):
+    for seed in range(10):
+        problem = lines(seed, count)
+        # Thirty times the noise: the least distance that five groups can tell for certain.
+        for at in range(wrong):
+            problem = shifted(problem, at, 3e-3 * np.array([1.0, -1.0, 1.0]))
+        found = find_inlier_groups(problem)
+        assert np.flatnonzero(~found.mask).tolist() == list(range(wrong))
+        assert not found.doubtful.any()
+        assert (found.beyond[:wrong] > 1.0).all()
+
+
+def test_a_mahalanobis_sq_is_the_distance_from_what_the_others_predict():
+    problem = lines(3)
+    found = find_inlier_groups(problem)
+    others = np.arange(10) != 4
+    jacobian, values = problem.jacobian[others].reshape(-1, 6), problem.values[others].ravel()
+    predicted = np.linalg.lstsq(jacobian, values, rcond=None)[0]
+    away = problem.jacobian[4] @ predicted - problem.values[4]
+    covariance = np.eye(3) + problem.jacobian[4] @ np.linalg.solve(
+        jacobian.T @ jacobian, problem.jacobian[4].T
+    )
+    squared = away @ np.linalg.solve(covariance, away) / found.fit.sigma**2
+    assert distances(found.fit).squares[4] == pytest.approx(squared, rel=1e-6)
+
+
+def test_a_group_that_alone_determines_a_direction_is_not_accused():
+    problem = lines(5)
+    jacobian = problem.jacobian.copy()
+    jacobian[1:, :, 5] = 0.0
+    alone = Lines(jacobian, jacobian @ TRUTH, problem.observed, problem.known)
+    noise = SIGMA * np.random.default_rng(6).standard_normal((10, 3))
+    alone = shifted(alone, slice(None), noise)
+    # An error along the direction that only the first group sees is a change of the unknown.
+    found = find_inlier_groups(shifted(alone, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
+    assert found.mask.all()
+    assert found.fit.state[5] == pytest.approx(TRUTH[5] + 0.05, abs=20 * SIGMA)
+
+
+def test_where_nothing_tells_which_is_wrong_both_stay_and_are_doubtful():
+    problem = lines(7)
+    jacobian = problem.jacobian.copy()
+    jacobian[2:, :, 3:] = 0.0
+    jacobian[:2] = 0.0
+    jacobian[:2, :, 3:] = np.eye(3)
+    # Two groups see three unknowns that no other does, and disagree about them.
+    values = jacobian @ TRUTH + SIGMA * np.random.default_rng(8).standard_normal((10, 3))
+    values[0] += 0.01
+    found = find_inlier_groups(Lines(jacobian, values, problem.observed, problem.known))
+    assert found.mask.all()
+    assert np.flatnonzero(found.doubtful).tolist() == [0, 1]
+    assert not found.explained
+
+
+def test_sound_sets_keep_all_their_groups():
+    lost = [seed for seed in range(60) if not find_inlier_groups(lines(seed, 8)).mask.all()]
+    # One in a thousand loses one by design: more than two of 60 have a probability of 3e-5.
+    assert len(lost) <= 2
+
+
+def noisy(touches, rng, noise_m=NOISE_M):
+    return replace(
+        touches, measured=touches.measured + noise_m * rng.normal(size=(len(touches), 3))
+    )
+
+
+def test_known_noise_stands_where_no_touch_is_to_spare():
+    frame, touches = featured(4, ONE_EACH)
+    found = fit_features(replace(touches, covariances=even(3, NOISE_M)), expected_noise_m=0.0)
+    assert np.allclose(
+        found.fit.covariance, feature_bound(found.fit.state.frame, touches, NOISE_M), rtol=1e-5
+    )
+    expected = fit_features(touches, expected_noise_m=NOISE_M)
+    assert expected.fit.sigma == NOISE_M
+    assert np.allclose(expected.fit.covariance, found.fit.covariance, rtol=1e-3)
+    error = away(found.fit.state.frame, frame)
+    # Chi-square of 6 stays under 23 in all but one case of a thousand.
+    assert error @ np.linalg.solve(found.fit.covariance, error) < 23.0
+
+
+def test_a_touch_that_tells_no_direction_does_no_harm():
+    """One of the x touches is on the origin, which is on the x axis, too."""
+    frame, touches = featured(12, (*ONE_EACH, "x", "xy", "origin"))
+    points = touches.measured.copy()
+    points[3] = points[0] + NOISE_M * np.array([-1.0, 0.5, 0.5])
+    found = fit_features(replace(touches, measured=points))
+    assert found.mask.all()
+    # A few times 0.1 mm over 0.2 m.
+    assert np.abs(away(frame, found.fit.state.frame)).max() < 3e-3
+    points[3] = points[0]
+    guesses = list(fixture_problem(replace(touches, measured=points)).guesses())
+    # 2 x 2 x 2 sets of three touches, of which two are on one line, and the means.
+    assert len(guesses) == 9
+    turns = [guess.frame[:3, :3] for guess in guesses]
+    assert all(np.allclose(turn @ turn.T, np.eye(3)) for turn in turns)
+
+
+def measured_part(seed, count, noise_m=NOISE_M):
+    """A frame and the points of a part that lies there."""
+    rng = np.random.default_rng(seed)
+    frame, nominal = some_frame(rng), some_drawing(rng, count)
+    return frame, pairs_of(nominal, placed(frame, nominal) + noise_m * rng.normal(size=(count, 3)))
+
+
+def test_known_and_unknown_noise_add_up():
+    squares, levels = [], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        frame, nominal, known = some_frame(rng), some_drawing(rng, 10), uneven(rng, 10)
+        noise = noise_of(known + even(10, 2 * NOISE_M), rng)
+        pairs = pairs_of(nominal, placed(frame, nominal) + noise, known)
+        fit = fit_groups(fixture_problem(pairs))
+        error = away(fit.state.frame, frame)
+        squares.append(error @ np.linalg.solve(fit.covariance, error))
+        levels.append(fit.sigma)
+    # Of a chi-square with six degrees, a little widened by some twenty residuals' noise level: the
+    # mean of F is 6 * 20 / 18 = 6.7, and 200 draws scatter by 0.3.
+    assert 5.6 < np.mean(squares) < 7.6
+    assert np.median(levels) == pytest.approx(2 * NOISE_M, rel=0.1)
+
+
+def test_weights_reach_the_bound():
+    errors, plain, bounds = [], [], []
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        frame, nominal, known = some_frame(rng), some_drawing(rng, 6), uneven(rng, 6)
+        pairs = pairs_of(nominal, placed(frame, nominal) + noise_of(known, rng), known)
+        fit = fit_groups(fixture_problem(pairs))
+        errors.append(away(frame, fit.state.frame) ** 2)
+        plain.append(away(frame, align(pairs.measured, nominal)) ** 2)
+        bounds.append(np.diag(point_bound(frame, nominal, known)))
+    share = np.sqrt(np.mean(errors, axis=0) / np.mean(bounds, axis=0))
+    # A sum of 120 squares scatters by 6 % in its root, and the noise's level costs a little.
+    assert share.max() < 1.2
+    # Even weights ignore that each point is ten times better in two directions.
+    assert np.sqrt(np.mean(plain, axis=0) / np.mean(bounds, axis=0)).min() > 1.5
+
+
+def test_the_frame_moves_with_each_point_as_it_says():
+    frame, pairs = measured_part(5, 5, 0.0)
+    pairs = replace(pairs, covariances=uneven(np.random.default_rng(5), 5))
+    found = fit_points(pairs).agreement.fit.by_points
+
+    def moved_frame(step):
+        measured = pairs.measured + step.reshape(5, 3)
+        return away(frame, fit_points(replace(pairs, measured=measured)).agreement.fit.state.frame)
+
+    # Of exact points; the steps of a micrometre leave 1e-8 of a gain near one, and some of its
+    # slope: a frame turns by radians a metre over points of 0.1 m.
+    expected = np.moveaxis(jacobian(moved_frame, 15).reshape(6, 5, 3), 0, 1)
+    assert np.abs(found - expected).max() < 1e-4
+
+
+def measured(nominal, order, rng, noise_m=NOISE_M):
+    points = placed(some_frame(rng), nominal[order])
+    return points + noise_m * rng.normal(size=points.shape)
+
+
+ORDERS = {
+    "swapped": (lambda n: [1, 0, *range(2, n)], "P0 and P1 are exchanged"),
+    "shifted": (lambda n: [*range(1, n), 0], "points are exchanged: P0 is P1"),
+    "reversed": (lambda n: [*range(n)][::-1], "points are exchanged: P0 is P"),
+    "anyhow": (lambda n: [2, 0, 1, *range(4, n), 3], "points are exchanged: P0 is P2, P1 is P0"),
+}
+
+
+@pytest.mark.parametrize("count", [5, 7, 12, 30])
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_wrong_order_is_found_and_named(order, count):
+    rng = np.random.default_rng(count)
+    nominal, (make, words) = some_drawing(rng, count), ORDERS[order]
+    found = find_numbering(measured(nominal, make(count), rng), nominal)
+    assert found.is_wrong
+    assert found.equally_good == 1
+    assert found.assignment.tolist() == make(count)
+    assert found.words(NAMES[:count]).startswith(words)
+    # Root mean square over three coordinates of noise that the fit has taken a part of.
+    assert found.rms_m < 2 * NOISE_M < found.stated_rms_m
+
+
+def test_triangles_find_what_trying_all_orders_finds():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        nominal = some_drawing(rng, 6)
+        points = measured(nominal, rng.permutation(6), rng, 1e-3)
+        tried = find_numbering(points, nominal)
+        best = min(
+            permutations(range(6)),
+            key=lambda permutation: procrustes_residual(points, nominal[list(permutation)]),
+        )
+        assert tried.assignment.tolist() == list(best)
+
+
+def rejected(fit):
+    return np.flatnonzero(~fit.agreement.mask).tolist()
+
+
+def test_the_gradient_is_exact_far_from_closing_too():
+    made = touches_of(Job(tips=3, points=2, axes=2), 2)
+    problem = tool_problem(made.touches, EXACT, oriented=True)
+    twist = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.01])
+    state = Placement(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
+
+    def cost(step):
+        return np.sum(problem.linearise(problem.move(state, step)).residuals ** 2) / 2
+
+    groups = problem.linearise(state)
+    gradient = np.einsum("mij,mi->j", groups.jacobian, groups.residuals)
+    expected = [(cost(value) - cost(-value)) / 2e-6 for value in 1e-6 * np.eye(12)]
+    # Central differences of a cost of 0.01 are exact to rounding over the step.
+    assert gradient == pytest.approx(np.array(expected), abs=1e-10)
+
+
+def test_the_robots_noise_is_carried_to_the_touched_point():
+    made = touches_of(Job(tips=1, axes=1), 3)
+    problem = tool_problem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
+    tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
+    known = problem.linearise(Placement(tool, POINTS[:1])).known
+    for at, flange in enumerate(made.touches.base_from_flange):
+        jacobian = [
+            (invert(flange @ exp(step) @ tool) - invert(flange @ exp(-step) @ tool)) @ point / 2e-5
+            for step in 1e-5 * np.eye(6)
+        ]
+        slope = np.array(jacobian)[:, :3].T * np.repeat([1e-3, 2e-3], 3)
+        # The floor of a micrometre is 2.5e-7 of the level.
+        assert known[at] == pytest.approx(slope @ slope.T, rel=1e-5, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "job", [Job(tips=6, axes=2), *(slow(job) for job in (Job(noise=ROBOT), Job(tips=4, points=3)))]
+)
+def test_error_and_covariance_agree(job):
+    squared = []
+    for seed in range(30):
+        made = touches_of(job, seed)
+        fit = fit_pivot(made.touches, job.noise)
+        free = np.arange(0 if job.axes else 3, 6)
+        error = error_of(fit.flange_from_tool) if job.axes else np.zeros(6)
+        if not job.axes:
+            error[3:] = fit.flange_from_tool[:3, 3] - TIP
+        covariance = fit.covariance[np.ix_(free, free)]
+        squared.append(error[free] @ np.linalg.solve(covariance, error[free]))
+    size = len(free)
+    # An F distribution over 24 degrees of freedom or more: 9 % over its size on average, and its
+    # standard deviation is at most 1.2 sqrt(2 size); four standard errors of the mean.
+    assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 30)
+
+
+def test_the_covariance_is_the_bound_where_the_noise_is_known():
+    # The points are exact, so that no noise is estimated; differences are exact to 1e-8.
+    frame, touches = featured(3, ONE_EACH * 2, 0.0)
+    found = fit_features(replace(touches, covariances=even(6, NOISE_M)))
+    assert np.allclose(found.fit.covariance, feature_bound(frame, touches, NOISE_M), rtol=1e-5)
+    rng = np.random.default_rng(4)
+    frame, nominal, known = some_frame(rng), some_drawing(rng, 8), uneven(rng, 8)
+    pairs = pairs_of(nominal, placed(frame, nominal), known)
+    pairs = replace(pairs, nominal_sigma_m=np.full(8, NOISE_M))
+    bound = point_bound(frame, nominal, known + even(8, NOISE_M))
+    assert np.allclose(fit_points(pairs).agreement.fit.covariance, bound, rtol=1e-5, atol=1e-14)
+
+
+@pytest.mark.parametrize("job", [Job(tips=3), Job(tips=2, points=2), Job(axes=1), Job(points=3)])
+def test_exact_touches_give_the_exact_tool(job):
+    made = touches_of(replace(job, contact_m=0.0), 1)
+    fit = fit_pivot(made.touches)
+    # Exact in double precision, at levers of a metre and the weakest of these geometries.
+    assert fit.flange_from_tool[:3, 3] == pytest.approx(TIP, abs=1e-11)
+    assert fit.agreement.fit.state.points == pytest.approx(POINTS[: job.points], abs=1e-11)
+    turn = TURN.as_matrix() if job.axes else np.eye(3)
+    assert fit.flange_from_tool[:3, :3] == pytest.approx(turn, abs=1e-10)
+    assert fit.oriented == fit.covariance[:3].any() == (job.axes > 0)
+    assert fit.agreement.mask.all()
+    assert not fit.looks_inverse
+
+
+def test_a_right_order_is_left_alone_and_a_symmetrical_one_cannot_be_told():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        nominal = some_drawing(rng, 3 + seed % 10)
+        found = find_numbering(measured(nominal, np.arange(len(nominal)), rng), nominal)
+        assert not found.is_wrong
+        assert not len(found.moved)
+        assert found.words(NAMES[: len(nominal)]) == ""
+    # A square fits in any order that is a symmetry, so that nothing speaks against the stated one.
+    square = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]])
+    for order, count in (([3, 0, 1, 2], 0), ([1, 0, 2, 3], 2)):
+        found = find_numbering(measured(square, order, rng), square)
+        # The orders that move the fewest: it may as well be the other two.
+        assert (found.is_wrong, len(found.moved)) == (count > 0, count)
+        assert found.equally_good == 8
+    # What is known of the noise counts in its favour: exchanged, nearly equal sides fit to 0.6 mm.
+    nearly = 0.2 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0]])
+    nearly += 1e-3 * np.random.default_rng(3).normal(size=(3, 3))
+    points = measured(nearly, [1, 0, 2], rng, 0.0)
+    assert find_numbering(points, nearly).is_wrong
+    assert not find_numbering(points, nearly, noise_m=1e-3).is_wrong
