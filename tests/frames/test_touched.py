@@ -535,6 +535,8 @@ def test_the_tip_and_its_rotation(tmp_path):
         "pivot of 10 touches of one point; rotation from 3 along z and 3 in the xz plane"
     )
     assert {value["kind"] for value in tool["observations"]} == {"point", "z", "xz"}
+    off = [value["residual_mm"] for value in tool["observations"] if value["used"]]
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(tool["rms_mm"])
 
 
 def test_poses_of_a_tool_that_was_active_are_doubted(tmp_path):

@@ -224,9 +224,7 @@ class PointsFit:
             1e3 * float(np.sqrt(np.mean(off_m[self.agrees] ** 2))),
             1e3 * self.noise_m,
             tuple(
-                Observation(
-                    label, used=used, reason=reason, kind=kind, residual_mm=1e3 * float(off)
-                )
+                Observation(label, used=used, reason=reason, kind=kind, residual_mm=off)
                 for label, used, reason, kind, off in rows
             ),
             Verdict.by(
