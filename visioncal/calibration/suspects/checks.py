@@ -188,15 +188,16 @@ def remedy_for_uncertainty(judged: Findings) -> Remedy | None:
     return _more_views(judged, "Add views from other poses of the robot.")
 
 
-def _more_views(judged: Findings, words: str, purpose: str = "") -> Remedy:
-    return add_views_remedy(words, modelled=judged.plannable, purpose=purpose)
+def _more_views(judged: Findings, words: str, purpose: str = "", count: int = 5) -> Remedy:
+    return add_views_remedy(words, modelled=judged.plannable, purpose=purpose, count=count)
 
 
 def _tilted(judged: Findings) -> Remedy:
-    words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
+    count = max(5, *(_LIMITS.stops[0] - arm.stops for arm in judged.arms))
+    how = "tilted by 20 to 40 degrees about different axes"
     if not all(arm.can_tilt for arm in judged.arms):
-        words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
-    return _more_views(judged, words)
+        how = "all over the workspace and turned as far as the arm turns"
+    return _more_views(judged, f"Add {count} views or more, {how}.", count=count)
 
 
 def _sigmas(judged: Findings) -> Iterator[Finding]:

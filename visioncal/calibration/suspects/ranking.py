@@ -105,10 +105,10 @@ def correcting(need: Need | None) -> Remedy:
     )
 
 
-def add_views_remedy(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
+def add_views_remedy(words: str, *, modelled: bool, purpose: str = "", count: int = 5) -> Remedy:
     """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
     if modelled:
-        return Remedy(words, f"{PLAN}{purpose}")
+        return Remedy(words, f"{PLAN.removesuffix('5')}{count}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
     return Remedy(f"{words} {model}")
 
