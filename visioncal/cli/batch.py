@@ -6,6 +6,7 @@ from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answer
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import BatchOptions
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.interchange.batch import batch
 from visioncal.interchange.outputs import RECORDING, REPORT
 
@@ -30,7 +31,7 @@ def batch_command(options: BatchOptions) -> None:
     counts = found.counts
     named = ("good", "check", "bad", "failed", "kept", "standing out")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
-    answer(f"{len(found.rows)} sessions: {words}")
+    answer(f"{counted(len(found.rows), 'session')}: {words}")
     lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
     failed = [
         f"{row.name}: {row.words} {row.next_step}".rstrip()
