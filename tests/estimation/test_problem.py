@@ -1,30 +1,64 @@
-"""Whole cells in plain arrays: the linearisation, the fit, its start, and what moved."""
+"""The estimation problem in plain arrays: derivatives, identities, the fit, and what moved."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from support.cells import calibrated
+from support.edges import inliers_of
+from support.marks import slow
 from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
 from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pairwise import Candidates
+from visioncal.core.errors import ConvergenceError
+from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.types import FloatArray
+from visioncal.estimation import joint
+from visioncal.estimation.budget import Sources, covariance_by_source
+from visioncal.estimation.chain import chain
+from visioncal.estimation.clock import clock_problem
+from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
+from visioncal.estimation.intervals import expected_levels
+from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.normal_equations import normal_equations
-from visioncal.estimation.outliers import inliers_and_moves, refine_inliers
-from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
+from visioncal.estimation.model_evidence import (
+    SIZES_M,
+    TURN_PER_M,
+    CalibrationPosterior,
+    ChangeHypothesis,
+    evidence_of,
+    undone,
+    with_change,
+)
+from visioncal.estimation.normal_equations import Whitening, normal_equations
+from visioncal.estimation.outliers import distances, inliers_and_moves, refine_inliers
+from visioncal.estimation.problem_parts import ROBOT, Effect, FramePrior, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
     equations_from,
     fit_problem,
-    posterior,
+    left_out_residuals,
     solve_problem,
 )
 from visioncal.estimation.steps import Step, evidence, find_steps, frames_of
+from visioncal.estimation.trajectory import Trajectory
+from visioncal.simulation import CellOptions, fine_camera, simulate
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
-NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
+FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+SOURCES = Sources(
+    {"cam_left": "pixels of left", "cam_right": "pixels of right"}, {"a": "robot a", "b": "robot b"}
+)
+NETWORK_NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
+NOISE = Noise.of_robot(1e-4, 1e-4)
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+RATES = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
+SIZES = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
 
 
 def problem_of(seed, stops=20, seen=0.7, **more):
@@ -45,13 +79,6 @@ def started(problem):
     tied = network(problem)
     assert not tied.untied
     return State(np.array([tied.edges[index] for index in problem.unknown]), np.zeros(0))
-
-
-def with_places_alone(problem, rows):
-    """The problem in which some rows read places without rotations."""
-    rotation = problem.observations.has_rotation.copy()
-    rotation[rows] = False
-    return replace(problem, observations=replace(problem.observations, has_rotation=rotation))
 
 
 def with_values(problem, rng):
@@ -86,54 +113,6 @@ def test_derivatives_are_those_of_central_differences(kind):
         # as their last step does, which is its own square, 1e-6, off.
         away_by = np.abs((ends[0] - ends[1]) / (2 * step) - found[:, :, at]).max()
         assert away_by < {"poses": 1e-8, "places": 5e-4, "values": 5e-6}[kind]
-
-
-def test_flanges_move_as_central_differences_have_it():
-    cell, problem = problem_of(1, stops=2, seen=1.0)
-    state, step = true_state(cell, problem.tree), 1e-6
-    found = problem.linear(state).by_errors
-    of, members = problem.units
-    for robot, name in enumerate(problem.robots):
-        for at in range(6):
-            ends = []
-            for sign in (step, -step):
-                twist = np.zeros(6)
-                twist[at] = sign
-                poses = np.array([moved(value, twist) for value in problem.poses[name]])
-                other = replace(problem, poses={**problem.poses, name: poses})
-                ends.append(other.linear(state).residuals)
-            slope = (ends[0] - ends[1]) / (2 * step)
-            mine = [row for row, unit in enumerate(of) if unit >= 0 and members[unit, 0] == robot]
-            assert mine
-            np.testing.assert_allclose(found[mine, :, at], slope[mine], atol=1e-8)
-
-
-def dense_information(problem, state):
-    """The information with every flange's error as an unknown of its own."""
-    linear = problem.linear(state, ideal=True)
-    weights = np.linalg.inv(problem.observations.covariance)
-    of, members = problem.units
-    size = problem.size
-    whole = np.zeros((size + 6 * len(members), size + 6 * len(members)))
-    for row, unit in enumerate(of):
-        slope = np.zeros((6, len(whole)))
-        slope[:, :size] = linear.jacobian[row]
-        if unit >= 0:
-            slope[:, size + 6 * unit : size + 6 * unit + 6] = linear.by_errors[row]
-        whole += slope.T @ weights[row] @ slope
-    for unit, (robot,) in enumerate(members):
-        at = size + 6 * unit + np.arange(6)
-        whole[at, at] += np.repeat(NOISE.robots[robot], 3) ** -2.0
-    return whole
-
-
-def test_taking_the_flanges_out_loses_nothing():
-    cell, problem = problem_of(3, stops=6)
-    state = true_state(cell, problem.tree)
-    dense = np.linalg.inv(dense_information(problem, state))[: problem.size, : problem.size]
-    found = covariance_of(problem, Solution(state, NOISE))
-    # The same to rounding, for matrices of a condition of 1e6.
-    np.testing.assert_allclose(found, dense, atol=1e-7 * np.abs(dense).max())
 
 
 def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
@@ -205,15 +184,6 @@ def test_the_fit_is_as_good_as_its_covariance_says():
     np.testing.assert_allclose(np.mean(levels, axis=0), [3e-5, 8e-5], rtol=0.35)
 
 
-def test_what_is_left_of_the_observations_is_their_redundancy():
-    cell, problem = problem_of(5)
-    fit = fit_problem(problem, true_state(cell, problem.tree))
-    squares, left = posterior(problem, fit.state, fit.noise)
-    # Chi-square of some 300: a standard deviation of 8 %.
-    assert left.sum() > 200
-    assert squares.sum() == pytest.approx(left.sum(), rel=0.3)
-
-
 def test_the_level_of_a_sensor_is_found():
     cell, problem = problem_of(6)
     sensors = np.array(
@@ -229,83 +199,6 @@ def test_the_level_of_a_sensor_is_found():
     assert fit.noise.sensors[0] == pytest.approx(3.0, rel=0.2)
 
 
-def test_the_start_is_near_the_truth():
-    cell, problem = problem_of(7)
-    off = away(cell, problem, started(problem)).reshape(-1, 2, 3)
-    # Closed forms of 8 to 16 views: far inside the 50 mm and 5 degrees that the fit needs.
-    assert np.abs(off[:, 0]).max() < 0.02
-    assert np.abs(off[:, 1]).max() < 0.02
-
-
-def test_a_camera_in_one_hand_and_a_board_in_the_other_place_three_frames():
-    rng = np.random.default_rng(14)
-    cell = world(rng, 20)
-    sights = [("cam_left", "target_b", stop) for stop in range(20)]
-    cell = replace(cell, parents={**cell.parents, "cam_left": "flange_a"}, pairs=sights)
-    edges = network(observed(cell, rng)).edges
-    for name in ("base_b", "cam_left", "target_b"):
-        off = np.linalg.inv(cell.truth[name]) @ edges[name]
-        assert np.linalg.norm(off[:3, 3]) < 0.02
-
-
-def test_a_sound_cell_has_nothing_left_out_and_nothing_moved():
-    _, problem = problem_of(8)
-    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
-    assert found.used.all()
-    assert not found.moves
-
-
-def pushed(cell, frame, stop, twist, stops=20):
-    edge = moved(cell.truth[frame], np.array(twist))
-    return {(frame, at): edge for at in range(stop, stops)}
-
-
-def test_a_board_that_slips_and_a_camera_that_is_bumped_are_two_frames_each():
-    rng = np.random.default_rng(9)
-    cell = world(rng, 20, 0.9)
-    changed = pushed(cell, "target_b", 9, (0.004, 0, 0, 0.003, 0, 0.004))
-    changed |= pushed(cell, "cam_right", 12, (0, -0.006, 0, 0, 0.005, 0))
-    problem = observed(cell, rng, changed)
-    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
-    assert {(move.frame, move.stop) for move in found.moves} == {("target_b", 9), ("cam_right", 12)}
-    assert found.used.all()
-    plain = [name for name in found.problem.unknown if "@" not in name]
-    edges = dict(zip(found.problem.unknown, found.fit.state.edges, strict=True))
-    was = np.linalg.inv(cell.truth["base_b"]) @ edges["base_b"]
-    assert len(plain) == 6
-    # The base is as near as without: to some 0.1 mm.
-    assert np.linalg.norm(was[:3, 3]) < 4e-4
-
-
-def test_a_slip_that_hides_in_the_noise_of_single_views_is_found():
-    rng = np.random.default_rng(10)
-    cell = world(rng, 40, 1.0)
-    # 0.12 mm: one sigma of a single view along its axis.
-    problem = observed(cell, rng, pushed(cell, "target_floor", 20, (0, 0, 0, 1e-4, 6e-5, 0), 40))
-    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
-    (move,) = found.moves
-    assert move.frame == "target_floor"
-    assert abs(move.stop - 20) <= 2
-    assert found.used.all()
-
-
-# Of the views of one pair, a few in the middle, or most of the earliest.
-@pytest.mark.parametrize(
-    ("some", "others"), [(slice(3, 6), slice(8, 11)), (slice(4), slice(9, 13))]
-)
-def test_wrong_images_are_left_out_and_nothing_else(some, others):
-    _, problem = problem_of(11, stops=25)
-    measured = problem.observations.measured.copy()
-    pairs = list(zip(problem.observations.observers, problem.observations.observed, strict=True))
-    rows = [at for at, pair in enumerate(pairs) if pair == ("cam_left", "target_a")]
-    wrong = rows[some]
-    measured[wrong] = problem.observations.measured[rows[others]]
-    problem = replace(problem, observations=replace(problem.observations, measured=measured))
-    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
-    assert np.flatnonzero(~found.used).tolist() == wrong
-    assert not found.moves
-
-
 def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
     cell, problem = problem_of(13)
     state = true_state(cell, problem.tree)
@@ -314,31 +207,33 @@ def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
     known = PriorInformation(np.eye(1), np.zeros(1))
     effect = Effect("drift", np.zeros(1), known, np.ones(1, dtype=bool), by_sensor)
     held = problem.with_effects([effect])
-    moved, _ = solve_problem(held, State(state.edges, np.zeros(1)), NOISE)
-    without, _ = solve_problem(problem, state, NOISE)
+    moved, _ = solve_problem(held, State(state.edges, np.zeros(1)), NETWORK_NOISE)
+    without, _ = solve_problem(problem, state, NETWORK_NOISE)
     assert moved.values[0] == 0.0
     np.testing.assert_array_equal(moved.edges, without.edges)
     free = problem.with_effects([replace(effect, held=np.zeros(1, dtype=bool))])
-    there = Solution(moved, NOISE)
+    there = Solution(moved, NETWORK_NOISE)
     np.testing.assert_array_equal(covariance_of(held, there), covariance_of(free, there))
-    alone = covariance_of(problem, Solution(without, NOISE))
+    alone = covariance_of(problem, Solution(without, NETWORK_NOISE))
     assert np.trace(covariance_of(held, there)[:-1, :-1]) > 1.5 * np.trace(alone)
 
 
 def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
     cell, problem = problem_of(14)
     state = true_state(cell, problem.tree)
-    plain, _ = solve_problem(problem, state, NOISE)
-    covariance = covariance_of(problem, Solution(plain, NOISE))[problem.edge_columns("target_a")]
+    plain, _ = solve_problem(problem, state, NETWORK_NOISE)
+    covariance = covariance_of(problem, Solution(plain, NETWORK_NOISE))[
+        problem.edge_columns("target_a")
+    ]
     at = problem.unknown["target_a"]
     turn, place = plain.edges[at][:3, :3], plain.edges[at][:3, 3]
     before = turn @ covariance[3:, problem.edge_columns("target_a")][:, 3:] @ turn.T
     sigma_m = float(np.sqrt(before[0, 0]))
     prior = FramePrior("flange_a", "target_a", (0,), (place[0] + 1e-4,), sigma_m)
-    found, _ = solve_problem(replace(problem, priors=(prior,)), plain, NOISE)
+    found, _ = solve_problem(replace(problem, priors=(prior,)), plain, NETWORK_NOISE)
     # As sure as the observations: half-way. Of second order are a few thousandths of a step.
     assert found.edges[at][0, 3] - place[0] == pytest.approx(0.5e-4, rel=0.02)
-    narrower = covariance_of(replace(problem, priors=(prior,)), Solution(found, NOISE))
+    narrower = covariance_of(replace(problem, priors=(prior,)), Solution(found, NETWORK_NOISE))
     block = narrower[problem.edge_columns("target_a"), problem.edge_columns("target_a")][3:, 3:]
     turned = found.edges[at][:3, :3]
     assert (turned @ block @ turned.T)[0, 0] == pytest.approx(0.5 * sigma_m**2, rel=0.02)
@@ -375,11 +270,424 @@ def test_repeated_views_of_a_still_board_count_as_one():
     edges = np.array([cell.truth[index] for index in fixed.tree.unknown])
     for count in (1, 5, 40):
         some = fixed.subset(np.arange(40) < count)
-        known = covariance_of(some, Solution(State(edges, np.zeros(0)), NOISE))
+        known = covariance_of(some, Solution(State(edges, np.zeros(0)), NETWORK_NOISE))
         mine = known[some.edge_columns("target_floor"), some.edge_columns("target_floor")]
         np.testing.assert_allclose(mine, single, atol=1e-6 * single.max())
     # What the boards on the flanges tell is as without.
     moving = problem.subset(~still & ~problem.observations.involves("target_floor"))
     plain = replace(moving, with_repeats=False)
-    found = [covariance_of(value, Solution(state, NOISE)) for value in (moving, plain)]
+    found = [covariance_of(value, Solution(state, NETWORK_NOISE)) for value in (moving, plain)]
     np.testing.assert_array_equal(*found)
+
+
+def test_residuals_of_views_left_out_are_those_of_fits_without_them():
+    problem, fit = answered(False, views=12, seed=3)
+    predicted = left_out_residuals(problem, fit.state, fit.noise)
+    covariance = problem.total_covariance(problem.linear(fit.state), fit.noise)
+    everything = np.ones(12, dtype=bool)
+    inside = distances(problem, everything, fit)
+    for view in range(12):
+        others = np.arange(12) != view
+        without, _ = solve_problem(problem.subset(others), fit.state, fit.noise)
+        refitted = problem.linear(without).residuals[view]
+        sigma = np.sqrt(np.diagonal(covariance[view]))
+        # To first order: what is left is the curvature over a step of the size of the noise.
+        np.testing.assert_allclose(predicted[view], refitted, atol=0.01 * sigma.max())
+        square = distances(problem, others, Solution(without, fit.noise)).squares[view]
+        assert square == pytest.approx(inside.squares[view], rel=1e-2)
+
+
+def doubled(problem):
+    """Every view twice, as two that know half as much each."""
+    again = np.repeat(np.arange(len(problem)), 2)
+    seen = problem.observations.take(again)
+    return replace(
+        problem,
+        observations=replace(seen, covariance=2.0 * seen.covariance),
+        effects=tuple(effect.take(again) for effect in problem.effects),
+    )
+
+
+def test_shared_errors_of_flanges_are_eliminated_exactly():
+    """Against the covariance of all observations, written out."""
+    cell, problem = problem_of(3, stops=6)
+    problem = with_values(problem, np.random.default_rng(5))
+    state = true_state(cell, problem.tree)
+    state = State(state.edges, np.full(problem.size - 6 * len(state.edges), 0.3))
+    linear, (units, members) = problem.linear(state), problem.units
+    by_errors = np.zeros((len(problem), 6, 6 * len(members)))
+    for row, unit in enumerate(units):
+        if unit >= 0:
+            by_errors[row, :, 6 * unit : 6 * unit + 6] = linear.by_errors[row]
+    by_errors = by_errors.reshape(6 * len(problem), -1)
+    noise = block_diag(*problem.covariance(NETWORK_NOISE))
+    noise += by_errors @ block_diag(*problem.error_covariance(NETWORK_NOISE)) @ by_errors.T
+    jacobian, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
+    known = problem.prior_information(state)
+    weighted = np.linalg.solve(noise, jacobian)
+    whitening = Whitening.of(problem, NETWORK_NOISE, linear.by_errors)
+    information, gradient, cost = whitening.equations(problem, state, linear)
+    scale = np.sqrt(np.diag(information))
+    away = (information - known.information - jacobian.T @ weighted) / np.outer(scale, scale)
+    # Rounding, of numbers whose squares differ by ten powers of ten.
+    np.testing.assert_allclose(away, 0.0, atol=1e-8)
+    away = gradient - known.gradient - weighted.T @ residuals
+    np.testing.assert_allclose(away / scale, 0.0, atol=1e-8 * np.abs(gradient / scale).max())
+    whole = residuals @ np.linalg.solve(noise, residuals)
+    assert cost == pytest.approx(whole + known.cost, rel=1e-8)
+
+
+def causes_of(problem, rng):
+    """A board that moved, and a joint that slipped."""
+    count = len(problem)
+    board = ChangeHypothesis("board", np.full(6, 2.0), -np.tile(np.eye(6), (count, 1, 1)))
+    by_flange = rng.normal(size=(count, 6, 1))
+    return board, ChangeHypothesis("joint", np.ones(1), flange_jacobian=by_flange)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("size", [0.0, 0.4, 1.5])
+def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
+    rng = np.random.default_rng(3)
+    data, state = stops_of(mount, rng)
+    for cause in causes_of(data, rng):
+        at = size * np.ones(len(cause.units)) / np.sqrt(6.0)
+        beginning, step = with_change(state, cause), 1e-6
+        by_cause = undone(data, cause, at).linear(beginning).jacobian[:, :, 12:]
+        for unknown, shift in enumerate(step * np.eye(len(at))):
+            ahead, behind = (
+                undone(data, cause, value).linear(beginning).residuals
+                for value in (at + shift, at - shift)
+            )
+            # The series of the right Jacobian is cut where it is exact to 1e-9 up to 0.5 rad, and
+            # to some 1e-3 at two radians.
+            assert by_cause[:, :, unknown] == pytest.approx(
+                (ahead - behind) / (2 * step), abs=1e-7 if size < 1 else 2e-2
+            )
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_board_that_was_turned_over_is_told_exactly(mount):
+    rng = np.random.default_rng(4)
+    data, state = stops_of(mount, rng)
+    change = np.array([0.0, 2.9, 0.3, 0.2, -0.1, 0.4])
+    turned = seen_as(data, data.observations.measured @ exp(change))
+    board, _ = causes_of(data, rng)
+    cause = replace(board, start=log(turned.change_of("target", state)).mean(axis=0))
+    found = evidence_of(turned, belief_of(state), cause)
+    assert exp(found.values) == pytest.approx(exp(change), abs=1e-6)
+    # Exact stops leave nothing but rounding.
+    assert found.misfit == pytest.approx(0.0, abs=1e-3)
+    before = undone(turned, cause, found.values).observations
+    assert before.measured == pytest.approx(data.observations.measured, abs=1e-6)
+    # What was noise of the turned board's pose is noise of it where it was.
+    carried = adjoint(invert(exp(-change)))
+    assert before.covariance[0] == pytest.approx(1e-10 * carried @ carried.T, rel=1e-4)
+
+
+def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
+    def runs_away(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(joint, "fit_problem", runs_away)
+    with pytest.raises(ConvergenceError, match="poses of other views than the images"):
+        calibrated(simulate(replace(FINE, views=6)))
+
+
+def exact(seed, stops=5):
+    """A cell that was measured without noise, and its state."""
+    rng = np.random.default_rng(seed)
+    cell = world(rng, stops, 0.8)
+    problem = observed(cell, rng, noise=0.0)
+    return problem, true_state(cell, problem.tree)
+
+
+def with_drift(problem):
+    """The problem with two values that are known together, and all that counts besides."""
+    by_sensor = np.zeros((len(problem), 6, 2))
+    by_sensor[:, 3, 0] = by_sensor[:, 5, 1] = 1e-3
+    known = PriorInformation(np.array([[4.0, 1.0], [1.0, 2.0]]), np.zeros(2))
+    effect = Effect("drift", np.zeros(2), known, np.zeros(2, dtype=bool), by_sensor)
+    prior = FramePrior("flange_b", "target_b", (0, 2), (-0.02, 0.06), 1e-4)
+    return replace(problem.with_effects([effect]), priors=(prior,), with_repeats=True)
+
+
+def test_the_parts_add_up_to_the_whole():
+    problem, state = exact(1, stops=12)
+    problem = with_drift(problem)
+    state = State(state.edges, np.zeros(2))
+    first = 6 * len(problem.unknown)
+    columns = {"x": np.array([first]), "z": np.array([first + 1])}
+    parts = covariance_by_source(problem, state, NETWORK_NOISE, replace(SOURCES, columns=columns))
+    whole = covariance_of(problem, Solution(state, NETWORK_NOISE))[:first, :first]
+    assert set(parts) == {*SOURCES.sensors.values(), "robot a", "robot b", "x", "z", "priors"}
+    # An identity; what is left is rounding of an inverse with a condition of 1e6.
+    np.testing.assert_allclose(sum(parts.values()), whole, atol=1e-7 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_the_part_of_a_robot_is_what_its_errors_do_to_the_answer(robot):
+    problem, state = exact(2)
+    whole = covariance_of(problem, Solution(state, NETWORK_NOISE))
+    sigmas, step, part = np.repeat(ROBOT_SIGMAS[robot], 3), 1e-6, np.zeros_like(whole)
+    for stop in range(5):
+        for axis in range(6):
+            twist = np.zeros(6)
+            twist[axis] = step
+            poses = problem.poses[robot].copy()
+            poses[stop] = moved(poses[stop], twist)
+            other = replace(problem, poses={**problem.poses, robot: poses})
+            pulled = whole @ normal_equations(other, state, NETWORK_NOISE)[1] / step * sigmas[axis]
+            part += np.outer(pulled, pulled)
+    found = covariance_by_source(problem, state, NETWORK_NOISE, SOURCES)[f"robot {robot}"]
+    # Steps of 1e-6 are of the first order to 1e-5, and weights follow the poses by as much.
+    np.testing.assert_allclose(found, part, atol=1e-3 * np.abs(part).max())
+
+
+def stops_of(mount, rng, count=5):
+    """Stops that close the chain exactly, with the edges that they close it with."""
+    x, z, *poses = exp(rng.normal(0.0, 0.5, (count + 2, 6)))
+    poses = np.array(poses)
+    robot = poses if mount == "eye-in-hand" else invert(poses)
+    covariance = np.tile(1e-10 * np.eye(6), (count, 1, 1))
+    problem = chain(mount, poses, invert(robot @ x) @ z, covariance)
+    return problem, State(np.stack([x, z]), np.zeros(0))
+
+
+def seen_as(problem, measured):
+    return replace(problem, observations=replace(problem.observations, measured=measured))
+
+
+def belief_of(state, freedom=np.inf, sigma=1e-5):
+    return CalibrationPosterior(state, sigma**2 * np.eye(12), NOISE, freedom)
+
+
+def test_misfit_and_evidence_follow_their_distributions():
+    rng = np.random.default_rng(5)
+    data, state = stops_of("eye-in-hand", rng)
+    sigma = np.repeat(NOISE.robots[0], 3)
+    misfits, ratios = [], []
+    for _ in range(60):
+        noise = exp(sigma * rng.standard_normal((5, 6)))
+        noisy = replace(data, poses={ROBOT: data.poses[ROBOT] @ noise})
+        nothing = evidence_of(noisy, belief_of(state, freedom=60.0))
+        board = evidence_of(noisy, belief_of(state, freedom=60.0), causes_of(data, rng)[0])
+        misfits.append(nothing.misfit)
+        ratios.append(np.exp(board.likelihood - nothing.likelihood))
+    # Chi-square of thirty directions: its mean over 60 draws is known to 1.
+    assert np.mean(misfits) == pytest.approx(30.0, abs=4.0)
+    # One on average at most; a ratio of a hundred is chance in one draw of a hundred at most.
+    assert np.mean(ratios) < 1.5
+    assert max(ratios) < 100.0
+
+
+def test_linear_algebra_says_what_it_sees(monkeypatch):
+    rng = np.random.default_rng(0)
+    tall = rng.normal(size=(30, 4)) * [1.0, 1e3, 1e-3, 1.0]
+    information = tall.T @ tall
+    np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
+    assert eigenvalue_shares(information)[0] > 0.1  # the units of the columns do not matter
+    tall[:, 3] = tall[:, 0]
+    assert eigenvalue_shares(tall.T @ tall)[0] < 1e-12
+    step = damped_step(information, information @ np.ones(4), 0.0)
+    np.testing.assert_allclose(step, -np.ones(4), rtol=1e-8)
+    # No information at all gives a finite covariance.
+    found = covariance_from(np.stack([np.zeros((6, 6)), np.eye(6)]))
+    assert np.isfinite(found).all()
+    assert found[0].diagonal().min() > 1e12
+    assert found[1] == pytest.approx(np.eye(6))
+
+    def give_up(_):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(np.linalg, "eigh", give_up)
+    np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
+    with pytest.raises(np.linalg.LinAlgError):
+        covariance_from(np.full((2, 6, 6), np.nan))
+
+
+def swung(times_s: FloatArray) -> FloatArray:
+    """A flange that swings about all axes, at up to 3 rad/s: (n, 4, 4)."""
+    return exp(np.sin(2 * np.pi * RATES * times_s[:, None] + np.arange(6)) * SIZES)
+
+
+def sampled(hz: float, keep=lambda times_s: times_s >= 0.0) -> Trajectory:
+    times_s = np.arange(0, 10, 1 / hz)
+    times_s = times_s[keep(times_s)]
+    return Trajectory(times_s, swung(times_s))
+
+
+def test_nothing_is_said_across_gaps_and_beyond_the_ends() -> None:
+    moved = sampled(100, lambda value: (value < 2.0) | (value > 2.5))
+    at_s = np.array([-0.01, 0.0, 1.985, 2.2, 2.505, 9.985, 9.995])
+    assert moved.covers(at_s).tolist() == [False, True, True, False, False, True, False]
+    assert moved.covers(at_s, 0.02).tolist() == [False] * 7
+    # Beside a gap a line is left, through the last two samples.
+    away = log(invert(swung(at_s[2:3])) @ moved.at(at_s[2:3]))
+    assert np.abs(away).max() < 1e-3
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
+    rng = np.random.default_rng(1)
+    x, z = exp(rng.normal(size=(2, 6)))
+    moved, at_s = sampled(500), np.linspace(0.5, 9.5, 40)
+    robot = swung(at_s) if mount == "eye-in-hand" else invert(swung(at_s))
+    frames = ImageTimes(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
+    state, step_s = State(np.stack([x, z]), np.zeros(1)), 1e-4
+    residuals = [
+        clock_problem(moved, frames, value).linear(state).residuals for value in (-step_s, step_s)
+    ]
+    column = clock_problem(moved, frames, 0.0).linear(state).jacobian[:, :, 12]
+    difference = (residuals[1] - residuals[0]) / (2 * step_s)
+    # Speeds are means over 0.04 s: 2e-3 of the fastest, which a lever of metres enlarges.
+    np.testing.assert_allclose(column, difference, atol=4e-3 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 50, 100])
+def test_stamps_since_1970_are_matched_as_those_near_zero(rate_hz) -> None:
+    begin_s = 1_700_000_000.0
+    times_s = np.arange(0.0, 9.95, 1.0 / rate_hz)
+    robot = Trajectory(begin_s + times_s, swung(times_s))
+    at_s = np.arange(0.5, 9.0, 1.0 / 30.0)
+    frames = ImageTimes("eye-in-hand", begin_s + at_s + 0.03, invert(swung(at_s)))
+    best = turning_matches(robot, frames)[0]
+    # Half a step of the search; a robot of 10 Hz is interpolated over 0.1 s.
+    assert best.offset_s == pytest.approx(0.03, abs=0.006)
+
+
+def with_places_alone(problem, rows):
+    """The problem in which some rows read places without rotations."""
+    rotation = problem.observations.has_rotation.copy()
+    rotation[rows] = False
+    return seen_otherwise(problem, has_rotation=rotation)
+
+
+def seen_otherwise(problem, **changes):
+    return replace(problem, observations=replace(problem.observations, **changes))
+
+
+def pushed(cell, frame, stop, twist, stops=20):
+    edge = moved(cell.truth[frame], np.array(twist))
+    return {(frame, at): edge for at in range(stop, stops)}
+
+
+@cache
+def answered(given, **changes):
+    known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
+    problem = known.assessment.problem
+    return problem, fit_problem(problem, known.assessment.state)
+
+
+@pytest.mark.parametrize("views", [6, slow(20)])
+def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom(views):
+    # Corners know poses far better than the robot stands.
+    problem, fit = answered(True, views=views, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)
+    expected = expected_levels(problem, fit.state, fit.noise)
+    # Corners' own noise takes some of the freedom; the sum over the scales is right to 1e-3.
+    ratio = (expected / fit.noise.robots) ** 2
+    np.testing.assert_allclose(ratio - 1.0, 2.0 / (6 * views - 14.0), rtol=0.15)
+    if views == 6:  # A level that may be zero is expected to be what the corners hide.
+        problem, fit = answered(True, views=6, seed=1, robot_sigma_m=0.0, robot_sigma_rad=0.0)
+        at = replace(fit.noise, robots=np.full((1, 2), 1e-9))
+        assert 1e-6 < expected_levels(problem, fit.state, at)[0, 1] < 1e-4
+
+
+def of_kind(problem, kind):
+    """The problem with two views a stop, with places of one point, or with combined noise."""
+    if kind == "two a stop":
+        return doubled(problem)
+    if kind == "places":  # Which leave a flange's rotation open.
+        return seen_otherwise(problem, has_rotation=np.zeros(len(problem), dtype=bool))
+    if kind == "combined":
+        unknown = np.zeros_like(problem.observations.covariance)
+        return replace(seen_otherwise(problem, covariance=unknown), is_combined=True)
+    return problem
+
+
+KINDS = ["one a stop", "two a stop", "places", "combined"]
+
+
+@pytest.mark.parametrize("kind", [*map(slow, KINDS[:3]), KINDS[3]])
+def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
+    problem, fit = answered(False, views=8, seed=6)
+    problem = of_kind(problem, kind)
+    moves = np.random.default_rng(0).standard_normal((8, 6, 3))
+    nothing = PriorInformation(np.zeros((3, 3)), np.zeros(3))
+    effect = Effect.free("arm", nothing, flange_jacobian={ROBOT: moves})
+    wider = problem.with_effects([*problem.effects, effect])
+    there = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
+    beside = robot_likelihood(problem, fit.state, fit.noise).beside(0, moves)
+    expected = robot_likelihood(wider, there, fit.noise)
+    np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
+    if kind == "places":  # These leave rotations open: the rounding of none decides the likelihood.
+        return
+    # What the wider problem has left of the arm's columns beside them is rounding.
+    levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
+    found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
+    assert found == pytest.approx(values, abs=1e-5)
+    # The likelihood of levels that grow together is that of each.
+    likelihood = robot_likelihood(problem, fit.state, fit.noise)
+    scales = np.array([0.02, 0.5, 1.0, 8.0])
+    values = [likelihood.most_likely(scale * fit.noise.robots, fixed)[1] for scale in scales]
+    scaled = likelihood.scaled(0, fit.noise.robots, scales)
+    # The rounding of values of some hundreds, at a fiftieth of the noise some millions.
+    np.testing.assert_allclose(np.diff(scaled), np.diff(values), rtol=1e-7, atol=1e-7)
+
+
+def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
+    """Poses to 10 mm and 1 deg, which is more than any result may be off, and one to 100 deg."""
+    cell, rng = simulate(replace(FINE, views=60, seed=4)), np.random.default_rng(0)
+    noise = np.repeat([np.deg2rad(1.0), 0.01], 3) * rng.standard_normal((60, 6))
+    noise[17, 1] += np.deg2rad(100.0)
+    measured = cell.cam_from_target @ exp(noise)
+    found = inliers_of(chain("eye-in-hand", cell.robot.base_from_flange, measured))
+    assert np.flatnonzero(~found.used).tolist() == [17]
+
+
+@pytest.mark.parametrize(("times", "combined"), [slow(2, True), (3, False)])
+def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, combined):
+    """Each stop looked at several times, with the camera's own noise each time."""
+    problem = answered(True, seed=1)[0].with_effects([])
+    seen = problem.observations.take(np.repeat(np.arange(len(problem)), times))
+    noise = np.random.default_rng(5).standard_normal((len(seen), 6))
+    step = np.einsum("nij,nj->ni", np.linalg.cholesky(seen.covariance), noise)
+    problem = replace(problem, observations=replace(seen, measured=seen.measured @ exp(step)))
+    if combined:
+        uneven = np.ones(len(seen), dtype=bool)
+        problem = seen_otherwise(of_kind(problem, "combined"), is_uneven=uneven)
+    assert inliers_of(problem).used.all()
+    measured = problem.observations.measured
+    for rows in ([4 * times + 1], [*range(4 * times, 5 * times)]):
+        # One image, or all of a stop, is of another.
+        wrong = measured.copy()
+        wrong[rows] = measured[11 * times]
+        found = inliers_of(seen_otherwise(problem, measured=wrong))
+        assert np.flatnonzero(~found.used).tolist() == rows
+
+
+def test_between_samples_pose_and_speed_are_right() -> None:
+    at_s, step_s = np.random.default_rng(0).uniform(0.1, 9.8, 500), 1e-4
+    # Far below any arm's repeatability (0.05 mrad, 0.03 mm); the fourth power of the distance.
+    for hz, most in ((50, 3e-6), (125, 1e-7), (500, 1e-9)):
+        assert np.abs(log(invert(swung(at_s)) @ sampled(hz).at(at_s))).max() < most
+    # A sample that is missing now and then is no gap: through samples of 50 Hz on one side.
+    moved = sampled(100, lambda value: np.arange(len(value)) % 7 != 3)
+    assert moved.covers(at_s).all()
+    assert np.abs(log(invert(swung(at_s)) @ moved.at(at_s))).max() < 5e-6
+    told = sampled(125).speeds(at_s)
+    true = log(invert(swung(at_s - step_s)) @ swung(at_s + step_s)) / (2 * step_s)
+    # Means over 0.04 s.
+    assert np.abs(told - true).max() < 2e-3 * np.abs(true).max()
+
+
+def test_a_slip_that_hides_in_the_noise_of_single_views_is_found():
+    rng = np.random.default_rng(10)
+    cell = world(rng, 40, 1.0)
+    # 0.12 mm: one sigma of a single view along its axis.
+    problem = observed(cell, rng, pushed(cell, "target_floor", 20, (0, 0, 0, 1e-4, 6e-5, 0), 40))
+    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
+    (move,) = found.moves
+    assert move.frame == "target_floor"
+    assert abs(move.stop - 20) <= 2
+    assert found.used.all()
