@@ -116,7 +116,10 @@ def test_views_without_corners_keep_their_place():
             [SEEN[0], (np.arange(8) % 7, SEEN[0][1]), SEEN[2]],
             r"^corners\[1\], ids\[7\]: .*ids\[0\]",
         ),
-        ([SEEN[0], (np.arange(8), SEEN[0][1] * np.nan), SEEN[2]], r"corners\[1\]: px\[0\].*7 more"),
+        (
+            [SEEN[0], (np.arange(8), SEEN[0][1] * np.nan), SEEN[2]],
+            r"corners\[1\]: px has numbers that are",
+        ),
     ],
 )
 def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
@@ -128,7 +131,7 @@ def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
 @pytest.mark.parametrize(
     ("spoilt", "words", "step"),
     [
-        (POSES.swapaxes(1, 2), r"\[0\] .* transposed.* So are 2 more of 3", "Transpose"),
+        (POSES.swapaxes(1, 2), r"\[0\] .* transposed", "Transpose"),
         (POSES * [[[-1], [-1], [-1], [1]]], r"\[0\] .* reflection", "right-handed"),
         (POSES * [[[1.05]] * 3 + [[1]]], r"\[0\] .* scaled by 1.05", "Divide"),
         ([POSES[0], 0.0 * POSES[0], POSES[0]], r"\[1\] .* entries are zero", "never filled"),

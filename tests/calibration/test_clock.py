@@ -314,14 +314,14 @@ def test_motion_that_repeats_itself_is_told_by_what_is_stated():
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
 
-@pytest.mark.parametrize(("per_s", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
-def test_times_of_views_and_robot_in_another_unit_are_named(session, per_s, unit):
+@pytest.mark.parametrize("per_s", [1e3, 1e6])
+def test_times_of_views_and_robot_in_another_unit_are_refused(session, per_s):
     stream = session.streams["robot"]
     scaled = stream.values * np.where(np.array(stream.columns) == "stamp_s", per_s, 1.0)
     rows = [{**view.numbers, "stamp_s": per_s * view.stamp_s} for view in session.views]
     views = tuple(replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True))
     both = replace(session, views=views).with_streams({"robot": Stream(stream.columns, scaled)})
-    with pytest.raises(DataError, match=rf"streams/robot\.csv: .* looks like {unit} \(125 samples"):
+    with pytest.raises(DataError, match=r"streams/robot\.csv: .* stamp_s is in seconds"):
         calibrate(both)
 
 

@@ -28,7 +28,7 @@ NAMED = {
 }
 # Files that cannot be read as they stand are refused, with what to type.
 REFUSED = {
-    "[cam] for [camera]": "In session.toml, replace",
+    "[cam] for [camera]": "Add [camera]",
     "images turned clockwise": "In session.toml, write resolution = ",
 }
 

@@ -149,6 +149,9 @@ def test_beta_is_chosen_for_the_axes_that_are_nearly_parallel():
 @pytest.mark.parametrize("name", robot_names())
 def test_a_urdfs_table_is_the_published_one(name, convention):
     nominal = table(name)
+    document = load_robot(name).document
+    if any("xyz_m" in document.get(part, ()) for part in ("base", "flange")):
+        pytest.skip("its table is one of many of its URDF")
     document = {"schema": 1, "name": name, "tip": nominal.tip, "urdf": small_urdf(load_robot(name))}
     found = table_of(Robot.from_document(document), convention)
     expected = convert_table(nominal, convention)
