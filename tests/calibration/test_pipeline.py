@@ -1,17 +1,44 @@
-"""The whole way on simulated corners, by ways that few sessions take."""
+"""The whole way on simulated corners and poses: lenses, several boards, and what was measured."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated, error_of, known_of, session_of
+from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from support.cells import board_numbers, calibrated, error_of, known_of, session_of
 from support.marks import slow
+from support.refusals import raised
 
-from visioncal.calibration.pipeline.result import view_evidence
-from visioncal.calibration.run import STAGES
-from visioncal.core.errors import DataError
+from visioncal.calibration.pipeline.result import result_of, view_evidence
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES, calibrate, run
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS, Camera, Target
-from visioncal.simulation import CellOptions, fine_camera, fisheye_camera, simulate, wide_camera
+from visioncal.frames.session_observations import detect_session_target
+from visioncal.interchange.outputs import write_outputs
+from visioncal.live.planning.information import predict_worlds
+from visioncal.live.planning.purposes import PURPOSES
+from visioncal.live.planning.recorded import PartialCalibration, start_from_session
+from visioncal.results import Calibration
+from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
+from visioncal.simulation import (
+    BOARDS,
+    CellOptions,
+    Second,
+    SimulatedCell,
+    fine_camera,
+    fisheye_camera,
+    simulate,
+    wide_camera,
+    write_session,
+)
+from visioncal.simulation.records import cell_session
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 # Simulated boards have exactly their size.
@@ -20,6 +47,8 @@ MARKER = replace(
     target=Target("tag", "marker", 1, 1, 0.12, 1e-6, dictionary="DICT_5X5_100", marker_id=3),
     pixel_sigma_px=0.03,
 )
+# Corners as exact as centres of circles.
+EXACT = replace(FINE, seed=2, pixel_sigma_px=0.002)
 # Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.
 AMBIGUOUS = replace(
     FINE,
@@ -29,6 +58,18 @@ AMBIGUOUS = replace(
     tilt_rad=(0.0, 0.3),
     seed=1,
 )
+# The second board is out of sight from where the first is looked at, unless it is turned less.
+NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
+TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
+SIGMA_M = 5e-4
+X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
+Z = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.4, 0.1, -0.25]))
+# Of the target's poses, as a camera measures them [rad and m].
+NOISE = np.repeat([2e-4, 1e-4], 3)
+TWICE = Camera(
+    "brown", (640, 360), np.array([520.0, 519, 320, 190]), np.array([-0.37, 0.1, 0.001, 0.0, 0.03])
+)
+OF_HALF = CellOptions(robot="ur3e", views=24, camera=TWICE, pixel_sigma_px=0.03, robot_sigma_m=1e-4)
 
 
 def with_camera(cell, off_px=(0, 0, 0, 0), **table):
@@ -36,112 +77,6 @@ def with_camera(cell, off_px=(0, 0, 0, 0), **table):
     stated = replace(cell.options.camera, matrix=cell.options.camera.matrix + off_px)
     told = session_of(replace(cell, stated={"": stated}))
     return replace(told, document=told.document | {"camera": told.document["camera"] | table})
-
-
-def mahalanobis_sq(cell, known):
-    """Squared error of both edges over the covariance, divided by their twelve numbers."""
-    error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
-    return error @ np.linalg.solve(covariance, error) / 12
-
-
-def test_intrinsics_are_refined_where_they_are_asked_to_be():
-    off = np.array([4.0, 4.0, -3.0, 2.0])
-    surprises = []
-    for seed in range(2):
-        cell = simulate(replace(FINE, seed=seed))
-        known = calibrated(cell, session=with_camera(cell, off, intrinsics="refine"))
-        assert np.isin(
-            known.cell_fit.camera_parameters.lens_of("cam")[:4],
-            known.cell_fit.linearised_corners.moving,
-        ).all()
-        refined = known.cell_fit.camera_parameters.camera("cam")
-        sigma = np.sqrt(np.diag(known.assessment.covariance)[12:16])
-        # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
-        assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
-        surprises.append(mahalanobis_sq(cell, known))
-    # Mean of 2 chi-square of 12 over 12: beyond is one in a thousand.
-    assert np.mean(surprises) < 2.13
-
-
-@pytest.mark.parametrize("mode", [slow("hold"), "auto"])
-def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
-    rng = np.random.default_rng(1)
-    surprises = []
-    for seed in range(4):
-        cell = simulate(replace(FINE, seed=seed))
-        off = 0.5 * rng.standard_normal(4)
-        told = with_camera(cell, off, matrix_sigma_px=0.5, intrinsics=mode)
-        known = calibrated(cell, session=told)
-        assert known.uncertainty.budget_mm["intrinsics"] > 0.0
-        surprises.append(mahalanobis_sq(cell, known))
-    # Mean of 4 chi-square of 12 over 12: sigma 0.2; four sigma, and held values err a bit more.
-    assert 0.2 < np.mean(surprises) < 2.0
-
-
-@pytest.mark.parametrize("mode", ["auto", slow("refine")])
-def test_a_rough_matrix_is_refined_within_its_prior_by_views_of_one_marker(mode):
-    rng, sigma_px, nees = np.random.default_rng(3), 6.0, []
-    for seed in range(5):
-        cell = simulate(replace(MARKER, seed=seed))
-        # Of the stated sigma, but without the rare draws beyond three sigmas, which are named.
-        off_px = sigma_px * rng.uniform(-(3**0.5), 3**0.5, 4)
-        session = with_camera(cell, off_px, matrix_sigma_px=sigma_px, intrinsics=mode)
-        known = calibrated(cell, session=session)
-        nees.append(mahalanobis_sq(cell, known))
-        # The corners' noise does not absorb the lens's error, and nothing is accused for it.
-        (noise_px,) = known.cell_fit.linearised_corners.sigmas_px
-        assert noise_px == pytest.approx(0.03, rel=0.5)
-        assert known.verdict.status == "good", known.verdict.reasons
-        assert not any("was not done" in finding.words for finding in known.verdict.findings)
-    # Mean of 5 chi-square of 12 over 12: sigma 0.18; beyond is one in a thousand on either side.
-    assert 0.5 < np.mean(nees) < 1.7
-
-
-@pytest.mark.slow
-def test_a_matrix_off_by_many_of_its_sigmas_is_refined_without_its_prior_and_named():
-    nees = []
-    for seed in range(2):
-        cell = simulate(replace(MARKER, seed=seed))
-        session = with_camera(cell, (9.0, -9.0, 6.0, -9.0), matrix_sigma_px=0.6)
-        known = calibrated(cell, session=session)
-        nees.append(mahalanobis_sq(cell, known))
-        assert "lens" in [cause.kind for cause in known.verdict.causes]
-    # Mean of 2 chi-square of 12 over 12: beyond is one in a thousand.
-    assert np.mean(nees) < 2.13
-
-
-@pytest.mark.parametrize(
-    ("table", "is_refused"),
-    [
-        ({}, False),
-        slow({"matrix_sigma_px": 6.0, "intrinsics": "hold"}, False),
-        ({"intrinsics": "refine"}, True),
-    ],
-    ids=["no prior", "held", "refined without a prior"],
-)
-def test_a_matrix_without_a_prior_is_held_on_views_of_one_marker(table, is_refused):
-    cell = simulate(MARKER)
-    known = calibrated(cell, session=with_camera(cell, **table))
-    fitted = known.cell_fit
-    assert not np.isin(
-        fitted.camera_parameters.lens_of("cam"), fitted.linearised_corners.moving
-    ).any()
-    refused = [finding for finding in known.verdict.findings if "was not done" in finding.words]
-    assert len(refused) == is_refused
-    assert all("matrix_sigma_px" in finding.do.words for finding in refused)
-
-
-@pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])
-def test_a_fisheye_camera_goes_the_whole_way(given):
-    surprises = []
-    for seed in range(4):
-        options = CellOptions(camera=fisheye_camera(), state_intrinsics=given, seed=seed)
-        known = calibrated(cell := simulate(options))
-        assert known.used == tuple(range(20))
-        assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8
-        surprises.append(mahalanobis_sq(cell, known))
-    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
-    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
 
 
 def test_a_closed_form_is_diagnosed_too():
@@ -186,24 +121,354 @@ def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose():
     assert all(shown[view].predicted_px is not None for view in known.used)
 
 
+def test_a_session_that_holds_all_views_back_is_told_so():
+    for given in (True, False):
+        cell = simulate(replace(FINE, views=8, state_intrinsics=given))
+        told = session_of(cell)
+        held = replace(told, views=tuple(replace(view, holdout=True) for view in told.views))
+        caught = raised(DataError, "are held back", calibrated, cell, session=held)
+        assert "Clear role" in caught.next_step
+
+
+def without(cell, views):
+    """A cell that lacks some views."""
+    return cell.only([at for at in range(len(cell.corners)) if at not in views])
+
+
+@pytest.mark.slow
+def test_all_boards_are_placed_as_well_as_their_sigmas_say():
+    """Six cells, each with boards whose sizes are off by what their files allow."""
+    squares, count = 0.0, 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        first, further = 1.0 + 1e-3 * rng.standard_normal(2)
+        second = replace(NEAR if seed % 4 < 2 else Second(), scale=further)
+        cell = simulate(
+            replace(TWO, mount=MOUNTS[seed % 2], board_scale=first, second=second, seed=seed)
+        )
+        known = calibrated(cell, joints=False)
+        assert len(known.used) == len(cell.corners)
+        error, covariance = error_of(cell, known), result_of(known).joint_covariance
+        assert error.shape == (18,)
+        squares += float(error @ np.linalg.solve(covariance, error))
+        count += len(error)
+    # Both tails at one in ten thousand.
+    assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1.0 - 1e-4, count)
+
+
+def test_each_image_is_searched_for_its_own_board(tmp_path):
+    cell = simulate(replace(TWO, camera=wide_camera(), views=4, seed=11))
+    session = Session.load(write_session(cell, tmp_path / "session"))
+    found = detect(session)
+    assert sorted(found.corners) == [0, 1, 2, 3]
+    views = list(session.views)
+    views[1] = replace(views[1], text={"target": "first"})
+    wrong = detect(replace(session, views=tuple(views)))
+    assert sorted(wrong.corners) == [0, 2, 3]
+    (lost,) = wrong.rejections
+    assert (lost.view, lost.reason.endswith("(looked for target first)")) == (1, True)
+
+
+def away(found: Calibration) -> np.ndarray:
+    """(6,) right perturbation from the true `flange_from_cam` to the one that was found."""
+    return log(invert(X) @ found.transforms["flange_from_cam"].as_matrix())
+
+
+def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
+    with pytest.raises(DegenerateError, match="the tool's z is not determined at all") as refused:
+        calibrate(scara(0, {}))
+    assert "measure that offset for [prior.flange_from_cam]" in refused.value.next_step
+    squares = []
+    for seed in range(2):
+        wrong = SIGMA_M * np.random.default_rng(100 + seed).standard_normal()
+        prior = {"z_m": float(X[2, 3] + wrong), "sigma_m": SIGMA_M}
+        found = calibrate(scara(seed, {"flange_from_cam": prior}))
+        assert found.verdict.status == "good"
+        said = f"The measured z_m of flange_from_cam = {1e3 * prior['z_m']:g} mm was"
+        (reason,) = (reason for reason in found.verdict.reasons if reason.startswith(said))
+        assert reason.endswith("the views alone leave it open.")
+        covariance, off = found.covariance("flange_from_cam"), away(found)
+        # What was measured is all that is known of the height.
+        height = X[2, :3] @ covariance[3:, 3:] @ X[2, :3]
+        assert np.sqrt(height) == pytest.approx(SIGMA_M, rel=0.05)
+        squares.append(off @ np.linalg.solve(covariance, off))
+    # Chi-square of twelve, which chance leaves in one of a thousand cases on either side; the noise
+    # is itself estimated from each session, to a tenth.
+    assert 1.8 < np.sum(squares) < 40.0
+
+
+def test_a_board_of_several_may_be_known_whole():
+    options = CellOptions(robot="ur5e", motion="one_axis", views=12, second=Second(), seed=2)
+    cell = simulate(options)
+    name = "base_from_target_second"
+    edge = cell.transforms[name]
+    turn = Rotation.from_matrix(edge[:3, :3]).as_quat().tolist()
+    prior = dict(zip(("x_m", "y_m", "z_m"), edge[:3, 3].tolist(), strict=True))
+    prior |= {"sigma_m": SIGMA_M, "quaternion_xyzw": turn, "sigma_rad": 1e-5}
+    known = run_with(cell, {name: prior})
+    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:18])
+    # Four sigma, for eighteen numbers.
+    assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
+    # The board is turned no farther than that is known.
+    assert sigmas[12:15].max() < 1.001e-5
+    assert sum("was used" in note and name in note for note in known.notes) == 3
+
+
+# Ten sigma, and so many that noise beside the priors would explain them.
+@pytest.mark.parametrize("off_m", [slow(0.005), 0.04])
+def test_only_the_components_that_views_contradict_are_left_out(off_m):
+    height = float(X[2, 3])
+    prior = {"x_m": float(X[0, 3]) + off_m, "y_m": float(X[1, 3]) - off_m, "z_m": height}
+    found = calibrate(scara(0, {"flange_from_cam": prior | {"sigma_m": SIGMA_M}}))
+    assert found.verdict.status == "check"
+    doubts = [finding.words for finding in found.verdict.findings if finding.kind == "prior"]
+    for doubt, axis in zip(doubts, "xy", strict=True):
+        stated_mm = 1e3 * prior[f"{axis}_m"]
+        assert f"{axis}_m of flange_from_cam = {stated_mm:g} mm, known to 0.5 mm, is" in doubt
+        seen_mm = float(doubt.partition("alone say ")[2].split()[0])
+        # Some ten of their sigmas, and a fifth of the smaller of both offsets.
+        assert seen_mm == pytest.approx(1e3 * X["xy".index(axis), 3], abs=1.0)
+    kept = f"The measured z_m of flange_from_cam = {1e3 * height:g} mm was used"
+    assert any(reason.startswith(kept) for reason in found.verdict.reasons)
+    off, covariance = away(found), found.covariance("flange_from_cam")
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert off @ np.linalg.solve(covariance, off) < 22.0
+
+
+def test_a_plan_counts_what_was_measured():
+    cell = simulate(CellOptions(robot="ur5e", motion="one_axis", views=8, seed=4))
+    place = cell.transforms["flange_from_cam"][:3, 3].tolist()
+    prior = dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_m": SIGMA_M}
+    begun = start_from_session(PartialCalibration(run_with(cell, {"flange_from_cam": prior})))
+    (world,) = predict_worlds(
+        [begun.cell], PURPOSES["hand-eye"], cell.robot.joints[:1], recorded=begun.recorded
+    )
+    covariance = world.covariance(np.arange(0))
+    # Without a further stop: the three lengths are known to what they were measured to, or better.
+    assert np.sqrt(np.diag(covariance)[3:6]).max() < 1.05 * SIGMA_M
+
+
+def mahalanobis_sq(cell, known):
+    """Squared error of both edges over the covariance, divided by their twelve numbers."""
+    error, covariance = error_of(cell, known)[:12], known.assessment.covariance[:12, :12]
+    return error @ np.linalg.solve(covariance, error) / 12
+
+
+def is_refined(known):
+    """Whether the fit moves the intrinsics."""
+    lens = known.cell_fit.camera_parameters.lens_of("cam")
+    return np.isin(lens, known.cell_fit.linearised_corners.moving).any()
+
+
+def by_sigma(sigma_px):
+    return lambda rng: sigma_px * rng.standard_normal(4)
+
+
+def within(sigma_px):
+    """Of the stated sigma, but without the rare draws beyond three sigmas, which are named."""
+    return lambda rng: sigma_px * rng.uniform(-(3**0.5), 3**0.5, 4)
+
+
+def by(*off_px):
+    return lambda _: np.array(off_px)
+
+
+def lens(options, off_px, least=0.0, most=2.74, seeds=1, refined=None, status=None, **table):
+    """A case: whether the lens is refined and how it is judged, where that is sure.
+
+    `least` and `most` are limits of the mean of n chi-square of 12 over 12: beyond is one in a
+    thousand; what is held errs by a bit more.
+    """
+    return options, seeds, off_px, table, (least, most), refined, status
+
+
+REFINE, HOLD, RIGHT = {"intrinsics": "refine"}, {"intrinsics": "hold"}, by(0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "seeds", "off_px", "table", "limits", "refined", "status"),
+    [
+        lens(FINE, by(4.0, 4.0, -3.0, 2.0), most=2.13, seeds=2, refined=True, **REFINE),
+        lens(FINE, RIGHT, refined=True, status="good", **REFINE),
+        lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, matrix_sigma_px=0.5),
+        slow(*lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, False, matrix_sigma_px=0.5, **HOLD)),
+        # The corners' noise does not absorb the lens's error, and nothing is accused for it.
+        lens(MARKER, within(6.0), 0.5, 1.7, 5, True, "good", matrix_sigma_px=6.0),
+        # Without a prior, one marker tells no lens.
+        lens(MARKER, RIGHT, refined=False),
+        lens(MARKER, RIGHT, refined=False, matrix_sigma_px=6.0, **HOLD),
+        lens(MARKER, RIGHT, refined=False, **REFINE),
+        # A lens that is stated for images twice as large.
+        lens(OF_HALF, by(520.0, 519.0, 320.0, 190.0), refined=True),
+        # Corners as exact as centres of circles: both moves are beyond chance.
+        lens(EXACT, by(0.02, -0.02, 0.02, 0.01), status="good"),
+        lens(EXACT, by(0.5, -0.5, 0.5, 0.25), status="check"),
+    ],
+)
+def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
+    options, seeds, off_px, table, limits, refined, status
+):
+    rng, surprises = np.random.default_rng(1), []
+    for seed in range(seeds):
+        cell = simulate(replace(options, seed=options.seed + seed))
+        known = calibrated(cell, session=with_camera(cell, off_px(rng), **table))
+        surprises.append(mahalanobis_sq(cell, known))
+        assert is_refined(known) == (is_refined(known) if refined is None else refined)
+        assert known.verdict.status == (status or known.verdict.status), known.verdict.reasons
+        if refined:
+            camera = known.cell_fit.camera_parameters.camera("cam")
+            sigma = np.sqrt(np.diag(known.assessment.covariance))[12:16]
+            # Chi-square of four under 23.5 in all but one case of ten thousand.
+            assert np.all(np.abs(camera.matrix - options.camera.matrix) < 4.5 * sigma)
+        elif "matrix_sigma_px" in table:
+            assert known.uncertainty.budget_mm["intrinsics"] > 0.0
+        refused = [finding for finding in known.verdict.findings if "was not done" in finding.words]
+        assert bool(refused) == (refined is False and table.get("intrinsics") == "refine")
+        assert all("matrix_sigma_px" in finding.do.words for finding in refused)
+        named = any("do not fit these images" in reason for reason in known.verdict.reasons)
+        assert status is None or named == (status == "check")
+        (noise_px,) = known.cell_fit.linearised_corners.sigmas_px
+        assert noise_px == pytest.approx(options.pixel_sigma_px, rel=0.5)
+    assert limits[0] < np.mean(surprises) < limits[1]
+
+
+def test_a_fisheye_camera_goes_the_whole_way():
+    surprises = []
+    for seed in range(4):
+        options = CellOptions(camera=fisheye_camera(), state_intrinsics=False, seed=seed)
+        known = calibrated(cell := simulate(options))
+        assert known.used == tuple(range(20))
+        assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8
+        surprises.append(mahalanobis_sq(cell, known))
+    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
+    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
+
+
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
-def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
-    matrix, bent = np.array([520.0, 519, 320, 190]), np.array([-0.37, 0.1, 0.001, 0.0, 0.03])
-    camera = Camera("brown", (640, 360), matrix, bent)
-    told = CellOptions(robot="ur3e", mount=mount, views=24, camera=camera, pixel_sigma_px=0.03)
-    cell = simulate(replace(told, robot_sigma_m=1e-4))
-    known = calibrated(cell, session=with_camera(cell, matrix))
-    refined = known.cell_fit.camera_parameters.camera("cam")
-    sigma = np.sqrt(np.diag(known.assessment.covariance)[12:16])
-    # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
-    assert np.all(np.abs(refined.matrix - matrix) < 4.5 * sigma)
+def test_boards_have_names_and_a_common_covariance(mount):
+    cell = simulate(replace(TWO, mount=mount, seed=3))
+    result = result_of(calibrated(cell))
+    assert list(result.edges) == list(cell.transforms)
+    assert set(result.boards) == {"first", "second"}
+    for at, edge in enumerate(result.edges.values()):
+        rows = slice(6 * at, 6 * at + 6)
+        assert np.array_equal(edge.covariance, result.joint_covariance[rows, rows])
+    # The boards hang together by the camera's edge.
+    assert np.abs(result.joint_covariance[6:12, 12:]).max() > 0.0
+    assert np.linalg.eigvalsh(result.joint_covariance).min() > 0.0
+    assert all(list(form.matrices) == list(cell.transforms) for form in result.solvers.values())
+    park = result.solvers["park"].matrices
+    for name, true in cell.transforms.items():
+        # Closed forms are off by a few tenths of a millimetre.
+        assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
-def test_a_session_that_holds_all_views_back_is_told_so(given):
-    cell = simulate(replace(FINE, views=8, state_intrinsics=given))
-    told = session_of(cell)
-    held = replace(told, views=tuple(replace(view, holdout=True) for view in told.views))
-    with pytest.raises(DataError, match="are held back") as caught:
-        calibrated(cell, session=held)
-    assert "Clear role" in caught.value.next_step
+def test_one_view_places_a_board_and_none_is_told():
+    cell = simulate(replace(TWO, second=replace(Second(), target=BOARDS["charuco"]), seed=6))
+    first, further = (np.flatnonzero(board_numbers(cell) == board) for board in (0, 1))
+    known = calibrated(without(cell, {*further[1:]}))
+    edges = result_of(known).edges
+    edge = edges["base_from_target_second"]
+    assert edge.sigma_mm > edges["base_from_target_first"].sigma_mm
+    away = log(invert(cell.transforms["base_from_target_second"]) @ edge.matrix)
+    # One draw of chi-square with six degrees of freedom, at one in ten thousand.
+    assert away @ np.linalg.solve(edge.covariance, away) < chi2.ppf(1.0 - 1e-4, 6)
+    # Without that view nothing places the board: it has no part in what is held out.
+    assert np.isnan(known.assessment.held_out.residual_m).sum() == 1
+    assert np.isfinite(known.findings.held_out.mm)
+    known = calibrated(without(cell, {*further}))
+    assert list(result_of(known).edges) == ["flange_from_cam", "base_from_target_first"]
+    assert any("No usable view shows target second" in reason for reason in known.verdict.reasons)
+    with pytest.raises(DegenerateError, match="it takes 3 stops or more"):
+        calibrated(without(cell, {*first[2:], *further[2:]}))
+
+
+def test_every_output_shows_all_boards(tmp_path):
+    cell = simulate(replace(TWO, seed=10))
+    session = Session.load(write_session(cell, tmp_path / "pairs", images=False))
+    written = run(session)
+    write_outputs(tmp_path / "out", session, written)
+    file = tmp_path / "out" / "recording.rrd"
+    assert Session.load(file).digest() == session.digest()
+    again = run(Session.load(file)).calibration
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    logged = {str(chunk.entity_path) for chunk in RrdReader(file).stream()}
+    for name, edge in written.calibration.edges.items():
+        assert np.array_equal(again.edges[name].matrix, edge.matrix)
+        assert np.array_equal(again.edges[name].covariance, edge.covariance)
+        assert name in report
+    assert {f"/targets/{name}/sheet" for name in ("first", "second")} <= logged
+    with pytest.raises(DataError, match=r"several targets \(first, second\)"):
+        detect_session_target(session, written.calibration, "base")
+
+
+def test_what_is_written_of_the_fit_is_read_back():
+    """Further boards are written relative to the first."""
+    wrong = replace(TWO, seed=2, state_intrinsics=False, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
+    known = calibrated(simulate(wrong))
+    assert known.robot_arm.model is not None
+    prior, solved = CalibrationPrior.of(result_of(known)), known.assessment
+    np.testing.assert_allclose(prior.state.edges, solved.state.edges, atol=1e-12)
+    # What lenses do beyond their models is not written.
+    own = np.delete(np.arange(len(solved.covariance)), known.cell_fit.field_columns)
+    covariance = solved.covariance[np.ix_(own, own)]
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    # Slopes there and back undo each other up to rounding.
+    np.testing.assert_allclose(prior.covariance / scale, covariance / scale, atol=1e-6)
+
+
+def texts(pose):
+    return [repr(value) for value in pose_row(pose).values()]
+
+
+def scara(seed: int, prior: dict[str, dict[str, float]], views: int = 12, tilted: int = 0):
+    """A session of four axes: the tool turns about z alone, but for some first views."""
+    rng, rows = np.random.default_rng(seed), []
+    for view in range(views):
+        turn = np.array([0.0, 0.0, rng.uniform(-2.5, 2.5)])
+        if view < tilted:
+            turn = rng.uniform(-0.5, 0.5, 3)
+        place = np.array([0.4, 0.1, 0.1]) + rng.uniform(-0.1, 0.1, 3)
+        flange = compose(Rotation.from_rotvec(turn).as_matrix(), place)
+        seen = invert(flange @ X) @ Z @ exp(NOISE * rng.standard_normal(6))
+        rows.append([str(view), *texts(flange), *texts(seen)])
+    document = {"schema": 1, "name": "scara", "mount": "eye-in-hand", "prior": prior}
+    columns = ["view", *POSE, *(f"cft_{name}" for name in POSE)]
+    return Session.assemble(document, columns, rows, MemoryImages({}))
+
+
+def run_with(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunState:
+    """Calibrates a cell whose session knows something beforehand."""
+    session = known_of(cell).session
+    session = replace(session, document={**session.document, "prior": prior})
+    return calibrated(cell, session=session, level="hand-eye")
+
+
+def test_what_cannot_be_used_is_said():
+    prior = {"z_m": 0.1, "sigma_m": SIGMA_M}
+    other = calibrate(scara(5, {"base_from_cam": prior}, 14, tilted=8)).verdict
+    words = (
+        "[prior.base_from_cam] was not used: what is unknown of this session is flange_from_cam "
+        "and base_from_target"
+    )
+    assert any(words in reason for reason in other.reasons)
+    (unused,) = (cause for cause in other.causes if cause.kind == "unused")
+    assert unused.do.words.endswith("or delete [prior.base_from_cam] from session.toml.")
+    closed = calibrate(scara(5, {"flange_from_cam": prior}, 14, tilted=8), solver="park").verdict
+    assert any("was not used: the closed form park cannot" in reason for reason in closed.reasons)
+
+
+def test_measured_distances_of_another_scale_are_named_and_an_arm_that_is_off_is_not():
+    for scale, mount in ((1.0, "eye-in-hand"), (1.01, "eye-to-hand")):
+        cell = simulate(CellOptions(mount=mount, views=16, board_scale=scale, seed=2))
+        verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
+        named = [finding for finding in verdict.findings if finding.kind == "board_size"]
+        assert (verdict.status == "good") == (not named) == (scale == 1.0)
+    assert verdict.causes[0] is named[0]
+    # A scale's sigma is a hundredth of a percent there; the factor has five digits.
+    factor = float(named[0].do.words.split()[-1].rstrip("."))
+    assert factor == pytest.approx(scale, abs=4e-4)
+    for seed in (0, 1):
+        arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3, seed=seed))
+        verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
+        assert "board_size" not in {finding.kind for finding in verdict.findings}
