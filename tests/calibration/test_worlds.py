@@ -212,6 +212,9 @@ WORLDS: dict[str, World] = {
     "sound": World(FINE, joints=True, seeds=(0, 1), status="good", never=ANY),
     "sound, poses": World(FINE, seeds=(0, 5), status="good", never=ANY),
     "sound to hand": World(of(TO_HAND, views=30), status="good", never=ANY),
+    "six views": World(
+        CellOptions(views=6), joints=True, seeds=(108,), never=frozenset({"moved_slowly"})
+    ),
     # What grows with reach, time or gravity.
     # Its mean is a base that stands otherwise: edges are not asked.
     "tilt": World(replace(FINE, views=30), tilted, kinds=("base_tilts",), of=NONE),

@@ -162,8 +162,9 @@ def find_steps(
         problem: The inlier observations.
         fit: Their converged fit.
         candidates: What may have changed.
-        kinds: Number of kinds of residuals, rotations and positions, if a change may be in one
-            alone: it then has to explain a half as much, and noise explains it more often.
+        kinds: Number of kinds of residuals, rotations and positions, if a frame's step may be in
+            one alone: it then has to explain a half as much, and noise explains it more often. No
+            `evidence` follows for a drift, whose test is of both.
     """
     size, fitted = problem.size, fitted_covariance(problem, fit.state, fit.noise)
     effects = [candidate.effect for candidate in candidates if candidate.effect is not None]
@@ -205,7 +206,7 @@ def find_steps(
         covariances = covariance_from(blocks[sound, 1])
         values = -(covariances @ slopes[sound][:, :, None])[:, :, 0]
         squares, count = -np.sum(slopes[sound] * values, axis=1), len(mine)
-        many = freedom / (kinds if count > 1 else 1)
+        many = freedom / (kinds if candidate.kind == FRAME else 1)
         chance = FALSE_ALARM / tried[candidate.kind]
         limit = count * float(f_limit(chance, count, max(0.5 * many, 6.0)))
         shown = np.where(_as_f_test(squares, many, count) < limit, 0.0, squares)
