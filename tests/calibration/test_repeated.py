@@ -173,6 +173,12 @@ def test_images_of_a_stop_share_the_robots_error():
         assert misfit(edge.matrix, edge.covariance, STEADY.transforms[name]) < 22.5
 
 
+def test_images_of_what_stands_still_are_no_copies_at_other_stops():
+    cell = simulate(replace(read_cell("two-cameras"), stops=14, pixel_sigma_px=0.002))
+    found = calibrate(cell_session(cell, "still", seen="corners"))
+    assert all(view.used for view in found.views)
+
+
 def test_pictures_that_were_stored_anew_are_copies():
     session = of_one_camera(1)
     shown = session.corner_table

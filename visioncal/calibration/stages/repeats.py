@@ -149,6 +149,7 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
         # Who observes what, and what else is measured. A robot's pose in its stream is that of the
         # time.
         alike = (
+            bool(row.robots),
             *(row.seer, row.seen, None if found is None else found.ids.tobytes()),
             *map(len, states),
             *(_others(one) for one in (view, *(robot for _, robot in sorted(row.robots.items())))),
@@ -156,15 +157,17 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
         )
         groups[alike].append((view, np.concatenate([*states, reading])))
     repeated = dict[int, int]()
-    for rows in groups.values():
+    for (is_by_robot, *_), rows in groups.items():
         # The pairs that are near in all numbers, by the earlier row.
         tree = cKDTree([numbers for _, numbers in rows])
         for first, later in sorted(tree.query_pairs(1.0, p=np.inf)):
             (view, numbers), (other, others) = rows[first], rows[later]
-            # Corners and exact numbers are never read twice; others are, at another time or stop.
+            # Exact numbers are never read twice, and corners only where all stands still;
+            # others are, at another time or stop.
             pairs = (view.stamp_s, other.stamp_s), (view.stop, other.stop)
             is_apart = any(None not in pair and pair[0] != pair[1] for pair in pairs)
-            is_copy = view.number in corners or not is_apart or np.array_equal(numbers, others)
+            is_image = is_by_robot and view.number in corners
+            is_copy = is_image or not is_apart or np.array_equal(numbers, others)
             if is_copy and not {view.number, other.number} & repeated.keys():
                 repeated[other.number] = view.number
     return dict(sorted(repeated.items()))
