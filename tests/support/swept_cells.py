@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 
-from visioncal.core.types import Corners
-from visioncal.session import Session
 from visioncal.simulation import (
     CameraAt,
     NetworkOptions,
     SimulatedCell,
     Swept,
-    cell_session,
     simulate,
 )
 
@@ -22,10 +19,3 @@ HOW = Swept("side", "b", "plate_b", camera_minus_robot_s=AHEAD_S, frames_hz=20.0
 def cell_of(options: NetworkOptions, how: Swept = HOW) -> SimulatedCell:
     """A cell with one more camera, at the side, which sees a board on a moving flange."""
     return simulate(replace(options, cameras=(*options.cameras, SIDE), sweeps=(how,)))
-
-
-def swept_session(cell: SimulatedCell) -> tuple[Session, dict[int, Corners]]:
-    """The cell's session, and what is detected in its images."""
-    return cell_session(cell, "swept", seen="names"), {
-        view_corners.view: view_corners for view_corners in cell.corners
-    }
