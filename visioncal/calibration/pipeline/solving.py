@@ -116,7 +116,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     corners = cell_fit.linearised_corners
     rows = None if corners is None else cell_fit.frame_model.rows(corners)
     if found := random_effects(problem, fit, cell_fit.arms, corners, rows):
-        effects = (*clock_errors, *found)
+        used = cell_fit.inlier_fit.used
+        effects = (*clock_errors, *(effect.among(used) for effect in found))
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
