@@ -34,6 +34,7 @@ from typer.testing import CliRunner
 import visioncal
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.joints import guess_joints
+from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.pipeline.guess_inputs import chain_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
@@ -502,7 +503,10 @@ PLANTED = [
     ),
     (misread("euler-ZYX-deg", "mm", Reading("euler-xyz-rad")), MOUNTS[0], 14),
     # Fewer than eleven rows are alike in several orders, which are no readings of their own.
-    (misread("quaternion-wxyz", "inch", Reading("quaternion-xyzw")), MOUNTS[0], 8),
+    *(
+        (misread("quaternion-wxyz", unit, Reading("quaternion-xyzw")), MOUNTS[0], 8)
+        for unit in ("mm", "inch")
+    ),
     (lambda poses: plant("rows shifted by one", few(poses)), MOUNTS[0], 14),
     (lambda poses: plant("rows shifted by one", two_unseen(poses)), MOUNTS[0], 14),
 ]
@@ -517,6 +521,9 @@ def test_a_planted_mistake_is_named(make, mount, views):
     assert guess.declared in guess.candidates
     seen = np.isfinite(poses.camera.positions).all(axis=1)
     assert len(guess.declared.of_rows) == seen.sum()
+    if views == 8:
+        tried = changes(guess.declared.hypothesis, is_measured=True, count=8)
+        assert not any("sorted as text" in change.words for change in tried)
 
 
 @pytest.mark.parametrize(("written", "read"), [("ZYX", "xyz"), ("xyz", "ZYX")])
@@ -611,9 +618,10 @@ def pairs_session(poses):
     return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
-def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", [slow("board's size in mm"), "the other mount"])
+def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    pairs_session(plant("the other mount", cell_poses())).save(Path("my cell"))
+    pairs_session(plant(name, cell_poses())).save(Path("my cell"))
     done = typed("calibrate", "my cell", "-o", "out")
     assert done.status == 3, done.err
     first = done.said.split("What to do next:")[1].splitlines()[2].strip()
@@ -627,9 +635,17 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatc
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 
-@pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
-def test_what_was_never_recorded_is_named(lost):
-    poses = cell_poses()
+@pytest.mark.parametrize(
+    ("lost", "mount"),
+    [
+        ("rotations", "eye-in-hand"),
+        ("poses", "eye-in-hand"),
+        ("positions", "eye-in-hand"),
+        slow("positions", "eye-to-hand"),
+    ],
+)
+def test_what_was_never_recorded_is_named(lost, mount):
+    poses = cell_poses(mount)
     told = poses.robot.poses()
     if lost == "positions":
         told[:, :3, 3] = 0.0

@@ -848,8 +848,9 @@ def test_they_are_printed_where_the_table_has_them():
         any_page(lifted)
 
 
-def test_a_cell_is_calibrated_with_them(tmp_path):
-    cell = simulate(CellOptions(target=TAGS, views=12, seed=4))
+@pytest.mark.parametrize("mount", [IN_HAND, slow(TO_HAND)])
+def test_a_cell_is_calibrated_with_them(tmp_path, mount):
+    cell = simulate(CellOptions(target=TAGS, views=12, mount=mount, seed=4))
     write_session(cell, tmp_path / "s")
     result = run(Session.load(tmp_path / "s")).calibration
     assert result.verdict.status in ("good", "check")
