@@ -33,6 +33,16 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
+@pytest.fixture
+def strict_rerun():
+    """Turns rerun's warnings, which it prints and forgets, into errors."""
+    import rerun as rr
+
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real measurements, which lies beside a checkout and is never part of it."""

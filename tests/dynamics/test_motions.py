@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rerun as rr
 import tomli_w
 from support.apart import clearances
 from support.commands import visioncal
@@ -23,6 +22,8 @@ from visioncal.dynamics.sweeps import Stroke, SweepRequest, plan_sweeps
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.collision import Body
 from visioncal.simulation.arms import ur_arm
+
+pytestmark = pytest.mark.usefixtures("strict_rerun")
 
 RATES = {"velocity_rad_s": 2.5, "acceleration_rad_s2": 8.0, "torque_nm": 60.0}
 
@@ -246,14 +247,6 @@ def test_missing_limits_are_named_and_can_be_given(robot, joints, option):
 
 
 TABLES = {"excitation.csv", "sweeps.csv", "plan.json", "plan.rrd"}
-
-
-@pytest.fixture(autouse=True)
-def strict_rerun():
-    """Turns rerun's warnings, which it prints and forgets, into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rerun as rr
 from scipy.spatial.distance import pdist
 from support.commands import visioncal
 
@@ -16,6 +15,8 @@ from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.table import parse_csv, read_views
 from visioncal.simulation import CellOptions, simulate, write_session
+
+pytestmark = pytest.mark.usefixtures("strict_rerun")
 
 FILES = {"stops.csv", "plan.json", "plan.script", "plan.rrd"}
 CELL = {
@@ -29,14 +30,6 @@ CELL = {
 }
 
 ONE_AXIS = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
-
-
-@pytest.fixture(autouse=True)
-def strict_rerun():
-    """Turns rerun's warnings, which it prints and forgets, into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 def plan(source, out, *more, **cell):

@@ -32,15 +32,9 @@ from visioncal.present.viewer import blueprint
 from visioncal.results import to_document
 from visioncal.session import MemoryImages, Session
 
+pytestmark = pytest.mark.usefixtures("strict_rerun")
+
 DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
-
-
-@pytest.fixture(autouse=True)
-def strict_rerun():
-    """Turns rerun's warnings, which it prints and forgets, into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 @pytest.fixture(scope="module")

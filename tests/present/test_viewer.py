@@ -33,13 +33,7 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.boards import find_target
 from visioncal.vision.targets import corner_positions, target_from_document
 
-
-@pytest.fixture(autouse=True)
-def strict_rerun():
-    """Turns rerun's warnings, which it prints and forgets, into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
+pytestmark = pytest.mark.usefixtures("strict_rerun")
 
 
 def without_joints(sample):
