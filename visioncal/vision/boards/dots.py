@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import cv2
@@ -18,7 +17,7 @@ from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.circles import find_blobs
 from visioncal.vision.boards.kind import BoardRequest, Cells, DetectedCorners, NotFound, sigma_of
-from visioncal.vision.boards.points import points_csv, points_of, read_points
+from visioncal.vision.boards.points import PointsKind, points_of
 from visioncal.vision.boards.template import Print
 
 _COLUMNS = ("point", "x_m", "y_m", "radius_m")
@@ -50,7 +49,7 @@ def _radii_m(target: Target) -> FloatArray:
     return np.array(cast("DotsTarget", target).radii_m)
 
 
-class Dots(Board):
+class Dots(PointsKind, Board):
     """A board of dots, in the frame of its table."""
 
     name: ClassVar[str] = "dots"
@@ -58,6 +57,7 @@ class Dots(Board):
     noun, sides, unit = "board of dots", "a distance of dots", "distance"
     options = "--columns --rows --square-mm --name"
     is_seen_in_part = True
+    table_columns, needed_columns = _COLUMNS, 3
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads points, the columns of its table as lists, radius_m and square_sigma_m."""
@@ -100,20 +100,6 @@ class Dots(Board):
         columns = (list(target.point_numbers), x_m, y_m, _radii_m(target).tolist())
         points = dict(zip(_COLUMNS, columns, strict=True))
         return {"points": points, "square_sigma_m": target.square_sigma_m}
-
-    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """The content of its `.toml` with the columns of its table."""
-        table = document.get("points")
-        if not isinstance(table, str):
-            return document
-        return document | {"points": read_points(folder, table, _COLUMNS, _COLUMNS[:3])}
-
-    def stored(
-        self, document: Mapping[str, Any], stem: str
-    ) -> tuple[Mapping[str, Any], dict[str, str]]:
-        """The content of its `.toml`, and its table `STEM.points.csv`."""
-        table = f"{stem}.points.csv"
-        return {**document, "points": table}, {table: points_csv(document["points"])}
 
     def corners(self, target: Target) -> FloatArray:
         """(n, 3) centres [m], in the order of its table."""

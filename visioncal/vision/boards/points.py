@@ -27,7 +27,7 @@ from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import refine_tags
 
 # Columns of a rig's table; sigma_m is optional, and so are tag and corner together.
-RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
+_RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
 _WHOLE_NUMBERS = ("point", "tag", "corner")
 # Largest rig [m], beyond which numbers are in millimetres; minimum points for a pose.
 _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
@@ -39,20 +39,44 @@ _SQUARE = 0.02
 _LEAST_TAGS = 2
 
 
-class Rig(BoardKind):
+class PointsKind(BoardKind):
+    """A kind of target whose points are in a table beside its `.toml`."""
+
+    table_columns: ClassVar[tuple[str, ...]]  # Columns of its table, the needed ones first.
+    needed_columns: ClassVar[int]  # Number of the needed ones.
+
+    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The content of its `.toml` with the columns of its table."""
+        table = document.get("points")
+        if not isinstance(table, str):
+            return document
+        known = self.table_columns
+        points = _read_points(folder, table, known, known[: self.needed_columns])
+        return document | {"points": points}
+
+    def stored(
+        self, document: Mapping[str, Any], stem: str
+    ) -> tuple[Mapping[str, Any], dict[str, str]]:
+        """The content of its `.toml`, and its table `STEM.points.csv`."""
+        table = f"{stem}.points.csv"
+        return {**document, "points": table}, {table: _points_csv(document["points"])}
+
+
+class Rig(PointsKind):
     """A rig of points, in the frame of its table. Points are found if they are corners of tags."""
 
     name: ClassVar[str] = "points"
     noun = "rig"
     unit = "side"
     fewest = 4
+    table_columns, needed_columns = _RIG_COLUMNS, 4
     is_seen_in_part = has_lone_tags = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads points, the columns of the rig's table as lists, and dictionary."""
         columns = table.content.get("points")
         if not isinstance(columns, Mapping) or not all(
-            column in columns for column in RIG_COLUMNS[:4]
+            column in columns for column in _RIG_COLUMNS[:4]
         ):
             raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
         numbers, places_m = points_of(table, columns)
@@ -70,26 +94,12 @@ class Rig(BoardKind):
             **_tags_of_rig(table, columns),
         )
 
-    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """The content of its `.toml` with the columns of its table."""
-        table = document.get("points")
-        if not isinstance(table, str):
-            return document
-        return document | {"points": read_points(folder, table, RIG_COLUMNS, RIG_COLUMNS[:4])}
-
-    def stored(
-        self, document: Mapping[str, Any], stem: str
-    ) -> tuple[Mapping[str, Any], dict[str, str]]:
-        """The content of its `.toml`, and its table `STEM.points.csv`."""
-        table = f"{stem}.points.csv"
-        return {**document, "points": table}, {table: points_csv(document["points"])}
-
     def document(self, target: Target) -> dict[str, Any]:
         """The rig as the content of a `.toml`, with its table."""
         x_m, y_m, z_m = self.corners(target).T.tolist()
         tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
         columns = (list(target.point_numbers), x_m, y_m, z_m, list(target.point_sigmas_m), *tags)
-        rig = dict(zip(RIG_COLUMNS, columns, strict=True))
+        rig = dict(zip(_RIG_COLUMNS, columns, strict=True))
         points = {"points": {name: value for name, value in rig.items() if value}}
         return points | ({"dictionary": target.dictionary} if target.point_tags else {})
 
@@ -192,7 +202,7 @@ class Rig(BoardKind):
         return np.asarray(places[numbers, :2])
 
 
-def read_points(
+def _read_points(
     folder: Path, name: str, known: Sequence[str], needed: Sequence[str]
 ) -> dict[str, list[Any]]:
     """Reads a table of points by columns, from the folder of its target's description."""
@@ -224,7 +234,7 @@ def read_points(
     return read
 
 
-def points_csv(points: Mapping[str, Sequence[float]]) -> str:
+def _points_csv(points: Mapping[str, Sequence[float]]) -> str:
     """Text of a table of points, from its columns."""
     rows = zip(*points.values(), strict=True)
     return "\n".join([",".join(points), *(",".join(map(repr, row)) for row in rows), ""])
@@ -234,7 +244,7 @@ def points_of(
     table: DocumentTable, columns: Mapping[str, Any]
 ) -> tuple[tuple[int, ...], FloatArray]:
     """Checked numbers and (n, 3) places [m] of a table's points, by its columns as lists."""
-    names = [column for column in RIG_COLUMNS if column in columns]
+    names = [column for column in _RIG_COLUMNS if column in columns]
     try:
         values = np.array([columns[word] for word in names], dtype=float)
     except (TypeError, ValueError):
