@@ -195,10 +195,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             culprits=[str(source)],
             next_step="Record the camera's topic, too: ros2 bag record IMAGES /tf /tf_static.",
         )
-    cameras, (stream, words, tip, robot) = (
-        _cameras(contents, requested),
-        _motion(contents, requested),
-    )
+    cameras = _cameras(contents, requested)
+    stream, words, tip, robot = _motion(contents, requested)
     at_s, poses = stream.stamps_s, stream.poses.poses()
     flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
     rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, bool, int]]()
@@ -425,10 +423,15 @@ def _motion(
     return ForeignStream(every_s, PoseNumbers.of_poses(found, labels), q), words, tip, robot
 
 
+def _table(values: "array[float]", width: int) -> FloatArray:
+    """(m, width) rows that begin with their time, in the order of time, each time once."""
+    table = np.frombuffer(values, dtype=float).reshape(-1, width)
+    return np.asarray(table[np.unique(table[:, 0], return_index=True)[1]])
+
+
 def _rows(values: "array[float]") -> tuple[FloatArray, FloatArray]:
     """(m,) times and (m, 4, 4) poses, in the order of time, each time once."""
-    table = np.frombuffer(values, dtype=float).reshape(-1, 8)
-    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    table = _table(values, 8)
     rotations = Rotation.from_quat(table[:, 4:])
     poses = RigidTransform.from_components(table[:, 1:4], rotations)
     return table[:, 0], np.asarray(poses.as_matrix())
@@ -527,8 +530,7 @@ def _joint_rows(
             continue
         for names, values in by_names.items():
             if robot is not None and {*robot.joint_names} <= {*names}:
-                table = np.frombuffer(values, dtype=float).reshape(-1, 1 + len(names))
-                table = table[np.unique(table[:, 0], return_index=True)[1]]
+                table = _table(values, 1 + len(names))
                 order = [1 + names.index(name) for name in robot.joint_names]
                 return table[:, 0], table[:, order], robot
     return none
