@@ -1,5 +1,6 @@
 """Bags of ROS and data sets of LeRobot become sessions that calibrate to the same."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,16 @@ def test_poses_of_a_topic_and_frames_are_named(source, rendered, tmp_path):
     with pytest.raises(DataError, match="no 'tool1'") as caught:
         convert(frames, tmp_path / "none", requested=wrong)
     assert "tool0" in caught.value.next_step
+
+
+def test_intrinsics_without_an_image_size_take_that_of_the_bag(source, rendered, tmp_path):
+    path, lens = bag(tmp_path / "b", source, rendered, is_compressed=True), tmp_path / "lens.json"
+    fx, fy, cx, cy = LENS["matrix"]
+    stated = {"camera_matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}
+    lens.write_text(json.dumps(stated | {"distortion_coefficients": LENS["distortion"]}))
+    session = convert(path, tmp_path / "out", requested=replace(BOARD, intrinsics=str(lens)))
+    assert session.declaration.camera.resolution == source.declaration.camera.resolution
+    assert session.declaration.camera.matrix == LENS["matrix"]
 
 
 def test_a_damaged_bag_is_refused(source, rendered, tmp_path):

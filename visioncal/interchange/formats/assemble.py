@@ -26,9 +26,9 @@ from visioncal.interchange.formats.intrinsics import (
     target_name,
 )
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
-from visioncal.session import ImageStore, MemoryImages, Session, Stream
+from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
-from visioncal.vision.boards.imaging import decode_image, looks_like_image
+from visioncal.vision.boards.imaging import image_size, looks_like_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +97,21 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     notes = list(foreign.notes)
-    if foreign.store is None:
+    store = foreign.store
+    if store is None:
         paths = _image_paths(foreign.images, foreign.name, notes)
+        store = FileImages(
+            {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
+        )
     else:
         paths = ["" if path is None else path.as_posix() for path in foreign.images]
-    files = {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
+    images = [path for path in dict.fromkeys(paths) if path]
     rows = _view_rows(foreign, paths)
     if foreign.lenses:
         document["cameras"] = {name: dict(lens) for name, lens in foreign.lenses.items()}
-    elif files:
-        document["camera"] = _camera(foreign, list(files.values()))
-    target = foreign.target if files else None
+    elif images:
+        document["camera"] = _camera(foreign, store, images)
+    target = foreign.target if images else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
@@ -117,7 +121,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         document,
         names,
         cells,
-        foreign.store or (FileImages(files) if files else MemoryImages({})),
+        store,
         target_document=target,
         robot_document=robot,
     )
@@ -281,10 +285,11 @@ def _is_meant(name: str, cells: Sequence[str]) -> bool:
     return not session_columns.is_number(name) or all(finite)
 
 
-def _camera(foreign: ForeignRecording, files: Sequence[Path]) -> dict[str, Any]:
+def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) -> dict[str, Any]:
     lens = {name: value for name, value in (foreign.lens or {}).items() if value is not None}
     if "resolution" not in lens:
-        size = next((pair for file in files if (pair := _image_size(file)) is not None), None)
+        sizes = (image_size(store.read(path)) for path in paths if store.exists(path))
+        size = next(filter(None, sizes), None)
         if size is not None:
             lens["resolution"] = list(size)
         elif "matrix" in lens:
@@ -295,11 +300,6 @@ def _camera(foreign: ForeignRecording, files: Sequence[Path]) -> dict[str, Any]:
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )
     return lens
-
-
-def _image_size(file: Path) -> tuple[int, int] | None:
-    image = decode_image(_image_bytes(file)) if file.is_file() else ""
-    return None if isinstance(image, str) else (image.shape[1], image.shape[0])
 
 
 def _image_bytes(file: Path) -> bytes:

@@ -36,6 +36,7 @@ from visioncal.interchange.formats.foreign import (
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
 from visioncal.session.images import ImageStore
+from visioncal.vision.boards.imaging import image_size
 
 # A message, or a reader of these: their classes are made from the bag's own definitions.
 Message: TypeAlias = Any
@@ -261,18 +262,13 @@ def _seven(position: Message, rotation: Message) -> tuple[float, ...]:
 def _add_image(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
     images = contents.images.get(topic)
     if images is None:
-        is_compressed, size = not hasattr(message, "encoding"), (0, 0)
+        is_compressed = not hasattr(message, "encoding")
         # Depth is no picture.
         if "depth" in topic.lower() or getattr(message, "encoding", "") == "32FC1":
             return
-        if is_compressed:
-            data = np.frombuffer(bytes(message.data), np.uint8)
-            decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-            if decoded is None:
-                return
-            size = decoded.shape[1], decoded.shape[0]
-        else:
-            size = message.width, message.height
+        size = image_size(bytes(message.data)) if is_compressed else (message.width, message.height)
+        if size is None:
+            return
         frame = message.header.frame_id.strip("/")
         images = contents.images[topic] = _Images(is_compressed, frame, size)
     images.stamps_s.append(_stamp_s(message, received_ns))

@@ -24,7 +24,6 @@ from visioncal.interchange.formats.file_search import path_inside
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.robot import robot_names
 from visioncal.session.images import ImageStore
-from visioncal.vision.boards.imaging import decode_image
 
 _STATE, _IMAGES = "observation.state", "observation.image"
 # Built-in models by words in `robot_type`, beside their own names.
@@ -159,7 +158,6 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         joints_rad=joints[chosen],
         stamps_s=stamps_s[chosen] + 1e4 * episodes[chosen],
         mount=mount,
-        lens={"resolution": _size(FrameImages(places), paths[0].as_posix())},
         arm=None if arm is None else {"model": arm},
         notes=tuple(notes),
     )
@@ -230,14 +228,6 @@ def _starts(
             named = form.format(video_key=key, episode_chunk=chunk, episode_index=episode)
             starts[episode] = path_inside(source, named), 0
     return starts
-
-
-def _size(images: FrameImages, path: str) -> list[int]:
-    """(width, height) of an image [px]."""
-    image = decode_image(images.read(path))
-    if isinstance(image, str):
-        raise DataError(f"{path} {image}.", culprits=[path])
-    return [image.shape[1], image.shape[0]]
 
 
 LEROBOT = ForeignFormat(

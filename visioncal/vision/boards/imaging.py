@@ -67,6 +67,12 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     return np.asarray(image, dtype=np.uint8) if image.dtype == np.uint8 else _to_eight_bits(image)
 
 
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) of an image file [px]; None where it cannot be decoded."""
+    image = decode_image(data)
+    return None if isinstance(image, str) else (image.shape[1], image.shape[0])
+
+
 def faint_jpeg(image: Image) -> bytes:
     """Encodes a (h, w) or (h, w, 3) image as strongly compressed JPEG, to look at.
 
