@@ -467,6 +467,14 @@ def test_what_grows_is_recovered_and_in_the_budget(change, kind, true):
     assert kind in next(iter(known.assessment.budget_mm.values()))
 
 
+def test_a_lens_also_grows_in_views_that_were_left_out():
+    known = calibrated(warmed(simulate(replace(FINE, views=30, wrong_views=2))), joints=False)
+    inliers = known.cell_fit.inlier_fit
+    (effect,) = (it for it in inliers.problem.effects if it.name.startswith("lens_grows of "))
+    assert np.sum(~inliers.used) == 2
+    assert effect.by_sensor[~inliers.used].any(axis=(1, 2)).all()
+
+
 @pytest.mark.parametrize("mount", [IN_HAND, slow(TO_HAND)])
 def test_a_bump_is_in_the_covariance(mount):
     """The answer is between both places, and as far from each as it says."""

@@ -125,14 +125,6 @@ class Effect:
             rows_concerned=None if self.rows_concerned is None else self.rows_concerned[rows],
         )
 
-    def among(self, used: Mask) -> "Effect":
-        """Returns the effect for all observations, of which it has the rows of the (n,) mask."""
-        if self.by_sensor is None:
-            return self
-        by_sensor = np.zeros((len(used), *self.by_sensor.shape[1:]))
-        by_sensor[used] = self.by_sensor
-        return replace(self, by_sensor=by_sensor)
-
     def carried(self, by: FloatArray) -> "Effect":
         """Returns the effect for poses of another point of the observed, by (n, 6, 6) adjoints."""
         return self if self.by_sensor is None else replace(self, by_sensor=by @ self.by_sensor)

@@ -112,12 +112,10 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
         cell_fit = _fit_with_inliers(cell_fit, observed)
-    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     corners = cell_fit.linearised_corners
-    rows = None if corners is None else cell_fit.frame_model.rows(corners)
-    if found := random_effects(problem, fit, cell_fit.arms, corners, rows):
-        used = cell_fit.inlier_fit.used
-        effects = (*clock_errors, *(effect.among(used) for effect in found))
+    rows = None if corners is None else cell_fit.frame_model.all_rows(corners)
+    if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, corners, rows):
+        effects = (*clock_errors, *found)
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit

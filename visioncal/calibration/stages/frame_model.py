@@ -51,15 +51,16 @@ class CellFrameModel:
 
     def rows(self, seen: LinearisedCorners) -> IntArray:
         """(n,) index of the corners' view of each observation of `problem`; see `FrameModel`."""
-        return self._all_rows(seen)[self.used]
+        return self.all_rows(seen)[self.used]
 
-    def _all_rows(self, seen: LinearisedCorners) -> IntArray:
+    def all_rows(self, seen: LinearisedCorners) -> IntArray:
+        """(n,) the same of all observations."""
         places = {view: at for at, view in enumerate(seen.views)}
         return np.array([places.get(view, -1) for view in self.views], dtype=np.int64)
 
     def full_problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with the poses by current lenses and boards."""
-        problem, rows = self.observed, self._all_rows(seen)
+        problem, rows = self.observed, self.all_rows(seen)
         has_corners, stated = rows >= 0, problem.observations
         measured, covariance = stated.measured.copy(), stated.covariance.copy()
         measured[has_corners] = seen.camera_parameters.poses[rows[has_corners]]

@@ -20,6 +20,7 @@ from visioncal.estimation.effects.random_effect import (
     find_random_effects,
 )
 from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution
@@ -35,27 +36,26 @@ def of_random_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 
 def random_effects(
-    problem: Problem,
-    fit: Solution,
+    inliers: InlierFit,
     arms: Mapping[str, RobotArm],
     corners: LinearisedCorners | None,
     rows: IntArray | None,
 ) -> tuple[Effect, ...]:
-    """The random effects that the residuals of a fit show.
+    """The random effects that the residuals of the inliers show, for all observations.
 
     `rows` are the (n,) views of the observations, -1 for none, among the cameras' corners, if any.
     """
-    found = list[Effect]()
+    problem, found = inliers.problem, list[Effect]()
     for robot, arm in arms.items():
-        stops = stops_of(problem, robot)
+        stops = stops_of(inliers.part, robot)
         if len(stops) < _FEWEST_STOPS or f"arm of {robot}" in problem.effect_columns:
             continue
         candidates = [*_of_flange(problem, robot, stops)]
         if corners is not None and rows is not None and len(arms) == 1:
-            candidates += _of_sensors(problem, robot, stops, corners, rows)
+            candidates += _of_sensors(inliers, robot, stops, corners, rows)
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
-        found += find_random_effects(problem, fit.state, fit.noise, candidates, [nuisance])
+        found += find_random_effects(inliers, candidates, [nuisance])
     return tuple(found)
 
 
@@ -92,8 +92,9 @@ def _without_constants(columns: FloatArray, poses: FloatArray, stops: IntArray) 
 
 
 def _of_sensors(
-    problem: Problem, robot: str, stops: IntArray, corners: LinearisedCorners, rows: IntArray
+    inliers: InlierFit, robot: str, stops: IntArray, corners: LinearisedCorners, rows: IntArray
 ) -> Iterator[tuple[RandomEffect, Effect]]:
+    problem = inliers.problem
     time = _time(stops, len(problem.poses[robot]))[problem.observations.stops]
     optics = corners.camera_parameters
     for name, compressed in zip(optics.problems, corners.compressed, strict=True):
@@ -103,7 +104,7 @@ def _of_sensors(
         by_focal[is_mine] = by_shared @ optics.camera(name).matrix[:2]
         seen = Stops(np.zeros((0, 4, 4)), time, by_focal)
         for kind in RANDOM_EFFECTS:
-            if kind.is_of_sensor and is_mine.any():
+            if kind.is_of_sensor and (is_mine & inliers.used).any():
                 yield kind, effect_of(kind, name, seen)
 
 

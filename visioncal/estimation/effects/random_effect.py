@@ -17,8 +17,8 @@ from visioncal.estimation.mixed import (
     PriorInformation,
     level_weight,
 )
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.outliers import InlierFit
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 
 # Share of sessions that have one such error.
@@ -53,21 +53,21 @@ class RandomEffect:
 
 
 def find_random_effects(
-    problem: Problem,
-    state: State,
-    noise: Noise,
+    inliers: InlierFit,
     candidates: Sequence[tuple[RandomEffect, Effect]],
     nuisance: Sequence[Effect],
 ) -> tuple[Effect, ...]:
-    """Those of some kinds, each with its columns, that the residuals of a fit show.
+    """Those of some kinds, each with its columns, that the residuals of the inliers show.
 
-    Their sizes are their priors; `nuisance` are errors of arms by posture, each of unknown size.
+    All have the rows of all observations. Their sizes are their priors; `nuisance` are errors of
+    arms by posture, each of unknown size.
     """
     effects = [*(effect for _, effect in candidates), *nuisance]
     typical = [kind.typical for kind, _ in candidates] + [_ARM] * len(nuisance)
-    wide = problem.with_effects([*problem.effects, *effects])
-    values = np.append(state.values, np.zeros(sum(map(len, effects))))
-    likelihood = robot_likelihood(wide, State(state.edges, values), noise)
+    problem, fit = inliers.problem, inliers.fit
+    wide = problem.with_effects([*problem.effects, *effects]).subset(inliers.used)
+    values = np.append(fit.state.values, np.zeros(sum(map(len, effects))))
+    likelihood = robot_likelihood(wide, State(fit.state.edges, values), fit.noise)
     columns = np.full(wide.size, -1)
     for index, effect in enumerate(effects):
         columns[wide.effect_columns[effect.name]] = index
