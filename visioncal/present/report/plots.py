@@ -141,8 +141,9 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     for index, (seer, views, (label, name, unit, limit)) in enumerate(shown):
         values = np.array([getattr(view, name) for view in views], dtype=float)
         top = index * pitch + 22.0
-        _draw_views(drawing, top, views, values, outlying, label)
         panel = _scale_of(drawing, top, views, values)
+        panel.draw_scale(label)
+        _draw_views(panel, views, values, outlying)
         rms = getattr(rms_of(views), unit)
         if rms is not None:
             panel.draw_level(rms, f"rms {significant(rms)}", "ink", "5 4")
@@ -152,8 +153,8 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
                 panel.draw_level(limit, "", "bad", "1 4")
             else:
                 words, y = f"{words} \N{UPWARDS ARROW}", top
-            near = rms is not None and abs(y - panel.y(rms)) < _LINE_HEIGHT
-            y += _LINE_HEIGHT * (1.0 if near and limit < (rms or 0.0) else -1.0 if near else 0.0)
+            if rms is not None and abs(y - panel.y(rms)) < _LINE_HEIGHT:
+                y += _LINE_HEIGHT if limit < rms else -_LINE_HEIGHT
             drawing.text(_WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
         drawing.text(_LEFT, top - 8.0, seer, "start")
         # With several cameras, each panel has other views.
@@ -183,16 +184,10 @@ def _scale_of(
 
 
 def _draw_views(
-    drawing: Drawing,
-    top: float,
-    views: Sequence[ViewResult],
-    values: FloatArray,
-    outlying: Collection[int],
-    label: str,
+    panel: Panel, views: Sequence[ViewResult], values: FloatArray, outlying: Collection[int]
 ) -> None:
     """Draws a bar a view, and a mark at each that was not used."""
-    panel, places = _scale_of(drawing, top, views, values), _places(len(views))
-    panel.draw_scale(label)
+    drawing, places = panel.drawing, _places(len(views))
     bars: dict[str, str] = {}
     for view, x, value in zip(views, places, values, strict=True):
         left_out = "bad" if contradicts(view) else "muted"
@@ -219,21 +214,18 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
         ends = np.vstack([*chart.lines])
         middle, reach = 0.5 * (ends.max(axis=0) + ends.min(axis=0)), np.ptp(ends, axis=0).max()
         scale, at = 0.82 * side / reach, np.array([(index + 0.5) * side, 0.5 * side + 14.0])
-
-        def drawn(points: FloatArray, scale: float = scale, at: FloatArray = at,
-                  middle: FloatArray = middle) -> FloatArray:  # fmt: skip
-            return np.asarray(scale * (points - middle) + at)
-
+        origin = at - scale * middle
         drawing.text(float(at[0]), 14.0, _CHARTS[chart.name])
         for line in chart.lines:
-            drawing.path("line", 1.0, "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in drawn(line)))
+            corners = (f"{x:.1f} {y:.1f}" for x, y in scale * line + origin)
+            drawing.path("line", 1.0, "M" + "L".join(corners))
         for place, words in chart.words:
-            x, y = drawn(np.array(place)).tolist()
+            x, y = (scale * np.array(place) + origin).tolist()
             drawing.text(x, y + 4.0, words)
         for is_used, colour in ((True, "accent"), (False, "bad")):
             points = [xy for view, xy in chart.points.items() if (view in used) is is_used]
             if points:
-                places = drawn(np.vstack(points))
+                places = scale * np.vstack(points) + origin
                 path = dots(*places[:: -(-len(places) // _MOST_DOTS)].T)
                 drawing.path(colour, 2.2 if chart.name == "image" else 5.0, path, _ROUND)
     return drawing.svg("Coverage: corners, viewing directions, rotation axes", side + 20.0)
