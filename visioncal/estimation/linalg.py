@@ -17,8 +17,6 @@ _LEAST_PIVOT_SQ = 1e-11
 ROUNDING = 1e-6
 # The same of eigenvalues beside the largest.
 NULL_SHARE = 1e-9
-
-
 # Scaled eigenvalue ratio below which a direction is undetermined.
 NULL_RATIO = 1e-8
 

@@ -47,7 +47,6 @@ class TouchTargets:
 
     points: tuple[TouchPoint, ...]
     board: Frame  # The board in the base, its z into it.
-    flange_from_tip: Edge  # The tip.
     # (k, 3) all that is known beyond the flange, in its frame, the tip first [m].
     parts_m: FloatArray
 
@@ -138,7 +137,7 @@ def touch_targets(
         radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     carried_m = np.vstack([tip.matrix[None, :3, 3], parts_m])
-    return TouchTargets(tuple(points), frame, tip, carried_m)
+    return TouchTargets(tuple(points), frame, carried_m)
 
 
 def evaluate_gaps(

@@ -11,7 +11,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.problem import Problem
@@ -102,11 +102,6 @@ class ObservedPoses(Observed):
         if len(self.session.boards) < 2:
             return edge_names(self.session.mount)[1].partition("_from_")[2]
         return frame_name("target", tuple(self.session.boards)[board])
-
-    def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
-        """Names (1 + b, 4, 4) edges of the camera and the problem's boards by their frames."""
-        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
-        return dict(zip((camera, *map(self.frame_of, self.boards)), edges, strict=True))
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""

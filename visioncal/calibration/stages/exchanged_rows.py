@@ -15,8 +15,8 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
-# False-alarm probability of an observation at its own stop, and the factor on its squared distance
-# for other ones: the prediction has errors, too, and wrong stops are much farther.
+# Factor on the limit of an observation's squared distance at other stops than its own: the
+# prediction has errors, too, and wrong stops are much farther.
 _NEAR = 4.0
 
 

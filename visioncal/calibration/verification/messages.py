@@ -28,7 +28,6 @@ from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
-# Sigmas beyond which a part of a motion is mentioned; nearly every check detects twice as many.
 # Thermal expansion of aluminium and steel, in shares a kelvin.
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
@@ -250,6 +249,7 @@ def _signed_axis(vector: FloatArray) -> str:
 
 def _agreement(check: Check) -> str:
     turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    # Nearly every check detects twice as many sigmas as a part of a motion is mentioned from.
     sure = 2.0 * CONTRADICTION * check.camera_sigma
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     again = f" ({check.repeated} of them where the calibration's stood)" if check.repeated else ""
