@@ -113,14 +113,14 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
     """
     declared, *others = tried
     best = others[0] if others else declared
-    rivals = [declared.log_posterior, EVIDENCE * _by_other_rows(best)]
-    rivals += [
-        other.log_posterior
-        for other in others
-        if other.log_posterior > best.log_posterior - _CLEAR and not _are_same(best, other)
-    ]
-    is_odd = _is_poor(best) or best.fit.score > _MOST_SCORE
-    if is_odd or best.log_posterior <= max(rivals) + _CLEAR:
+    beaten = best.log_posterior - _CLEAR
+    if (
+        beaten <= declared.log_posterior
+        or best.fit.score > _MOST_SCORE
+        or _turns_about_one_axis(best)
+        or any(other.log_posterior > beaten and not _are_same(best, other) for other in others)
+        or beaten <= EVIDENCE * _by_other_rows(best)
+    ):
         return tried, declared
     chosen = _with_likeliest_label(best)
     return [chosen if item is best else item for item in tried], chosen
@@ -128,8 +128,6 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
 
 def _by_other_rows(best: Candidate) -> float:
     """Log-likelihood of a reading whose positions, or rotations, are those of other rows."""
-    if not best.fit.is_readable:
-        return -np.inf
     (robot,), (camera,) = chains(best.recording, [best.hypothesis], best.of_rows)
     rng, mixed = np.random.default_rng(0), np.tile(robot, (2 * _SHUFFLES, 1, 1, 1))
     for at in range(_SHUFFLES):
@@ -192,10 +190,8 @@ def _are_same(best: Candidate, rival: Candidate) -> bool:
     )
 
 
-def _is_poor(best: Candidate) -> bool:
+def _turns_about_one_axis(best: Candidate) -> bool:
     """Whether the camera turns about one axis at most."""
-    if not best.fit.is_readable:
-        return False
     kept = best.recording.camera.rows(best.of_rows[best.fit.kept])
     return is_about_one_axis(best.hypothesis.camera.poses(kept)[:, :3, :3])
 
@@ -212,7 +208,7 @@ def _check_mount(likely: Sequence[Candidate]) -> None:
     first, *others = likely
     least = _beside_other_mount(first) - _CLEAR
     is_clear = all(_beside_other_mount(other) < least for other in others)
-    if not first.fit.closes or (is_clear and not _is_poor(first)):
+    if not first.fit.closes or (is_clear and not _turns_about_one_axis(first)):
         return
     pair = sorted(likely, key=lambda item: MOUNTS.index(item.hypothesis.mount))
     readings = " and ".join(f"{best.hypothesis.mount} ({best.words})" for best in pair)
@@ -236,7 +232,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     rivals = [candidate for candidate in ranked if candidate is not declared]
     if rivals:
         closes += f"; the next, {rivals[0].words}, to {_figures(rivals[0])}"
-    if _is_poor(declared):
+    if _turns_about_one_axis(declared):
         return (
             "The motion cannot distinguish readings: all views turn about one axis at most. As "
             f"declared, {closes}."
