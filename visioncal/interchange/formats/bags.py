@@ -24,14 +24,14 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import invert, log
-from visioncal.core.types import FloatArray, Mount
-from visioncal.estimation.clock_correlation import evenly
+from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
     ForeignStream,
     ImportOptions,
+    frames_to_take,
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
@@ -45,8 +45,8 @@ _ENDINGS = (".bag", ".mcap", ".db3")
 # Frames of a robot that are preferred where TF has several, by what they are.
 _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "link_base", "link_0", "world")
 _TIPS = ("tool0", "flange", "panda_link8", "fr3_link8", "link_eef", "ee_link", "tcp")
-# Fewest stops that make a recording one of stops, and most frames of a sweep.
-_FEWEST_STOPS, _MOST_FRAMES = 5, 600
+# Most frames of a motion without stops.
+_MOST_FRAMES = 600
 # Frames are of another stop where the flange has moved by this [rad, m].
 _MOVED = 1e-3
 # Conversions of raw images to what an image file holds, by encoding.
@@ -205,7 +205,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     for topic, camera in cameras.items():
         images = contents.images[topic]
         chosen, how = _chosen(np.array(images.stamps_s), flange)
-        notes.append(f"{topic}: {how}.")
+        notes.append(f"{topic}: {how}")
         for at in chosen.tolist():
             ending = "jpg" if images.is_compressed else "png"
             path = f"images/{camera}{'_' if camera else ''}{at:06d}.{ending}"
@@ -532,20 +532,13 @@ def _joint_rows(
     return none
 
 
-def _chosen(stamps_s: FloatArray, flange: Trajectory) -> tuple[np.ndarray, str]:
-    """Numbers of the frames to take: one a stop, or of a sweep evenly; and that in words."""
+def _chosen(stamps_s: FloatArray, flange: Trajectory) -> tuple[IntArray, str]:
+    """Numbers of the frames to take, as `frames_to_take` has them."""
     order = np.argsort(stamps_s, kind="stable")
     still = order[is_standing_still(flange, stamps_s[order])]
     poses = flange.at(stamps_s[still])
     moved = np.abs(log(invert(poses[:-1]) @ poses[1:])).max(axis=1) > _MOVED
-    runs = np.split(still, np.flatnonzero(moved) + 1)
-    count = len(stamps_s)
-    if len(runs) >= _FEWEST_STOPS:
-        # The middle of each rest, where clocks that differ a little have no effect.
-        chosen = np.array([run[len(run) // 2] for run in runs])
-        return chosen, f"{len(chosen)} of {count} frames are views, one a stop of the robot"
-    chosen = order[evenly(count, _MOST_FRAMES)]
-    return chosen, f"{len(chosen)} of {count} frames are views, of a motion without stops"
+    return frames_to_take(order, still, moved, _MOST_FRAMES)
 
 
 def _mount(contents: _Contents, frames: Sequence[str], tip: str) -> Mount | None:

@@ -5,11 +5,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.core.types import FloatArray, IntArray, Mount, Progress
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress
+from visioncal.estimation.clock_correlation import evenly
 from visioncal.session import ImageStore
+
+# Fewest stops that make a recording one of stops.
+_FEWEST_STOPS = 5
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,26 @@ class ForeignRecording:
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
+
+
+def frames_to_take(
+    order: IntArray, still: IntArray, moved: Mask, most: int
+) -> tuple[IntArray, str]:
+    """The frames that become views: one a stop, or of a motion without stops evenly; and how.
+
+    Args:
+        order: (n,) numbers of all frames, by time.
+        still: (m,) those at which the robot stood.
+        moved: (m - 1,) whether it has moved from each of these to the next.
+        most: Most frames of a motion without stops.
+    """
+    runs = np.split(still, np.flatnonzero(moved) + 1)
+    if len(runs) >= _FEWEST_STOPS:
+        # The middle of each rest, where clocks that differ a little have no effect.
+        chosen, how = np.array([run[len(run) // 2] for run in runs]), "one a stop of the robot"
+    else:
+        chosen, how = order[evenly(len(order), most)], "of a motion without stops"
+    return chosen, f"{len(chosen)} of {len(order)} frames are views, {how}."
 
 
 def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:

@@ -19,9 +19,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.file_search import path_inside
-from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ImportOptions,
+    frames_to_take,
+)
 from visioncal.robot import robot_names
 from visioncal.session.images import ImageStore
 
@@ -33,8 +37,8 @@ _GRIPPERS, _WRISTS = ("gripper", "finger", "hand"), ("wrist", "hand", "gripper",
 # A stop: joints stay within the first for the time before and after [rad, s]; those of another
 # stop differ by more than the second.
 _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad(3.0))
-# Fewest stops that make a recording one of stops, and most frames of any other.
-_FEWEST_STOPS, _MOST_FRAMES = 5, 60
+# Most frames of a motion without stops.
+_MOST_FRAMES = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +189,7 @@ def _joints(
 
 
 def _chosen(joints: FloatArray, episodes: FloatArray, fps: float) -> tuple[IntArray, str]:
-    """The rows to take: one a stop, or else evenly; and that in words."""
+    """The rows to take, as `frames_to_take` has them."""
     reach, count = max(round(_STILL_S * fps), 1), len(joints)
     at = np.arange(count)
     sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
@@ -200,12 +204,7 @@ def _chosen(joints: FloatArray, episodes: FloatArray, fps: float) -> tuple[IntAr
     )
     still = np.flatnonzero(is_still)
     moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
-    runs = np.split(still, np.flatnonzero(moved) + 1)
-    if len(runs) < _FEWEST_STOPS:
-        chosen = evenly(count, _MOST_FRAMES)
-        return chosen, f"{len(chosen)} of {count} frames are views, of a motion without stops."
-    chosen = np.array([run[len(run) // 2] for run in runs])
-    return chosen, f"{len(chosen)} of {count} frames are views, one a stop of the arm."
+    return frames_to_take(at, still, moved, _MOST_FRAMES)
 
 
 def _starts(
