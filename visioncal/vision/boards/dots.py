@@ -193,13 +193,12 @@ class Dots(PointsKind, Board):
         large, radii = _large(target), _radii_m(target)
         unlike = np.abs(np.log(ratios * np.median(radii) / radii[large].mean()))
         tried = np.argsort(unlike)[:_TRIED]
+        large_places = _round_about(places[large])
         best, most, predicted = np.zeros((0, 2), int), 0, np.zeros((0, 2))
         for chosen in combinations(tried[unlike[tried] < _UNLIKE].tolist(), _LARGE):
             px = _round_about(blobs.px[list(chosen)])
             for turn in range(_LARGE):
-                flat = cv2.getPerspectiveTransform(
-                    _round_about(places[large]), np.roll(px, turn, axis=0)
-                )
+                flat = cv2.getPerspectiveTransform(large_places, np.roll(px, turn, axis=0))
                 pairs = _matched(_mapped(np.asarray(flat, float), places), tree)
                 if len(pairs) > most:
                     best, most = pairs, len(pairs)
