@@ -114,10 +114,10 @@ class DynamicsLimits:
 
 # Fewest views, or stops, that determine a frame: turns about two axes take three of them.
 FEWEST_VIEWS = 3
-# Fewest stops, or rows, of which a majority tells which are wrong.
+# Fewest stops, or rows, in which a majority identifies outliers.
 FEWEST_COMPARED = 5
-# Fewest stops whose residuals tell an error from noise: fewer leave hardly more of them than edges
-# and noise have parameters.
+# Fewest stops whose residuals separate an error from noise: fewer leave hardly more of them than
+# edges and noise have parameters.
 FEWEST_STOPS = 6
 # Ratio of residuals from which on the smaller is clearly better.
 CLEAR_RATIO = 3.0

@@ -193,7 +193,7 @@ _OF_LENS = "it goes with the lens of that calibration, and with no other"
 # Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the
 # base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
-# Fields of a selection that say which part of a cell is meant, and those of any transform.
+# Fields of a selection that select a part of a cell, and those of any transform.
 _PARTS, OF_TRANSFORMS = ("camera", "robot", "target"), ("edge", "inverse", "parent", "child")
 _OPTIONS = {"load": "--mass-kg and --cog-mm", "calibration_hash": "--hash"}
 _T = TypeVar("_T")

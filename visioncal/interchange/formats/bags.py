@@ -77,7 +77,7 @@ class _Images:
 
 @dataclass(frozen=True, eq=False)
 class _Contents:
-    """All that a bag says of one cell, by topic; images by their times alone."""
+    """What a bag holds of one cell, by topic; of images their timestamps alone."""
 
     images: dict[str, _Images] = field(default_factory=dict)
     lenses: dict[str, Any] = field(default_factory=dict)  # The first CameraInfo.
@@ -489,7 +489,7 @@ def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, Floa
             next_step="Name the base and the tip of the arm: --robot-columns base_link,tool0",
         )
     tracks = {edge: Trajectory(*_rows(contents.moving[edge])) for edge in moving}
-    # The times of the frame that is told least often; the others are interpolated.
+    # Timestamps of the least frequent transform; the others are interpolated.
     at_s = min((track.stamps_s for track in tracks.values()), key=len)
     at_s = at_s[np.all([track.covers(at_s) for track in tracks.values()], axis=0)]
 

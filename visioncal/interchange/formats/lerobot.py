@@ -152,7 +152,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         notes.append(f"Robot type {kind!r} is no built-in arm: name its model with --robot-model.")
     notes += [
         how,
-        f"The camera {key} is taken to be mounted {mount}, by its name; --mount says it.",
+        f"The camera {key} is assumed to be mounted {mount}, by its name; --mount overrides it.",
     ]
     return ForeignRecording(
         name=source.resolve().name,

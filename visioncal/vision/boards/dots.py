@@ -1,4 +1,4 @@
-"""Boards of random dots, known by a table; four larger ones tell which is which."""
+"""Boards of random dots, listed in a table; four larger dots give the correspondences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

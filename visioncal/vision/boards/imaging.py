@@ -46,7 +46,7 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     # Pillow reads the header and a PNG's checksums: OpenCV decodes past damage with wrong pixels.
     from PIL import Image as Pillow
 
-    # Of damage, which is said below, and of half as many pixels as are refused.
+    # Warnings of damage, which is reported below, and of half as many pixels as are refused.
     warnings.filterwarnings("ignore", module=r"PIL\.")
     try:
         with Pillow.open(io.BytesIO(data), formats=_FORMATS) as header:
