@@ -29,7 +29,8 @@ _HEADLINES = {
     "bad": "Bad: do not use",
 }
 # Commands of remedies.
-CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
+CALIBRATE, ADD_VIEWS = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add"
+PLAN = f"{ADD_VIEWS} 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"

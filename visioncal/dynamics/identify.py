@@ -190,7 +190,7 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
         for block in fit.blocks
     ]
     lag = Lag(lag_s, sigma, float(np.max(changes)))
-    # A torque that never changes tells nothing of a lag.
+    # A torque that never changes shows no lag.
     residual_shares = [
         np.divide(rms_of(residual, block.used), std, out=np.ones(len(std)), where=std > 0.0)
         for residual, block in zip(fit.residuals, fit.blocks, strict=True)

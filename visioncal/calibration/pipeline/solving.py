@@ -148,17 +148,20 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     Servo arms turn by a degree from stop to stop. Taken for noise of the targets, that attenuates
     the edges, since the robot's poses are then regressors without errors (Fuller 1987, 1.1).
     """
-    inliers, values = cell_fit.inlier_fit, []
+    inliers = cell_fit.inlier_fit
     of_flange = replace(inliers, problem=replace(inliers.problem, is_combined=False))
     if len(of_flange.problem.units[1]) < len(of_flange.problem):
-        # Several observations of one stop tell both noises apart, but not in one level.
+        # Several observations of one stop separate both noises, but not as one level.
         return cell_fit
     of_flange = of_flange.refitted()
     other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
-    for found in (cell_fit.inlier_fit, other.inlier_fit):
+
+    def misfit(found: InlierFit) -> float:
+        """Negative log-likelihood of the same observations."""
         part, fit = found.problem.subset(inliers.used), found.fit
-        values.append(robot_likelihood(part, fit.state, fit.noise).white[1])
-    return other if values[0] - values[1] > CONTRADICTION else cell_fit
+        return robot_likelihood(part, fit.state, fit.noise).white[1]
+
+    return other if misfit(inliers) - misfit(other.inlier_fit) > CONTRADICTION else cell_fit
 
 
 def _without_misreported(
@@ -426,7 +429,7 @@ def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: InlierFi
 
 
 def _with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], problem: Problem) -> Problem:
-    """The problem with a noise level of each camera; itself where these cannot be told apart."""
+    """The problem with a noise level of each camera; itself where they cannot be separated."""
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
     # once a stop, that is part of the robot's noise.

@@ -39,7 +39,7 @@ def without_repeats(seen: T) -> T:
     try:
         repeated = repeated_rows(seen.timed, seen.corners)
     except DataError:
-        # Where the robot is cannot be told yet, and whether it is where it was neither.
+        # The robot's poses are not known yet, and so not which of them are repeated.
         return seen
     if not repeated:
         return seen

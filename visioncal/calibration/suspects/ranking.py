@@ -37,7 +37,7 @@ from visioncal.core.finding_kinds import (
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Need
-from visioncal.core.verdict import CALIBRATE, PLAN, REVIEW, Finding, Remedy, Verdict
+from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy, Verdict
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import NeedMet
 
@@ -108,7 +108,7 @@ def correcting(need: Need | None) -> Remedy:
 def add_views_remedy(words: str, *, modelled: bool, purpose: str = "", count: int = 5) -> Remedy:
     """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
     if modelled:
-        return Remedy(words, f"{PLAN.removesuffix('5')}{count}{purpose}")
+        return Remedy(words, f"{ADD_VIEWS} {count}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
     return Remedy(f"{words} {model}")
 
