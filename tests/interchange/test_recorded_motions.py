@@ -1,14 +1,17 @@
 """Bags of ROS and data sets of LeRobot become sessions that calibrate to the same."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support.bags import FORMS, BagOptions, write_bag
-from support.lerobot import write_dataset
+from support.lerobot import KEY, write_dataset
 
 from visioncal import calibrate
 from visioncal.calibration.stages.motion import motion_of
@@ -130,6 +133,24 @@ def test_a_data_set_of_lerobot_calibrates(version, source, rendered, tmp_path):
     meant = calibrate(source, level="hand-eye").transforms["flange_from_cam"]
     # A video's compression moves corners by some hundredths of a pixel.
     assert pose_difference(transform.as_matrix(), meant.as_matrix())[0] < 0.5
+
+
+def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, tmp_path):
+    path = write_dataset(tmp_path / "set", source, rendered, "v2.1", "ur10e")
+    info = json.loads((path / "meta" / "info.json").read_text())
+    info["features"][KEY] = {"dtype": "image"}
+    (path / "meta" / "info.json").write_text(json.dumps(info))
+    file = next((path / "data").rglob("*.parquet"))
+    table, image = pq.read_table(file), rendered / source.views[0].image
+    for folder, name in ((path, "frame.png"), (tmp_path, "../frame.png")):
+        shutil.copy(image, folder / "frame.png")
+        cells = [{"bytes": None, "path": name}] * len(table)
+        pq.write_table(table.append_column(KEY, pa.array(cells)), file)
+        if folder == path:
+            session = convert(path, tmp_path / "out", requested=BOARD)
+            assert session.images.read(session.views[0].image) == image.read_bytes()
+    with pytest.raises(DataError, match="leaves the folder"):
+        convert(path, tmp_path / "none", requested=BOARD)
 
 
 def test_a_data_set_without_its_large_files_is_refused(source, rendered, tmp_path):

@@ -16,7 +16,7 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents.jsons import parse_json
 from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_bytes, read_text
+from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.interchange.formats.file_search import path_inside
@@ -142,8 +142,9 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             places[path.as_posix()] = file, first + int(rows["frame_index"][at])
         else:
             cell = rows[key][at]
-            named = source / str(cell.get("path")) if not cell.get("bytes") else None
-            places[path.as_posix()] = cell["bytes"] if named is None else read_bytes(named, 10**8)
+            places[path.as_posix()] = cell.get("bytes") or read_bytes(
+                path_inside(source, str(cell.get("path"))), MOST_IMAGE_BYTES
+            )
     kind = str(info.get("robot_type")).lower()
     arms = {name: name for name in robot_names()} | _ARMS
     arm = next((arms[word] for word in sorted(arms, key=len, reverse=True) if word in kind), None)
