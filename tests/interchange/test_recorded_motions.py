@@ -74,6 +74,11 @@ def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
     assert list(session.cameras) == ["left_camera", "right_camera"]
     only = replace(BOARD, image="/left/camera/image_raw/compressed")
     assert not convert(path, tmp_path / "one", requested=only).declaration.cameras
+    unknown = convert(path, tmp_path / "lens", requested=replace(BOARD, intrinsics="estimate"))
+    assert all(one.matrix is None for one in unknown.declaration.cameras.values())
+    with pytest.raises(DataError, match="several cameras") as caught:
+        convert(path, tmp_path / "none", requested=replace(BOARD, resolution=(1280, 800)))
+    assert "--image-key" in caught.value.next_step
 
 
 @pytest.mark.parametrize(

@@ -63,15 +63,30 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
     if requested.robot_model is not None:
         tip = {} if requested.tip is None else {"tip": requested.tip}
         foreign = replace(foreign, arm={"model": requested.robot_model} | tip)
-    lens, notes = dict(foreign.lens or {}), foreign.notes
+    lens, lenses, notes = dict(foreign.lens or {}), foreign.lenses, foreign.notes
+    is_of_one = requested.intrinsics not in (None, "estimate") or requested.resolution is not None
+    if lenses and is_of_one:
+        raise DataError(
+            f"{foreign.name} has several cameras ({', '.join(lenses)}), and --intrinsics FILE and "
+            "--resolution are of one.",
+            culprits=["--intrinsics", "--resolution"],
+            next_step="Name one camera with --image-key, or convert without these options and "
+            "write them into [cameras] of session.toml.",
+        )
     if requested.intrinsics == "estimate":
-        lens = {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
+        lens = _to_estimate(lens)
+        lenses = {name: _to_estimate(one) for name, one in lenses.items()}
     elif requested.intrinsics is not None:
         lens, lens_notes = read_intrinsics(Path(requested.intrinsics))
         notes = (*notes, *lens_notes)
     if requested.resolution is not None:
         lens["resolution"] = list(requested.resolution)
-    return replace(foreign, lens=lens or None, notes=notes)
+    return replace(foreign, lens=lens or None, lenses=lenses, notes=notes)
+
+
+def _to_estimate(lens: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a camera whose intrinsics are estimated."""
+    return {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
 
 
 def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Session:
