@@ -149,11 +149,16 @@ def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, 
     table, image = pq.read_table(file), rendered / source.views[0].image
     for folder, name in ((path, "frame.png"), (tmp_path, "../frame.png")):
         shutil.copy(image, folder / "frame.png")
-        cells = [{"bytes": None, "path": name}] * len(table)
-        pq.write_table(table.append_column(KEY, pa.array(cells)), file)
+        later = (rendered / source.views[-1].image).read_bytes()
+        cells = [{"bytes": None, "path": name}] * 40 + [{"bytes": later}] * (len(table) - 40)
+        whole = table.append_column(KEY, pa.array(cells))
+        # In two files, as the rows of a data set of several episodes.
+        pq.write_table(whole[:40], file)
+        pq.write_table(whole[40:], file.with_name("episode_000001.parquet"))
         if folder == path:
             session = convert(path, tmp_path / "out", requested=BOARD)
             assert session.images.read(session.views[0].image) == image.read_bytes()
+            assert session.images.read(session.views[-1].image) == later
     with pytest.raises(DataError, match="leaves the folder"):
         convert(path, tmp_path / "none", requested=BOARD)
 

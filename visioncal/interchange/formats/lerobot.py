@@ -77,8 +77,8 @@ def _info(path: Path) -> Path:
     return path / "meta" / "info.json"
 
 
-def _parquet(path: Path, columns: list[str] | None = None) -> dict[str, list[Any]]:
-    """The columns of a parquet file.
+def _parquet(path: Path, columns: list[str], rows: IntArray | None = None) -> dict[str, list[Any]]:
+    """The columns of a parquet file, of some rows or of all.
 
     Raises:
         DataError: The extra is not installed, or the file cannot be read.
@@ -93,7 +93,10 @@ def _parquet(path: Path, columns: list[str] | None = None) -> dict[str, list[Any
             next_step="Install it: pip install 'visioncal[lerobot]'",
         ) from error
     try:
-        columns_read: dict[str, list[Any]] = read_table(path, columns=columns).to_pydict()
+        table = read_table(path, columns=columns)
+        if rows is not None:
+            table = table.take(rows)
+        columns_read: dict[str, list[Any]] = table.to_pydict()
     except (ArrowException, OSError, ValueError) as error:
         raise DataError(
             f"{path} cannot be read as parquet: {error}.",
@@ -117,13 +120,15 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         )
     state = (*requested.joints, _STATE)[0]
     is_video = mapping(features[key], key).get("dtype") == "video"
-    columns = [state, "timestamp", "frame_index", "episode_index", *([] if is_video else [key])]
+    columns = [state, "timestamp", "frame_index", "episode_index"]
     files = sorted((source / "data").glob("chunk-*/*.parquet"))
     rows: dict[str, list[Any]] = {name: [] for name in columns}
+    ends = []
     for file in files:
         for name, cells in _parquet(file, columns).items():
             rows[name] += cells
-    if not rows[columns[0]]:
+        ends.append(len(rows[state]))
+    if not rows[state]:
         raise DataError(
             f"{source}/data has no rows of {state}.",
             culprits=[state],
@@ -135,13 +140,20 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     chosen, how = _chosen(joints, episodes, fps)
     paths = tuple(Path(f"images/{at:06d}.png") for at in chosen.tolist())
     places: dict[str, tuple[Path, int] | bytes] = {}
-    starts = {} if not is_video else _starts(source, info, key, fps)
-    for path, at in zip(paths, chosen.tolist(), strict=True):
-        if is_video:
+    if is_video:
+        starts = _starts(source, info, key, fps)
+        for path, at in zip(paths, chosen.tolist(), strict=True):
             file, first = starts[int(episodes[at])]
             places[path.as_posix()] = file, first + int(rows["frame_index"][at])
-        else:
-            cell = rows[key][at]
+    else:
+        # Of the chosen rows only: all images may take more memory than there is.
+        parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+        cells = [
+            cell
+            for file, first, part in zip(files, [0, *ends], parts, strict=False)
+            for cell in (_parquet(file, [key], part - first)[key] if len(part) else [])
+        ]
+        for path, cell in zip(paths, cells, strict=True):
             places[path.as_posix()] = cell.get("bytes") or read_bytes(
                 path_inside(source, str(cell.get("path"))), MOST_IMAGE_BYTES
             )
