@@ -27,6 +27,7 @@ from visioncal.cli.dynamics_options import (
     DynamicsValidateOptions,
     StreamOptions,
 )
+from visioncal.cli.parsing import numbers_in
 from visioncal.cli.plan import boxes_of, floor_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
@@ -190,13 +191,7 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
 
 def _requested(streams: StreamOptions) -> IdentificationRequest:
     """The request for an identification."""
-    try:
-        gains = tuple(float(part) for part in streams.gains.split(",")) if streams.gains else ()
-    except ValueError as error:
-        raise DataError(
-            f"--gains is {streams.gains!r}; numbers with commas between are needed.",
-            culprits=["--gains"],
-        ) from error
+    gains = numbers_in(streams.gains, "--gains") if streams.gains else ()
     return IdentificationRequest(
         tuple(streams.stream or ()),
         cutoff_hz=streams.cutoff_hz,

@@ -17,10 +17,10 @@ FORMS = (
 )
 
 
-def numbers_in(words: str, option: str, form: str, scale: float = 1.0) -> tuple[float, ...]:
+def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> tuple[float, ...]:
     """Parses an option of numbers, such as `12.5,-3,0`, and multiplies them by `scale`.
 
-    `form` has their names, separated by commas: `x,y,z`.
+    `form` has their names, separated by commas, as `x,y,z`; empty for any number of them.
 
     Raises:
         DataError: It is not that many finite numbers.
@@ -29,9 +29,11 @@ def numbers_in(words: str, option: str, form: str, scale: float = 1.0) -> tuple[
         values = tuple(float(part) for part in words.split(","))
     except ValueError:
         values = ()
-    if len(values) != len(form.split(",")) or not all(map(math.isfinite, values)):
+    count = len(form.split(",")) if form else max(len(values), 1)
+    if len(values) != count or not all(map(math.isfinite, values)):
+        needed = f"{form} is needed, numbers" if form else "numbers are needed,"
         raise DataError(
-            f"{option} is {words[:80]!r}; {form} is needed, numbers with commas between.",
+            f"{option} is {words[:80]!r}; {needed} with commas between.",
             culprits=[option],
         )
     return tuple(scale * value for value in values)

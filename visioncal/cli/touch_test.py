@@ -69,9 +69,7 @@ def touch_test_command(options: TouchTestOptions) -> None:
     if options.gaps_mm is None:
         _report(points, targets, as_json=options.as_json)
         return
-    form = ",".join("abcdefghij"[: options.gaps_mm.count(",") + 1])
-    gaps = [*numbers_in(options.gaps_mm, "--gaps-mm", form)]
-    test = evaluate_gaps(points, gaps, touching)
+    test = evaluate_gaps(points, numbers_in(options.gaps_mm, "--gaps-mm"), touching)
     extended = replace(result, touch_test=test)
     written = rewrite_result(calibration if calibration.is_dir() else calibration.parent, extended)
     if options.as_json:
