@@ -186,6 +186,18 @@ def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
     assert np.sqrt(np.mean(error**2)) < 0.015
 
 
+def test_a_small_board_is_seen_among_larger_dark_things():
+    image, truth = photograph(EVEN, replace(CIRCLES_SHOT, square_px=20), 1)
+    scene = np.full((500, 900), 200, np.uint8)
+    scene[300 : 300 + len(image), 300 : 300 + image.shape[1]] = image
+    # Two dozen bars, at places of no lattice.
+    for number, height in enumerate(np.random.default_rng(1).integers(10, 200, 24)):
+        scene[height : height + 40, 20 + 36 * number : 36 + 36 * number] = 40
+    seen = find_target(scene, EVEN)
+    assert isinstance(seen, DetectedCorners), seen
+    np.testing.assert_allclose(numbered(seen, truth + 300), truth + 300, atol=0.1)
+
+
 @pytest.mark.parametrize("change", [{"columns": 5}, {"asymmetric": False}])
 def test_another_page_of_circles_is_refused(change):
     found = find_target(photograph(SHIFTED, CIRCLES_SHOT, 2)[0], replace(SHIFTED, **change))

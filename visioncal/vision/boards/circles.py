@@ -38,9 +38,10 @@ _SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
 _INNER = 0.5
 # Largest ratio of widths of neighbouring blobs, in any direction.
 _ALIKE = 1.6
-# Number of seed blobs; tolerance of predicted neighbours in steps; number of nearest blobs that are
-# candidates for the first steps.
-_SEEDS, _OFF, _NEAREST = 16, 0.3, 8
+# Number of seed blobs, and of those from which a lattice must grow before fewer than the most are
+# tried, as many blobs around a small board are larger than its circles; tolerance of predicted
+# neighbours in steps; number of nearest blobs that are candidates for the first steps.
+_SEEDS, _GROWN, _MOST_SEEDS, _OFF, _NEAREST = 16, 4, 400, 0.3, 8
 # Minimum number of blobs.
 _LEAST = 9
 # Transformations between bases of one lattice.
@@ -275,10 +276,14 @@ def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:
     """Largest set of points on one lattice: (n, 2) lattice coordinates, and point indices (n,)."""
     px, tree = blobs.px, cKDTree(blobs.px)
     best: dict[tuple[int, int], int] = {}
+    lattices = 0
     # Largest first: letters and scratches are smaller than a board's circles.
-    for seed in range(min(_SEEDS, len(px))):
+    for seed in range(min(_MOST_SEEDS, len(px))):
+        if seed >= _SEEDS and lattices >= _GROWN:
+            break
         steps = _first_steps(px, tree, seed)
         grown = _grown(blobs, tree, seed, steps) if steps is not None else {}
+        lattices += len(grown) >= _LEAST
         best = grown if len(grown) > len(best) else best
     return np.array(list(best), dtype=np.int64).reshape(-1, 2), np.array(list(best.values()), int)
 
