@@ -106,7 +106,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)
     cell_fit = _fit_with_inliers(initial, observed)
-    if cell_fit.inlier_fit.problem.is_combined:
+    if cell_fit.inlier_fit.problem.is_combined and not observed.scenes:
         cell_fit = _with_likelier_noise(cell_fit, observed)
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
@@ -153,8 +153,12 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     if len(of_flange.problem.units[1]) < len(of_flange.problem):
         # Several observations of one stop separate both noises, but not as one level.
         return cell_fit
-    of_flange = of_flange.refitted()
-    other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
+    try:
+        of_flange = of_flange.refitted()
+        other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
+    except (VisioncalError, np.linalg.LinAlgError):
+        # What no fit converges to is not likelier.
+        return cell_fit
 
     def misfit(found: InlierFit) -> float:
         """Negative log-likelihood of the same observations."""
