@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.advice import printed_commands
-from support.cells import known_of, session_of
+from support.cells import known_of, pairs_session, session_of
 from support.commands import visioncal as typed
 from support.foreign_samples import easy_handeye_file
 from support.fuzz.mistakes import (
@@ -61,8 +61,8 @@ from visioncal.robot import (
     read_robot_document,
     with_base,
 )
-from visioncal.session import MemoryImages, Session, View
-from visioncal.session.columns import POSE, pose_row
+from visioncal.session import Session, View
+from visioncal.session.columns import POSE
 from visioncal.simulation import (
     CellOptions,
     SimulatedCell,
@@ -607,21 +607,12 @@ def test_sound_poses_are_not_accused(world, mount):
         assert "cannot distinguish readings" in guess.sentence
 
 
-def pairs_session(poses):
-    """A session of the poses as they are told."""
-    rows = [
-        [str(at), *(repr(value) for pose in pair for value in pose_row(pose).values())]
-        for at, pair in enumerate(zip(poses.robot.poses(), poses.camera.poses(), strict=True))
-    ]
-    document = {"schema": 1, "name": "pairs", "mount": poses.mount}
-    columns = ("view", *POSE, *(f"cft_{name}" for name in POSE))
-    return Session.assemble(document, columns, rows, MemoryImages({}))
-
-
 @pytest.mark.parametrize("name", [slow("board's size in mm"), "the other mount"])
 def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    pairs_session(plant(name, cell_poses())).save(Path("my cell"))
+    planted = plant(name, cell_poses())
+    told, seen = planted.robot.poses(), planted.camera.poses()
+    pairs_session(planted.mount, told, seen).save(Path("my cell"))
     done = typed("calibrate", "my cell", "-o", "out")
     assert done.status == 3, done.err
     first = done.said.split("What to do next:")[1].splitlines()[2].strip()
@@ -653,7 +644,7 @@ def test_what_was_never_recorded_is_named(lost, mount):
         told[:, :3, :3] = np.eye(3)
     if lost == "poses":
         told[:] = told[0]
-    session = pairs_session(replace(poses, robot=numbers(told)))
+    session = pairs_session(mount, told, poses.camera.poses())
     one_place = "all rows have one position of the robot"
     if lost == "positions":
         verdict = visioncal.calibrate(session).verdict

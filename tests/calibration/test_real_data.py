@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
+from support.cells import pairs_session
 from support.fuzz.mistakes import numbers
 from support.tracked import known_of
 
@@ -23,7 +24,6 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats import DoubtfulSession
 from visioncal.robot import read_robot_document
 from visioncal.session import MemoryImages, Session
-from visioncal.session.columns import POSE, pose_row
 
 # What is not stated of these instruments is taken as usual for their kind.
 MEASURING_ARM, LASER = {"sigma_m": 6e-5}, {"sigma_m": 2e-5, "sigma_rad": 1e-4}
@@ -232,17 +232,6 @@ def test_a_humanoid_by_contacts(real_data):
     assert np.median(away) < 0.95
     # Its joints hardly moved: the method says that this arm is not known elsewhere.
     assert known.verdict.status != "good"
-
-
-def pairs_session(mount, base_from_flange, cam_from_target):
-    """A session of pose pairs, as its text would be read."""
-    rows = [
-        [str(at), *(repr(value) for pose in pair for value in pose_row(pose).values())]
-        for at, pair in enumerate(zip(base_from_flange, cam_from_target, strict=True))
-    ]
-    columns = ("view", *POSE, *(f"cft_{name}" for name in POSE))
-    document = {"schema": 1, "name": "pairs", "mount": mount}
-    return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
 def test_pose_pairs_with_a_published_answer(real_data):

@@ -14,8 +14,8 @@ from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.robot import Robot, load_robot
-from visioncal.session import Session
-from visioncal.session.columns import POSE
+from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, SimulatedCell, cell_session
 
 
@@ -35,6 +35,17 @@ def session_of(cell: SimulatedCell) -> Session:
         session.images,
         target_document=session.target_document,
     )
+
+
+def pairs_session(mount: str, base_from_flange: np.ndarray, cam_from_target: np.ndarray) -> Session:
+    """A session of measured pairs of poses, each (m, 4, 4), as its text would be read."""
+    rows = [
+        [str(at), *(repr(value) for pose in pair for value in pose_row(pose).values())]
+        for at, pair in enumerate(zip(base_from_flange, cam_from_target, strict=True))
+    ]
+    columns = ("view", *POSE, *(f"cft_{name}" for name in POSE))
+    document = {"schema": 1, "name": "pairs", "mount": mount}
+    return Session.assemble(document, columns, rows, MemoryImages({}))
 
 
 def arm_found(known: RunState) -> ArmReport:
