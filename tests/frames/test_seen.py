@@ -10,7 +10,7 @@ from support.cells import exact
 from support.imaged import Shot, calibrated_cell, session_of, shots
 from support.marks import slow
 from support.picks import Stand, calibration_of, really, seen_corners
-from support.plates import CENTRES, CLEAR, looking, marked_plate, plate_session
+from support.plates import CLEAR, looking, marked_plate, plate_session
 from support.refusals import raised
 
 from visioncal.core.errors import DataError
@@ -18,11 +18,9 @@ from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.transforms import compose, exp, invert, log, skew
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera
-from visioncal.frames.fixture_from_markers import fixture_from_marker_images, measure_markers
 from visioncal.frames.frame_from_images import depends_on_camera, seen_frame
 from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.frames.target_pose import Sight, candidate_places, place_seen
-from visioncal.frames.touches import NominalPoints
 from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
@@ -205,29 +203,6 @@ def test_a_symmetric_board_may_be_turned(cell):
     assert any("the same when it is turned" in warning for warning in found.warnings)
     # The first image's numbering is kept.
     assert 1e3 * np.linalg.norm((invert(place) @ found.matrix)[:3, 3]) < 3.0
-
-
-@pytest.fixture(scope="module")
-def marked():
-    return marked_plate()
-
-
-def test_markers_are_measured_points_with_a_common_part(marked):
-    calibration, base_from_plate, sights = marked
-    found = measure_markers(calibration, sights, list(CENTRES), "DICT_5X5_100", 0.04, sigma_px=0.1)
-    assert found.names == ("0", "7", "21", "30")
-    assert found.seen_in == (4, 4, 4, 4)
-    on_plate = np.array([[x, y, 0.0] for x, y in CENTRES.values()])
-    true = on_plate @ base_from_plate[:3, :3].T + base_from_plate[:3, 3]
-    error = (found.points - true).ravel()
-    assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
-    # Twelve degrees of freedom; the calibration's own error is left out here, and counts.
-    assert error @ np.linalg.solve(found.covariance, error) < 12 * 3
-    assert 1e3 * np.abs(error).max() < 0.5
-    # The robot and the camera move all markers alike: neighbours are correlated.
-    assert found.common[:3, 3:6].trace() > 0.3 * found.common[:3, :3].trace()
-    fewer = measure_markers(calibration, sights[:1], [7], "DICT_5X5_100", 0.04, sigma_px=0.1)
-    assert np.trace(fewer.independent[0]) > np.trace(found.independent[1])
 
 
 VIEWS = 5
@@ -418,46 +393,12 @@ def test_doubts_of_calibration_and_sigma_are_told():
     assert "more images do not" in frame.verdict.reasons[0]
 
 
-@pytest.fixture(scope="module")
-def plate():
-    return marked_plate()
-
-
-def drawing(places):
-    positions = np.array([[x, y, 0.0] for x, y in places.values()])
-    return NominalPoints("plate.csv", tuple(map(str, places)), positions, np.zeros(len(places)))
-
-
-def test_markers_place_a_fixture_by_its_drawing(plate):
-    calibration, base_from_plate, sights = plate
-    spare = {**CENTRES, 44: (0.0, 0.2)}
-    frame = fixture_from_marker_images(plate_session(sights), calibration, drawing(spare))
+def test_markers_on_a_plate_are_one_target():
+    calibration, base_from_plate, sights = marked_plate()
+    frame = seen_frame(plate_session(sights), calibration, "fixture")
     error = log(invert(base_from_plate) @ frame.edge.matrix)
     # Six degrees of freedom at 99.9 %: 22.5. The calibration's own error is left out here.
     assert error @ np.linalg.solve(frame.edge.covariance, error) < 22.5
-    assert {observation.name for observation in frame.observations} == {"0", "7", "21", "30"}
-    assert frame.details["spare_points"] == ["44"]
-    assert frame.details["seen_in"] == {"0": 4, "7": 4, "21": 4, "30": 4}
+    assert 1e3 * np.linalg.norm(error[3:]) < 0.3
     assert depends_on_camera(frame)
-    assert "4 points to plate.csv" in frame.method
-    # What the markers share does not fall out of a fit to them.
-    common = calibration.edges["flange_from_cam"].sigma_mm
-    assert frame.edge.sigma_mm > 0.5 * common
-
-
-def test_markers_that_do_not_fit_are_named(plate):
-    calibration, _, sights = plate
-    session = plate_session(sights)
-    places = list(CENTRES.values())
-    swapped = dict(zip(CENTRES, [places[1], places[0], *places[2:]], strict=True))
-    with pytest.raises(DataError, match=r"in another order to .*0.*7"):
-        fixture_from_marker_images(session, calibration, drawing(swapped))
-    strangers = {0: places[0], 7: places[1], 50: (0.0, 0.0), 51: (0.1, 0.1)}
-    with pytest.raises(DataError, match=r"2 drawn markers .*\(0, 7\).* not drawn \(21, 30\)"):
-        fixture_from_marker_images(session, calibration, drawing(strangers))
-    named = replace(drawing(CENTRES), names=("0", "7", "21", "hole"))
-    with pytest.raises(DataError, match="point 'hole' is no marker's id"):
-        fixture_from_marker_images(session, calibration, named)
-    board = {"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.03}
-    with pytest.raises(DataError, match="a checkerboard; beside a drawing"):
-        fixture_from_marker_images(plate_session(sights, board), calibration, drawing(CENTRES))
+    assert "seen in 4 images" in frame.method

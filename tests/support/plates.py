@@ -51,8 +51,8 @@ def marked_plate() -> tuple[Calibration, FloatArray, list[Sight]]:
     return calibration, base_from_plate, sights
 
 
-def plate_session(sights: Sequence[Sight], target: dict | None = None) -> Session:
-    """The session of a plate's pictures; its target is one of the markers."""
+def plate_session(sights: Sequence[Sight]) -> Session:
+    """The session of a plate's pictures; its target is a table of the markers' corners."""
     rows = []
     for at, sight in enumerate(sights):
         pose = sight.base_from_flange
@@ -66,16 +66,26 @@ def plate_session(sights: Sequence[Sight], target: dict | None = None) -> Sessio
         "schema": 1,
         "name": "plate",
         "mount": "eye-in-hand",
-        "target": "one.toml",
+        "target": "plate.toml",
         "camera": {},
     }
-    marker = {"kind": "marker", "id": 7, "size_m": SIZE_M, "dictionary": DICTIONARY}
+    corners = [
+        (tag, corner, x + SIZE_M / 2 * along, y + SIZE_M / 2 * across)
+        for tag, (x, y) in CENTRES.items()
+        for corner, (along, across) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    ]
+    tag, corner, x_m, y_m = map(list, zip(*corners, strict=True))
+    points = {"point": [*range(len(tag))], "x_m": x_m, "y_m": y_m, "z_m": [0.0] * len(tag)}
     return Session.assemble(
         document,
         ("view", "image", *POSE),
         rows,
         MemoryImages(files),
-        target_document=target or marker,
+        target_document={
+            "kind": "points",
+            "points": points | {"tag": tag, "corner": corner},
+            "dictionary": DICTIONARY,
+        },
     )
 
 

@@ -17,11 +17,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.frames.fixture import touched_fixture
-from visioncal.frames.fixture_from_markers import fixture_from_marker_images
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.frames.tcp import touched_tool
-from visioncal.frames.touches import NO_TOOL, NominalPoints, Tool
+from visioncal.frames.touches import NO_TOOL, Tool
 from visioncal.interchange.formats.touches import read_nominal, read_touches, robots_of
 from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result, load_result_or_frames, rewrite_result
@@ -169,7 +168,7 @@ def place_frame(
     kind: FrameKind,
     request: TcpOptions | FixtureOptions,
     by_touches: Callable[[Path, Calibration | None], Frame],
-    drawing: NominalPoints | None = None,
+    cad: Path | None = None,
     tool: str | None = None,
 ) -> None:
     """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
@@ -178,7 +177,7 @@ def place_frame(
         kind: Whether it is a tool or a fixture.
         request: The options.
         by_touches: Places it by the touches of a file, given the calibration if there is one.
-        drawing: Points or markers on a fixture; None where none are given.
+        cad: Table of a drawing's points; None where none is given.
         tool: The tool that touched a fixture, as typed.
 
     Raises:
@@ -193,7 +192,7 @@ def place_frame(
             culprits=["TOUCHES"],
             next_step=f"Name them: visioncal {command} TOUCHES -c OUT.",
         )
-    session = _image_session(source, {"--tool": tool, **request.written.given()})
+    session = _image_session(source, {"--cad": cad, "--tool": tool, **request.written.given()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": request.point}, f"touches say where {origin} is")
@@ -213,7 +212,11 @@ def place_frame(
                 culprits=["-c"],
                 next_step="Name the output folder of visioncal calibrate.",
             )
-        frame = _by_images(kind, request, session, location.calibration, drawing)
+        if has_several(session):
+            session = select(session, part.choice, robot_between=False)
+        point_m = np.array(request.point or np.zeros(3))
+        with shown_progress(quiet=request.as_json) as progress:
+            frame = seen_frame(session, location.calibration, kind, point_m, progress=progress)
     keep_and_report(location, frame, source, as_json=request.as_json)
 
 
@@ -235,26 +238,6 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session |
         )
     refuse_given(for_touches, f"session {session.name!r} has images, and this is for touches")
     return session
-
-
-def _by_images(
-    kind: FrameKind,
-    request: TcpOptions | FixtureOptions,
-    session: Session,
-    calibration: Calibration,
-    drawing: NominalPoints | None,
-) -> Frame:
-
-    if has_several(session):
-        session = select(session, request.part.choice, robot_between=False)
-    if drawing is not None:
-        refuse_given(
-            {"--point-mm": request.point}, "beside --cad the drawing's origin is the frame's"
-        )
-        return fixture_from_marker_images(session, calibration, drawing)
-    with shown_progress(quiet=request.as_json) as progress:
-        point_m = np.array(request.point or np.zeros(3))
-        return seen_frame(session, calibration, kind, point_m, progress=progress)
 
 
 def tcp_command(options: TcpOptions) -> None:
@@ -279,7 +262,7 @@ def fixture_command(options: FixtureOptions) -> None:
         noise_m, model = written.noise_m, _model(written)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
-    place_frame("fixture", options, by_touches, drawing, options.tool)
+    place_frame("fixture", options, by_touches, options.cad, options.tool)
 
 
 def _model(written: TouchOptions) -> Robot | None:

@@ -346,9 +346,9 @@ class FixtureOptions:
 
     A touch of kind origin is at the fixture's origin; of kind x, on its positive x axis; of kind
     xy, in its xy plane on the side of positive y: one of each at least. With --cad, three points or
-    more that the drawing has, by their names. In images a target on the fixture gives its frame, or
-    with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
-    the reason given; 3: the fixture is bad, and joins no calibration.
+    more that the drawing has, by their names. In images a target on the fixture gives its frame, by
+    the camera that -c names. Exit status 2: nothing was written, for the reason given; 3: the
+    fixture is bad, and joins no calibration.
     """
 
     goes: FrameOptions

@@ -40,6 +40,7 @@ from visioncal.robot import Robot
 # End of the reason of an outlier that fits by another name, and its remedy.
 RENAMED = ": is its name exchanged?"
 _RENAME = "Correct the names of what is named; where they are right, touch it once more."
+_TOUCH_AGAIN = "Touch what is named once more, and write the new poses in its rows."
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
@@ -71,29 +72,8 @@ def sigma_findings(
 
 
 @dataclass(frozen=True)
-class Words:
-    """Wording of messages for one way of measuring points."""
-
-    things: str = "touches"  # What the measurements are called.
-    # Advice for outliers, as a sentence.
-    again: str = "Touch what is named once more, and write the new poses in its rows."
-    # Advice for noisy measurements, as a sentence.
-    noisy: str = (
-        "Touch again with a sharp tip, and check the tool; an arm that was never calibrated is "
-        "off by a millimetre from posture to posture."
-    )
-    # Advice for a poorly determined direction, as a sentence.
-    weak: str = (
-        "Touch points that are farther apart, or more of them; a tip that is known better "
-        "helps where all touches share its error."
-    )
-    # Side that they were measured from, behind the words `the side that`.
-    side: str = "the tool came from"
-
-
-@dataclass(frozen=True)
 class FitSettings:
-    """Noise, limits and wording of a frame's fit."""
+    """Noise, limits and advice of a frame's fit."""
 
     # Known repeatability of a touch, per axis [m]; None where unknown.
     touch_noise_m: float | None = None
@@ -103,9 +83,16 @@ class FitSettings:
     options: FixtureLimits | ToolLimits = field(
         default_factory=FixtureLimits
     )  # Limits of the verdict.
-    words: Words = field(default_factory=Words)  # Wording for the kind of measurement.
-    # Assumed noise where it is unknown and points are few [m].
-    assumed_noise_m: float = TOUCH_NOISE_M
+    # Advice for noisy touches, as a sentence.
+    noisy: str = (
+        "Touch again with a sharp tip, and check the tool; an arm that was never calibrated is "
+        "off by a millimetre from posture to posture."
+    )
+    # Advice for a poorly determined direction, as a sentence.
+    weak: str = (
+        "Touch points that are farther apart, or more of them; a tip that is known better "
+        "helps where all touches share its error."
+    )
 
     @property
     def fewest(self) -> int:
@@ -116,7 +103,7 @@ class FitSettings:
     @property
     def expected_m(self) -> float:
         """Expected repeatability of a touch, per axis [m]."""
-        return self.assumed_noise_m if self.touch_noise_m is None else self.touch_noise_m
+        return TOUCH_NOISE_M if self.touch_noise_m is None else self.touch_noise_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +146,7 @@ class PointsFit:
 
     def findings(self, setting: FitSettings) -> Iterator[Finding]:
         """Findings on outliers and contradictions, the noise, and what is poorly determined."""
-        wording, reasons = setting.words, self.reasons
+        reasons = self.reasons
         names = [
             f"{name} ({place})" if place else name
             for name, place in zip(self.names, self.places, strict=True)
@@ -167,32 +154,32 @@ class PointsFit:
         for at in np.flatnonzero(~self.agrees).tolist():
             renamed = reasons[at].endswith(RENAMED)
             words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
-            yield Finding("left_out", words, Remedy(_RENAME if renamed else wording.again, AGAIN))
+            yield Finding("left_out", words, Remedy(_RENAME if renamed else _TOUCH_AGAIN, AGAIN))
         if self.agreement.doubtful.any():
             some = some_of([names[at] for at in np.flatnonzero(self.agreement.doubtful).tolist()])
             words = f"{some} contradict each other, and which is wrong is not known: all are used."
-            yield Finding("contradicting", words, Remedy(wording.again))
+            yield Finding("contradicting", words, Remedy(_TOUCH_AGAIN))
         noise_mm, (check, bad) = 1e3 * self.noise_m, setting.options.noise_mm
         if noise_mm > check:
             yield Finding(
                 "noise",
-                f"The {wording.things} agree to {figure(noise_mm)} mm only (per axis; doubt begins "
-                f"at {check:g}).",
-                Remedy(wording.noisy),
+                f"The touches agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
+                f"{check:g}).",
+                Remedy(setting.noisy),
                 is_fatal=noise_mm > bad,
             )
         elif not self.agreement.explained:
             yield Finding(
                 "noise",
-                f"The {wording.things} scatter by more than they are stated to, without one that "
-                f"stands out: {figure(noise_mm)} mm per axis.",
+                "The touches scatter by more than they are stated to, without one that stands out: "
+                f"{figure(noise_mm)} mm per axis.",
                 Remedy(
                     "Repeat them, or state the noise as it is.",
                     f"{AGAIN} --touch-noise-mm {noise_mm:.2g}",
                 ),
             )
         limits = setting.options
-        yield from sigma_findings(self.worst, limits.sigma_mm, limits.sigma_deg, wording.weak)
+        yield from sigma_findings(self.worst, limits.sigma_mm, limits.sigma_deg, setting.weak)
 
     def frame(
         self, method: str, more: Sequence[Finding], details: Mapping[str, Any], setting: FitSettings
@@ -209,9 +196,9 @@ class PointsFit:
             for direction in self.worst[1:]
         )
         praise = (
-            f"{int(self.agrees.sum())} {setting.words.things} agree to "
-            f"{figure(1e3 * self.noise_m)} mm per axis, and {offset.words}, the worst direction, "
-            f"is known to {figure(1e3 * offset.sigma)} mm{rotation}."
+            f"{int(self.agrees.sum())} touches agree to {figure(1e3 * self.noise_m)} mm per axis, "
+            f"and {offset.words}, the worst direction, is known to "
+            f"{figure(1e3 * offset.sigma)} mm{rotation}."
         )
         if not self.oriented:
             praise += " The rotation was not touched: it is the flange's own."
@@ -393,7 +380,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
         fit.agreement, pairs, measured, [causes[label] for label in pairs.labels], centre, setting
     )
     count = len(set(pairs.labels))
-    several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
+    several = f"{len(measured)} touches of " if count < len(measured) else ""
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
     share = "" if used == count else f"{used} of "
     spare = {"spare_points": list(pairs.spare_labels)} if pairs.spare_labels else {}
@@ -443,8 +430,8 @@ def _drawing_findings(
         side = float(cosines.mean()) if abs(normal[2]) > _FLAT else 0.0
         if side < -_ASIDE:
             words = (
-                "and the fixture's z axis points away from the side that "
-                f"{setting.words.side}: a mirrored drawing looks like this."
+                "and the fixture's z axis points away from the side that the tool came from: a "
+                "mirrored drawing looks like this."
             )
             yield _mirrored(words, "Check that z of the drawing points into the part.")
         elif not side > _ASIDE:

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import detect, image_of
+from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
 from visioncal.calibration.verification.prediction import check_robot
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.types import Corners, FloatArray, Image, Progress, Rejection, Target
+from visioncal.core.types import FloatArray, Progress, Target
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
 from visioncal.frames.locate import Located, locate_target
 from visioncal.frames.target_pose import Parent, Sight, needs_robot
@@ -70,47 +70,12 @@ def detect_session_target(
     detected = detect(session, progress=progress, among=_usable(session, wanted, target, lost))
     lost |= {rejection.view: rejection.reason for rejection in detected.rejections}
     check_resolution(session, calibration, detected.resolution)
-    return _images(session, calibration, target, wanted, poses, lost, detected.corners)
-
-
-def session_images(
-    session: Session, calibration: Calibration, *, among: Sequence[View] | None = None
-) -> SessionImages:
-    """Reads a session's images for detecting several markers, one of which is its target.
-
-    As `detect_session_target` with the base as parent, but without detection.
-    """
-    target = _checked_target(session, calibration)
-    wanted = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, "base", wanted)
-    lost |= {view.number: _NO_IMAGE for view in wanted if not view.image}
-    images: dict[int, Image] = {}
-    for view in _usable(session, wanted, target, lost):
-        image = image_of(session, view)
-        if isinstance(image, Rejection):
-            lost[view.number] = image.reason
-            continue
-        check_resolution(session, calibration, (image.shape[1], image.shape[0]))
-        images[view.number] = image
-    return _images(session, calibration, target, wanted, poses, lost, images)
-
-
-def _images(
-    session: Session,
-    calibration: Calibration,
-    target: Target,
-    wanted: Sequence[View],
-    poses: Mapping[int, FloatArray],
-    lost: Mapping[int, str],
-    seen: Mapping[int, Corners] | Mapping[int, Image],
-) -> SessionImages:
-    """Collects the views that are not rejected, with warnings on the session."""
     views, sights = _usable(session, wanted, target, lost), []
     for view in views:
         pose = poses.get(view.number)
         joints_rad = None if pose is None else calibrated_joints(view, calibration)
         label = f"view {view.number}"
-        sights.append(Sight(label, seen[view.number], pose, view.stop, joints_rad))
+        sights.append(Sight(label, detected.corners[view.number], pose, view.stop, joints_rad))
     lens, stated = calibration.camera, session.camera
     warnings = [*session.warnings]
     if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):

@@ -78,29 +78,13 @@ class TargetPlace:
     # images of one stop it is multiplied by sqrt(k), so that their mean has the variance of the
     # error that they share.
     flange_jacobian: FloatArray
-    # (6, c) Jacobian by the errors that all images share: see `common_covariance`.
+    # (6, c) Jacobian by the errors that all images share: camera's edge, lens, arm, target size.
     by_common: FloatArray
-
-
-def common_covariance(eye: CalibratedCamera, scale_sigma: float) -> FloatArray:
-    """(c, c) covariance of common errors: the camera's edge, its lens, arm, target size."""
-    return np.asarray(block_diag(eye.shared_covariance, [[scale_sigma**2]]))
 
 
 def needs_robot(eye: CalibratedCamera, parent: Parent) -> bool:
     """Whether the robot is between the parent and the target."""
     return (eye.mount == "eye-in-hand") == (parent == "base")
-
-
-def all_places(
-    eye: CalibratedCamera, sights: Sequence[Sight], looks: Sequence[PoseCandidates], parent: Parent
-) -> list[tuple[TargetPlace, ...]]:
-    """Candidate poses in the parent's frame, for each image; see `candidate_places`."""
-    stops = [sight.stop_key for sight in sights]
-    return [
-        candidate_places(eye, sight, look, parent, stops.count(stop))
-        for sight, look, stop in zip(sights, looks, stops, strict=True)
-    ]
 
 
 def candidate_places(
@@ -153,22 +137,8 @@ def candidate_places(
     )
 
 
-def check_labels(sights: Sequence[Sight]) -> None:
-    """Checks that there are images with unique labels.
-
-    Raises:
-        DataError: There is no image, or two have one label.
-    """
-    if not sights:
-        raise DataError("no image shows the target: at least one is needed.")
-    labels = [sight.label for sight in sights]
-    twice = sorted({label for label in labels if labels.count(label) > 1})
-    if twice:
-        raise DataError(f"two images are called {twice[0]!r}.", culprits=twice)
-
-
 @dataclass(frozen=True, eq=False)
-class CandidateViews:
+class _CandidateViews:
     """Candidate poses of a target from m images."""
 
     # Candidates of each image, the best by reprojection first.
@@ -193,14 +163,12 @@ class CandidateViews:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageInliers:
+class _ImageInliers:
     """Inlier images of a target, and their mean pose, weighted by independent errors."""
 
     matrix: FloatArray  # (4, 4) `parent_from_target`, the mean of the inliers.
     independent: FloatArray  # (6, 6) covariance by the images' independent errors.
-    gains: FloatArray  # (m, 6, 6) weight of each image; zero for outliers.
     by_common: FloatArray  # (6, c) Jacobian by the errors that all images share.
-    picks: IntArray  # (m,) index of each image's selected candidate.
     inliers: Mask  # (m,) inlier mask.
     residuals: FloatArray  # (m, 6) residual of each image's pose from the mean [rad, m].
     mahalanobis_sq: FloatArray  # (m,) its squared Mahalanobis distance; six on average under noise.
@@ -210,7 +178,7 @@ class ImageInliers:
     rival: FloatArray | None
 
 
-def find_inliers(candidates: CandidateViews) -> ImageInliers:
+def _find_inliers(candidates: _CandidateViews) -> _ImageInliers:
     """Finds the inlier images of a target.
 
     Where no more than half are inliers, the correct ones are unknown, and all are kept.
@@ -227,18 +195,18 @@ def find_inliers(candidates: CandidateViews) -> ImageInliers:
 class _ImageSearch:
     """Inlier search over images, each with its selected candidate."""
 
-    candidates: CandidateViews
+    candidates: _CandidateViews
     picks: IntArray
 
-    def fit(self, used: Mask, _: ImageInliers) -> ImageInliers:
+    def fit(self, used: Mask, _: _ImageInliers) -> _ImageInliers:
         return _fit(self.candidates, self.picks, used)
 
-    def distances(self, _: Mask, fit: ImageInliers) -> Distances:
+    def distances(self, _: Mask, fit: _ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
         return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
 
 
-def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
+def _start(candidates: _CandidateViews) -> tuple[IntArray, Mask]:
     """Selected candidates, and the half of the images nearest to one pose (least median)."""
     best: tuple[float, IntArray, FloatArray] | None = None
     half = len(candidates.views) // 2 + 1
@@ -256,7 +224,7 @@ def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
     return picks, agrees
 
 
-def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
+def _nearest(candidates: _CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
     """Squared distance (m,) of each image's nearest candidate from a pose, and its index."""
     independent, nearest = candidates.independent(seed), []
     for view in candidates.views:
@@ -271,7 +239,7 @@ def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray,
     )
 
 
-def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
+def _fit(candidates: _CandidateViews, picks: IntArray, agrees: Mask) -> _ImageInliers:
     """Mean pose over the inliers, and the distances of all images from it."""
     chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
     matrices = np.array([place.matrix for place in chosen])
@@ -304,12 +272,10 @@ def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInli
         if others
         else np.where(agrees, 0.0, squared)
     )
-    return ImageInliers(
+    return _ImageInliers(
         matrix,
         of_mean,
-        gains,
         mean_by_common,
-        picks,
         agrees,
         errors,
         mahalanobis_sq,
@@ -320,7 +286,7 @@ def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInli
 
 
 def _rival(
-    candidates: CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
+    candidates: _CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
 ) -> FloatArray | None:
     """Another pose among the candidates of all inliers: of a mirrored or rotated target."""
     limit = variance * candidates.limit
@@ -412,7 +378,8 @@ def place_seen(
         DataError: There is no camera, an image does not show the target, or a pose of the robot is
             needed and missing.
     """
-    check_labels(sights)
+    if not sights:
+        raise DataError("no image shows the target: at least one is needed.")
     eye = CalibratedCamera.of(calibration)
     board = target if isinstance(target, Target) else load_target(target)
     looks = [
@@ -425,10 +392,14 @@ def place_target(
     eye: CalibratedCamera, sights: Sequence[Sight], looks: Sequence[PoseCandidates], parent: Parent
 ) -> TargetPose:
     """Estimates a target's pose from its candidate poses in the images; see `place_seen`."""
-    views = all_places(eye, sights, looks, parent)
-    common = common_covariance(eye, looks[0].scale_sigma)
-    stops = len({sight.stop_key for sight in sights}) if needs_robot(eye, parent) else None
-    fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
+    keys = [sight.stop_key for sight in sights]
+    views = [
+        candidate_places(eye, sight, look, parent, keys.count(key))
+        for sight, look, key in zip(sights, looks, keys, strict=True)
+    ]
+    common = np.asarray(block_diag(eye.shared_covariance, [[looks[0].scale_sigma ** 2]]))
+    stops = len({*keys}) if needs_robot(eye, parent) else None
+    fit = _find_inliers(_CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
         fit.matrix,
@@ -442,17 +413,13 @@ def place_target(
         (
             *eye.warnings,
             *(words for look in looks for words in look.warnings),
-            *inlier_warnings(fit, labels, looks, stops),
+            *_inlier_warnings(fit, labels, looks, stops),
         ),
     )
 
 
-def inlier_warnings(
-    fit: ImageInliers,
-    labels: Sequence[str],
-    looks: Sequence[PoseCandidates],
-    stops: int | None,
-    thing: str = "target",
+def _inlier_warnings(
+    fit: _ImageInliers, labels: Sequence[str], looks: Sequence[PoseCandidates], stops: int | None
 ) -> Iterator[str]:
     """Warnings on the inliers of a target's images.
 
@@ -461,13 +428,13 @@ def inlier_warnings(
     count = len(labels)
     for at in np.flatnonzero(~fit.inliers).tolist():
         yield (
-            f"{labels[at]} puts the {thing} {_distance_words(fit, at)} from where the others do, "
+            f"{labels[at]} puts the target {_distance_words(fit, at)} from where the others do, "
             "and was left out: was it moved, or is the robot's pose that of another image?"
         )
     inliers = int(fit.inliers.sum())
     if count == 1:
         yield (
-            f"One image places the {thing}: nothing checks it. Take another"
+            f"One image places the target: nothing checks it. Take another"
             f"{', from another side' if stops else ''}."
         )
     elif stops == 1:
@@ -488,26 +455,26 @@ def inlier_warnings(
             "calibration's noise lets them; the sigmas are that much larger."
         )
     if fit.rival is not None:
-        yield _ambiguity_warning(fit, looks, thing)
+        yield _ambiguity_warning(fit, looks)
 
 
-def _distance_words(fit: ImageInliers, at: int) -> str:
+def _distance_words(fit: _ImageInliers, at: int) -> str:
     residual = fit.residuals[at]
     millimetres = 1e3 * float(np.linalg.norm(residual[3:]))
     degrees = float(np.rad2deg(np.linalg.norm(residual[:3])))
     return mm_and_deg(millimetres, degrees)
 
 
-def _ambiguity_warning(fit: ImageInliers, looks: Sequence[PoseCandidates], thing: str) -> str:
+def _ambiguity_warning(fit: _ImageInliers, looks: Sequence[PoseCandidates]) -> str:
     rival = np.eye(4) if fit.rival is None else fit.rival
     millimetres, degrees = pose_difference(fit.matrix, rival)
     shift = f"{mm_and_deg(millimetres, degrees)} away"
     if any(len(set(look.symmetries)) > 1 for look in looks):
         return (
-            f"The {thing} looks the same when it is turned: it may as well be {shift}. Use a board "
+            f"The target looks the same when it is turned: it may as well be {shift}. Use a board "
             "without symmetry, or see to it that it is not turned."
         )
     return (
-        f"Seen so flat, the {thing} may as well be tilted the other way, {shift}. Look from "
+        f"Seen so flat, the target may as well be tilted the other way, {shift}. Look from "
         "another side, or from nearer."
     )

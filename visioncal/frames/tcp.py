@@ -17,7 +17,7 @@ from visioncal.estimation.pivot import (
     fit_pivot,
 )
 from visioncal.estimation.placing import assumed_words
-from visioncal.frames.fixture import FitSettings, PointsFit, Words
+from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
@@ -32,12 +32,6 @@ from visioncal.robot import Robot
 TOUCH_KINDS = ("point", "z", "xz")
 # A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
 _NO_TOOL_M = 2e-3
-_WORDS = Words(
-    noisy="Touch again with a sharp tip; an arm that was never calibrated is off by a millimetre "
-    "from posture to posture, and poses that are read wrongly (--robot-form, --robot-inverse) by "
-    "more.",
-    weak="Add touches tilted by 30 to 45 degrees about other axes.",
-)
 
 
 @typed
@@ -96,7 +90,10 @@ def touched_tool(
         touch_noise_m,
         tuple(nominal_pose_findings(rows, calibration)),
         options=options or ToolLimits(),
-        words=_WORDS,
+        noisy="Touch again with a sharp tip; an arm that was never calibrated is off by a "
+        "millimetre from posture to posture, and poses that are read wrongly (--robot-form, "
+        "--robot-inverse) by more.",
+        weak="Add touches tilted by 30 to 45 degrees about other axes.",
     )
     more = tuple(_findings(fit, touches, setting))
     counts = {kind: rows.kinds.count(kind) for kind in TOUCH_KINDS}

@@ -108,7 +108,9 @@ class MarkerKind(BoardKind):
         del quick
         if min(image.shape) < 2:
             return NotFound("the image is a line")
-        ids, px = _markers(image, target.dictionary)
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        ids, px = read_markers(image, target.dictionary, parameters)
         if target.marker_id not in ids:
             seen = f"; seen instead: {', '.join(map(str, ids[:5]))}" if ids else ""
             return NotFound(f"no marker {target.marker_id} of {target.dictionary} is seen{seen}")
@@ -128,17 +130,6 @@ class MarkerKind(BoardKind):
 
 def _target(name: str, size_m: float, sigma_m: float, dictionary: str, number: int) -> Target:
     return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=number)
-
-
-def marker_ids(image: Image, dictionary: str) -> tuple[int, ...]:
-    """Ids of a dictionary's markers in a (h, w) grey image, each once."""
-    return tuple(dict.fromkeys(_markers(image, dictionary)[0]))
-
-
-def _markers(image: Image, dictionary: str) -> tuple[list[int], FloatArray]:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return read_markers(image, dictionary, parameters)
 
 
 def genuine(markers: Sequence[Marker]) -> list[Marker]:
