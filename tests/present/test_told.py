@@ -17,7 +17,7 @@ from support.findings import sick, with_contradiction, with_findings
 from support.samples import fixture_frame, made_up, tool_frame, with_frames
 
 from visioncal.core.types import Target
-from visioncal.present.recording.notes import result_markdown, view_markdown
+from visioncal.present.recording.notes import verdict_markdown, view_markdown
 from visioncal.present.report.page import render
 from visioncal.results import (
     Finding,
@@ -152,11 +152,7 @@ def told():
     for name, calibration, sample in shown():
         session, evidence = (sample.session, sample.evidence) if sample else (None, ())
         lines[f"report: {name}"] = words_of(render(calibration, session, evidence))
-        boards = {} if session is None else session.boards
-        for part in ("verdict", "figures", "solvers", "tools", "arms"):
-            text = result_markdown(part, calibration, boards)
-            if text:
-                lines[f"{part}: {name}"] = text.splitlines()
+        lines[f"verdict: {name}"] = verdict_markdown(calibration).splitlines()
         if name == "bad":
             lines["views"] = [*map(view_markdown, calibration.views)]
     return lines

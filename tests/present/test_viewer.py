@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import RigidTransform, Rotation
-from support.arm_documents import calibrated, stays_stated, with_holdout
+from support.arm_documents import calibrated
 from support.drawn import column
 from support.findings import with_findings
 from support.kept import assert_same_evidence
@@ -20,7 +20,6 @@ from visioncal.present import coverage
 from visioncal.present.recording import (
     arm,
     board,
-    notes,
     paths,
     read_calibration,
     read_evidence,
@@ -190,19 +189,6 @@ def with_arm(sample, document):
     return with_findings(sample, {"kinematics": document})
 
 
-def test_a_recording_tells_and_draws_the_arm(sample, tmp_path):
-    calibration = with_arm(sample, with_holdout())
-    path = tmp_path / "recording.rrd"
-    layout = blueprint(sample.session, calibration)
-    write_recording(path, sample.session, calibration, sample.evidence, layout)
-    read = read_calibration(path)
-    assert read is not None
-    assert to_document(read) == to_document(calibration)
-    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
-    assert paths.ARM_NOTE in entities
-    assert "Arm" in [tab.name for tab in layout.root_container.contents]
-
-
 def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
     path = tmp_path / "recording.rrd"
     calibration = with_arm(sample, calibrated())
@@ -211,13 +197,6 @@ def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
     ours = calibration.calibrated_robot.link_frames(q)[:, :3, 3]
     drawn = column(path, f"{paths.ROBOT}/links", "Capsules3D:translations")[4]
     np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
-
-
-def test_a_stated_arm_has_no_tab_but_a_word(sample):
-    calibration = with_arm(sample, stays_stated())
-    layout = blueprint(sample.session, calibration)
-    assert "Arm" not in [tab.name for tab in layout.root_container.contents]
-    assert "The arm stays as stated" in notes.result_markdown("figures", calibration)
 
 
 @pytest.fixture(scope="module")

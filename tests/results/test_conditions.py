@@ -14,7 +14,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.types import Need
 from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document
-from visioncal.present.recording.notes import result_markdown
+from visioncal.present.recording.notes import verdict_markdown
 from visioncal.present.report.page import write_certificate
 from visioncal.simulation import simulate
 from visioncal.simulation.boards import centre_m
@@ -74,7 +74,7 @@ def test_the_condition_goes_with_every_output(result, tmp_path):
     said = [
         (tmp_path / "page.html").read_text(),
         result._repr_html_(),
-        result_markdown("verdict", result),
+        verdict_markdown(result),
     ]
     assert all("belong to the calibrated arm" in text for text in said)
     for form in ("ur", "kuka", "abb", "ros", "urdf", "easy-handeye", "opencv", "text"):

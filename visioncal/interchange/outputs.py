@@ -143,7 +143,7 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     def draw(path: Path) -> None:
         from visioncal.live.planning.preview import preview_of
         from visioncal.present.recording.preview import write_preview
-        from visioncal.present.viewer.planned import plan_blueprint
+        from visioncal.present.viewer.layout import plan_blueprint
 
         preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
         write_preview(path, preview, plan_blueprint(preview))
@@ -173,7 +173,7 @@ def write_motions(
     def draw(path: Path) -> None:
         from visioncal.live.planning.preview import motion_preview
         from visioncal.present.recording.preview import write_motion_preview
-        from visioncal.present.viewer.planned import motion_blueprint
+        from visioncal.present.viewer.layout import motion_blueprint
 
         preview = motion_preview(plan)
         write_motion_preview(path, preview, motion_blueprint(preview))

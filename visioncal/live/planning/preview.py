@@ -15,7 +15,6 @@ _EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0
 def preview_of(plan: Plan, name: str) -> Preview:
     """Builds the preview of a plan under a name."""
     cell = plan.cell
-    history = [np.nan if accuracy.is_open else accuracy.mm for accuracy in plan.design.history]
     return Preview(
         cell.mount,
         cell.target,
@@ -25,7 +24,6 @@ def preview_of(plan: Plan, name: str) -> Preview:
         name,
         cell.robot,
         tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
-        np.array(history),
         tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),
         cell.limits.floor_m,
         _plan_note(plan, name),

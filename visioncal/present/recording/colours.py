@@ -1,9 +1,9 @@
-"""Colours of a recording, the same in the cell, the images and the charts."""
+"""Colours of a recording, the same in the cell and the images."""
 
 USED = (70, 150, 250)
 REJECTED = (230, 70, 60)
-# Contrasts with the others on dark and on light backgrounds.
-THIS_VIEW = (250, 165, 30)
+# The way; it contrasts with the others on dark and on light backgrounds.
+WAY = (250, 165, 30)
 # By the verdict's status, as in the report.
 VERDICT = {"good": (26, 122, 56), "check": (226, 173, 69), "bad": (194, 43, 38)}
 
@@ -13,6 +13,5 @@ DETECTED = (50, 220, 110)
 PREDICTED = (80, 160, 255)
 RESIDUAL = (255, 70, 60)
 
-# Background lines and labels of charts.
+# Background lines.
 GRID = (128, 134, 146)
-WORDS = (140, 146, 158)

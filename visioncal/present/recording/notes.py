@@ -1,34 +1,21 @@
-"""Texts in Markdown and plots of a result: verdict, figures, and residuals of every view."""
+"""The verdict as Markdown, and the residuals of every view as plots and text."""
 
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal
 
 import rerun as rr
-from markupsafe import Markup
 
 from visioncal.core.number_format import significant
-from visioncal.core.types import Target
-from visioncal.present import advice, arms, details, facts
+from visioncal.present import advice
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
-from visioncal.present.tables import Fact, Table
-from visioncal.present.words import said, templates_of
+from visioncal.present.words import said
 from visioncal.results import Calibration, ViewResult
 from visioncal.session import View
 
-_Part = Literal["verdict", "figures", "solvers", "tools", "arms"]
-_DOCUMENTS: dict[str, _Part] = {
-    paths.VERDICT: "verdict",
-    paths.FIGURES: "figures",
-    paths.SOLVERS: "solvers",
-    paths.TOOLS: "tools",
-    paths.ARM_NOTE: "arms",
-}
 _PLOTS = {
     paths.POSITION_MM: "residual_mm",
     paths.ORIENTATION_DEG: "residual_deg",
@@ -47,18 +34,11 @@ _MARKS = (
 )
 # End of a plot's scale, as a multiple of the used views' largest residual.
 _ROOM = 1.25
-# Marks of rows that are set in bold.
-_BOLD = ("taken", "sure")
 
 
-def log_static(
-    stream: rr.RecordingStream, calibration: Calibration, targets: Mapping[str, Target]
-) -> None:
-    """Logs the verdict, further texts, and the style of the residual plots."""
-    for entity, part in _DOCUMENTS.items():
-        text = result_markdown(part, calibration, targets)
-        if text:
-            stream.log(entity, markdown(text), static=True)
+def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
+    """Logs the verdict, and the style of the residual plots."""
+    stream.log(paths.VERDICT, markdown(verdict_markdown(calibration)), static=True)
     # A point in the verdict's colour, as an empty view would say that it is empty.
     point = rr.Points2D([[0.0, 0.0]], colors=colours.VERDICT[calibration.verdict.status])
     stream.log(paths.VERDICT_STRIP, point, static=True)
@@ -114,46 +94,46 @@ def _log_residuals(
         else:
             marks[paths.REJECTED][row] = float(value or 0.0)
     for name, marked in marks.items():
-        log_scalars(stream, f"{plot}/{name}", marked)
+        if marked:
+            scalars = rr.Scalars.columns(scalars=list(marked.values()))
+            send_rows(stream, f"{plot}/{name}", marked, scalars)
 
 
-def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, float]) -> None:
-    """Logs one number per view, by row."""
-    if values:
-        send_rows(stream, entity, values, rr.Scalars.columns(scalars=list(values.values())))
+def verdict_markdown(calibration: Calibration) -> str:
+    """The verdict with its reasons and next steps, the transforms, and the views left out."""
+    judged, cell, budget = calibration.verdict, calibration.cell, calibration.budget
+    steps = [
+        f"{at}. {plain(step.words)}" + (f"\n\n   `{step.command}`" if step.command else "")
+        for at, step in enumerate(calibration.next_steps, 1)
+    ]
+    frames = [
+        f"{name}: {frame.verdict.headline}, see the report"
+        for name, frame in calibration.frames.items()
+        if frame.verdict.status != "good"
+    ]
+    places = [
+        f"{name}: {edge.place_words()}, {edge.sigma_words}; {edge.rotation_words()}"
+        for name, edge in calibration.placed.items()
+    ]
+    used = sum(view.used for view in calibration.views)
+    words = [] if cell is None else [cell.weakest]
+    words += said("summary", calibration, budget) if budget else []
+    words.append(f"{used} of {len(calibration.views)} views used.")
+    parts = [
+        [f"# {judged.headline}", *_bullets([*judged.top, *frames])],
+        ["## What to do next", *steps],
+        ["## What it is valid for", *_bullets(calibration.unstated_conditions)],
+        ["## What else was found", *_bullets(judged.rest)],
+        ["## Transforms", *_bullets(places)],
+        ["## Views", *map(plain, words)],
+    ]
+    parts[-1] += _bullets(group.words for group in advice.left_out(calibration.views))
+    return "\n\n".join("\n\n".join(part) for part in parts if part[1:])
 
 
-def result_markdown(
-    part: _Part,
-    calibration: Calibration,
-    targets: Mapping[str, Target] = MappingProxyType({}),
-) -> str:
-    """A document on a result; empty where there is nothing to say.
-
-    Args:
-        part: The verdict with the transforms and the views left out; figures of residuals, noise
-            and uncertainty; the solvers compared; tools and fixtures; the arms.
-        calibration: The result.
-        targets: Boards as the session states them, by their names in results.
-    """
-    text = str(getattr(_documents(), part)(calibration, targets)).strip()
-    return re.sub(r"\n{3,}", "\n\n", text)
-
-
-@cache
-def _documents() -> Any:  # noqa: ANN401 - a module of macros
-    environment = templates_of(
-        "present/recording",
-        autoescape=True,
-        finalize=lambda value: value if isinstance(value, Markup) else Markup(plain(str(value))),
-    )
-    environment.globals |= vars(facts) | vars(arms) | vars(details) | vars(advice)
-    environment.globals["said"] = said
-    environment.globals |= {
-        "facts": lambda them: Markup("\n".join(fact_lines(them))),
-        "table": lambda table: Markup("\n".join(table_lines(table))),
-    }
-    return environment.get_template("notes.md.j2").module
+def _bullets(sentences: Iterable[str]) -> list[str]:
+    lines = "\n".join(f"- {plain(sentence)}" for sentence in sentences)
+    return [lines] if lines else []
 
 
 def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
@@ -189,28 +169,3 @@ def plain(text: str) -> str:
 def markdown(text: str) -> rr.TextDocument:
     """A text document that viewers render as Markdown."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-
-
-def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
-    """Facts as a list."""
-    for fact in facts:
-        note = f" ({plain(fact.note)})" if fact.note else ""
-        yield f"- {plain(fact.label)}: {plain(fact.value)}{note}"
-
-
-def table_lines(table: Table | None) -> Iterator[str]:
-    """A table, after an empty line; nothing for None."""
-    if table is None:
-        return
-    yield ""
-    yield _line(map(plain, table.titles))
-    yield _line("---" if column in table.words else "---:" for column in range(len(table.titles)))
-    for row in table.rows:
-        first, *rest = map(plain, row.cells)
-        is_bold = row.mark in _BOLD or not rest
-        rest = rest or [""] * (len(table.titles) - 1)
-        yield _line([f"**{first}**" if is_bold else first, *rest])
-
-
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |"

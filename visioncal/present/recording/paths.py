@@ -28,19 +28,10 @@ TARGET = "/target"
 FRAMES = "/frames"
 SEEN_TARGET = "/target_as_this_view_sees_it"
 
-# Charts over all views.
-COVERAGE = "/coverage"
-IMAGE_COVERAGE = f"{COVERAGE}/image"
-DIRECTIONS = f"{COVERAGE}/directions"
-ROTATION_AXES = f"{COVERAGE}/rotation_axes"
-
 # In the image.
 DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
-
-# What was found of the arms.
-ARM_NOTE = "/notes/arm"
 
 # A cell of several robots: its frame, and who saw whom.
 CELL_FRAME = "cell"
@@ -52,7 +43,6 @@ NETWORK = "/network"
 OBSTACLES = "/obstacles"
 WAY = "/way"
 WAY_TIMELINE = "way"
-PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
 PLAN_NOTE = "/notes/plan"
 STOP_NOTE = "/notes/stop"
 
@@ -67,11 +57,8 @@ REPROJECTION_PX = f"{RESIDUALS}/reprojection_px"
 VERDICT = "/notes/verdict"
 # A strip in the verdict's colour, as texts have no background colour.
 VERDICT_STRIP = "/verdict_strip"
-FIGURES = "/notes/figures"
-SOLVERS = "/notes/solvers"
-TOOLS = "/notes/tools_and_fixtures"
 VIEW_NOTE = "/notes/view"
-USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
+USED, REJECTED = "used", "rejected"
 # Beyond the scale, and drawn at its end.
 BEYOND = "rejected_beyond_the_scale"
 

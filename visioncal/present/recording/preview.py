@@ -13,14 +13,11 @@ from visioncal.core.files import replacing_file
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
-from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import Obstacle, log_obstacles
-from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder, send_rows
 from visioncal.present.recording.scene import Scene, Seen, states_of
-from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
@@ -50,8 +47,6 @@ class Preview(Seen):
     name: str  # Name of the recording.
     robot: Robot  # The arm.
     stops: Sequence[PreviewStop]  # Stops in driving order.
-    # Predicted sigma by number of stops; NaN where something is undetermined [mm].
-    sigmas_mm: FloatArray
     obstacles: Sequence[Obstacle]  # Obstacles in the cell.
     floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
     note: str  # Text of the plan in Markdown.
@@ -100,9 +95,7 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
         scene.log_stops(stream, labelled=True)
         _log_static(stream, preview)
         flange_m = np.array([state.pose[:3, 3] for state in states.values()])
-        line = rr.LineStrips3D(
-            [flange_m], colors=colours.THIS_VIEW, radii=0.7 * _LINE * preview.size_m
-        )
+        line = rr.LineStrips3D([flange_m], colors=colours.WAY, radii=0.7 * _LINE * preview.size_m)
         stream.log(paths.WAY, rr.CoordinateFrame(paths.BASE_FRAME), line, static=True)
         scene.log_views(stream, {view: row for row, view in enumerate(steps)})
         way.log_views(stream, {step: step for step in states}, paths.WAY_TIMELINE)
@@ -129,35 +122,20 @@ def _log_static(stream: rr.RecordingStream, preview: Preview) -> None:
     stream.log(f"{paths.IMAGE}/border", in_image, border, static=True)
     log_obstacles(stream, preview.obstacles, preview.floor_m, preview.size_m)
     stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
-    finite = np.isfinite(preview.sigmas_mm)
-    if finite.any():
-        places = np.flatnonzero(finite).astype(float)
-        bars = rr.BarChart(preview.sigmas_mm[finite], abscissa=places, color=colours.USED)
-        stream.log(paths.PREDICTED_SIGMA, bars, static=True)
 
 
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:
-    """Draws the image of each stop and its coverage, on both timelines; `steps` are its steps."""
+    """Draws the image of each stop, on both timelines; `steps` are its steps on the way."""
     outline = board.closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
-    evidence, px, rims = {}, {}, []
-    for stop, flange in zip(preview.stops, preview.base_from_flange, strict=True):
+    px, rims = [], []
+    for flange in preview.base_from_flange:
         base_from_cam, base_from_target = preview.placed(flange)
         cam_from_target = invert(base_from_cam) @ base_from_target
-        evidence[stop.view] = ViewEvidence(
-            stop.view, base_from_flange=flange, cam_from_target=cam_from_target
-        )
         corners = apply(cam_from_target, corner_positions(preview.target))
-        px[stop.view] = project(preview.camera, corners)
+        px.append(project(preview.camera, corners))
         rims.append(project(preview.camera, apply(cam_from_target, sides)))
-    charts = (
-        corners_chart(preview.camera.resolution, px),
-        directions_chart([*evidence.values()]),
-        rotation_axes_chart(list(evidence.values())),
-    )
-    drawn = Charts([chart for chart in charts if chart], frozenset(evidence))
-    drawn.log_static(stream)
     in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
     style = rr.Points2D.from_fields(colors=colours.PREDICTED, radii=rr.Radius.ui_points(2.5))
     stream.log(paths.PREDICTED, in_image, style, static=True)
@@ -165,16 +143,15 @@ def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int
     stream.log(f"{paths.IMAGE}/board", in_image, rim_style, static=True)
     notes = [stop.note for stop in preview.stops]
     # Rerun's origin is the image's corner, not the first pixel's centre.
-    places = rr.Points2D.columns(positions=np.vstack([*px.values()]) + 0.5)
+    places = rr.Points2D.columns(positions=np.vstack(px) + 0.5)
     columns = {
-        paths.PREDICTED: places.partition([len(corners) for corners in px.values()]),
+        paths.PREDICTED: places.partition([*map(len, px)]),
         f"{paths.IMAGE}/board": rr.LineStrips2D.columns(strips=[rim + 0.5 for rim in rims]),
         paths.STOP_NOTE: rr.TextDocument.columns(
             text=notes, media_type=["text/markdown"] * len(notes)
         ),
     }
     for timeline, rows in ((paths.TIMELINE, range(len(steps))), (paths.WAY_TIMELINE, steps)):
-        drawn.log_views(stream, dict(zip(evidence, rows, strict=True)), timeline)
         for entity, column in columns.items():
             send_rows(stream, entity, rows, column, timeline)
 
@@ -218,7 +195,7 @@ def write_motion_preview(
         recorder.lay_out(blueprint)
         log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
         stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
-        line = rr.LineStrips3D([places_m[1:]], colors=colours.THIS_VIEW, radii=_LINE * size_m)
+        line = rr.LineStrips3D([places_m[1:]], colors=colours.WAY, radii=_LINE * size_m)
         stream.log(paths.WAY, rr.CoordinateFrame(paths.BASE_FRAME), line, static=True)
         Scene.planned(robot, {}, size_m).log_static(stream)
         for motion in preview.motions.values():

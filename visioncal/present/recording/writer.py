@@ -11,10 +11,7 @@ from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
-from visioncal.present import result_parts
-from visioncal.present.coverage import coverage_charts
 from visioncal.present.recording import codec, notes, paths, sights
-from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
@@ -168,13 +165,7 @@ def _draw(
         sights.log_network(stream, scene, calibration)
         sights.log_sights(stream, scene, session, calibration)
     sights.log_seen_targets(stream, scene, session, calibration, seen)
-    charts = Charts(
-        coverage_charts(calibration, [*evidence.values()]),
-        frozenset(view.view for view in calibration.views if view.used),
-    )
-    charts.log_static(stream)
-    charts.log_views(stream, rows)
-    notes.log_static(stream, calibration, result_parts.stated_boards(session))
+    notes.log_static(stream, calibration)
     shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
     unposed = {row: scene.unposed(view) for view, row in rows.items()}
     notes.log_views(stream, shown, dict(enumerate(session.views)), unposed)

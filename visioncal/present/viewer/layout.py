@@ -1,79 +1,122 @@
-"""Layout of a recording in the rerun viewer."""
+"""Layouts of recordings and of previews of plans in the rerun viewer."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Verdict
 from visioncal.present import result_parts
-from visioncal.present.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.present.recording import colours, paths
-from visioncal.results import Calibration, CellResult
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
 
+# Its import takes long, and the layout of a recording does without.
+if TYPE_CHECKING:
+    from visioncal.present.recording.preview import MotionPreview, Preview
+
 # Distance of the eye from the cell's centre, in extents of the cell's content.
-EYE_DISTANCE = 0.8
-
-
-@dataclass(frozen=True)
-class _Contents:
-    """Which parts a session and its result have."""
-
-    images: bool
-    unused: bool
-    frames: bool
-    orientations: bool
-    by_camera: bool
-    seers: tuple[str, ...]
-    cell: CellResult | None
-
-    @classmethod
-    def of(cls, session: Session, calibration: Calibration | None) -> "_Contents":
-        cell = None if calibration is None else calibration.cell
-        views = () if calibration is None else calibration.views
-        return cls(
-            any(view.image or view.has_corners for view in session.views),
-            not all(view.used for view in views),
-            calibration is not None and bool(calibration.frames),
-            not views or any(view.residual_deg is not None for view in views),
-            session.mount != "instrument",
-            tuple(dict.fromkeys(view.seer for view in views)) or ("",),
-            cell,
-        )
+_EYE_DISTANCE = 0.8
+_THINGS = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
+# The overlays of the image would clutter the frustum.
+_PLAIN_IMAGE = (f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}")
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
     """Layout of a recording of a session and its result; parts that they lack get no space.
 
-    The first tab shows the verdict, the cell and the image. Others show the network of a cell, the
-    calibrated arm, the residuals, the coverage, and the solvers.
+    The first tab shows the verdict, the cell and the image. Others show the network of a cell, and
+    the residuals.
     """
-    contents, eye = _Contents.of(session, calibration), _eye(session, calibration)
-    tabs: list[rrb.Container | rrb.View] = [_overview(contents, eye, calibration)]
-    if contents.cell is not None:
-        tabs.append(rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK))
-    tabs += [] if calibration is None else _arms(calibration)
-    tabs.append(_residuals(contents))
-    if contents.cell is None:
-        tabs.append(_coverage(contents))
-    tabs.append(_figures(calibration))
-    return with_panels(rrb.Tabs(*tabs, active_tab=0))
+    views = () if calibration is None else calibration.views
+    cell = None if calibration is None else calibration.cell
+    seers = dict.fromkeys(view.seer for view in views) or ("",)
+    has_images = any(view.image or view.has_corners for view in session.views)
+    plots = {"Position residual [mm]": paths.POSITION_MM}
+    if not views or any(view.residual_deg is not None for view in views):
+        plots["Orientation residual [deg]"] = paths.ORIENTATION_DEG
+    if has_images:
+        plots["Reprojection error [px]"] = paths.REPROJECTION_PX
+    # A legend would cover the marks at the top and bottom, which are of these views; a longer title
+    # would be cut off.
+    legend = "; red: not used" if not all(view.used for view in views) else ""
+    curves = [
+        [
+            rrb.TimeSeriesView(
+                name=f"{seer}: {name}{legend}" if seer else f"{name}{legend}",
+                origin=paths.part_of(plot, seer),
+                contents=["$origin/**"],
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            for name, plot in plots.items()
+        ]
+        for seer in seers
+    ]
+    things = [*_THINGS, *(f"{thing}s" for thing in _THINGS), paths.STOPS, paths.FRAMES]
+    things += [paths.SEEN_TARGET, paths.CELL, paths.SIGHT_LINE]
+    frame = paths.BASE_FRAME if cell is None else paths.CELL_FRAME
+    left: rrb.Container | rrb.View = _space_view(
+        "Cell", things, _eye(session, calibration), frame, has_image=has_images
+    )
+    if cell is None:
+        # The residuals of one camera fit below the cell, those of several have a tab.
+        few = rrb.Horizontal(*curves[0][:1], *curves[0][1:][-1:])
+        left = rrb.Vertical(left, few, row_shares=[3, 1])
+    verdict: rrb.Container | rrb.View = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
+    if calibration is not None:
+        strip = rrb.Spatial2DView(
+            name=calibration.verdict.headline,
+            origin=paths.VERDICT_STRIP,
+            background=[*colours.VERDICT[calibration.verdict.status]],
+        )
+        verdict = rrb.Vertical(strip, verdict, row_shares=[1, 8], name="Verdict")
+    right = [verdict, rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)]
+    if has_images:
+        title = "Image: green detected, blue predicted, red residual"
+        # With several cameras, room for the largest image.
+        sizes = [] if cell is None else [lens.camera.resolution for lens in cell.lenses.values()]
+        bounds = None
+        if sizes:
+            width, height = np.max(sizes, axis=0).astype(float)
+            bounds = rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
+        right.insert(1, _image_view(title, bounds))
+    shares = [3.7, 4.2, 1.5] if has_images else [2, 1]
+    overview = rrb.Horizontal(
+        left, rrb.Vertical(*right, row_shares=shares), name="Overview", column_shares=[1.2, 1]
+    )
+    network = rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK)
+    residuals = rrb.Vertical(*(rrb.Horizontal(*row) for row in curves), name="Residuals")
+    tabs = (overview, *((network,) if cell is not None else ()), residuals)
+    return _with_panels(rrb.Tabs(*tabs, active_tab=0))
 
 
-def _figures(calibration: Calibration | None) -> rrb.Container:
-    figures = rrb.TextDocumentView(name="Residuals, noise and uncertainty", origin=paths.FIGURES)
-    if calibration is not None and not calibration.solvers:
-        return rrb.Horizontal(figures, name="Figures")
-    solvers = rrb.TextDocumentView(name="Solvers", origin=paths.SOLVERS)
-    return rrb.Horizontal(figures, solvers, name="Figures", column_shares=[2, 3])
+def plan_blueprint(preview: "Preview") -> rrb.Blueprint:
+    """Layout of the preview of a plan."""
+    flange = preview.base_from_flange
+    poses = [pose for base_from_flange in flange for pose in preview.placed(base_from_flange)]
+    places = np.array([np.zeros(3), *(pose[:3, 3] for pose in (*flange, *poses))])
+    things = (*_THINGS, paths.OBSTACLES, paths.STOPS, paths.WAY)
+    title = "Cell: stops in blue, way in orange"
+    cell = _space_view(title, things, _eye_on(places), has_image=True)
+    note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
+    stop = rrb.TextDocumentView(name="This stop", origin=paths.STOP_NOTE)
+    image = _image_view("The board in the image, as predicted")
+    right = rrb.Vertical(note, image, stop, row_shares=[3.4, 3.6, 1.6])
+    return _with_panels(rrb.Horizontal(cell, right, column_shares=[1.5, 1]))
 
 
-def with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.Blueprint:
+def motion_blueprint(preview: "MotionPreview") -> rrb.Blueprint:
+    """Layout of the preview of motions."""
+    things = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
+    cell = _space_view("The flange's way", things, _eye_on(preview.places_m))
+    note = rrb.TextDocumentView(name="The plan", origin=paths.PLAN_NOTE)
+    return _with_panels(rrb.Horizontal(cell, note, column_shares=[2, 1]), paths.MOTION_TIMELINE)
+
+
+def _with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.Blueprint:
     """A layout with collapsed panels, paused at the start of a timeline."""
     folded = rrb.PanelState.Collapsed
     return rrb.Blueprint(
@@ -84,124 +127,29 @@ def with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.B
     )
 
 
-def space_view(
+def _space_view(
     name: str,
-    contents: Sequence[str],
-    eye: rrb.EyeControls3D | None = None,
+    things: Iterable[str],
+    eye: rrb.EyeControls3D | None,
     frame: str = paths.BASE_FRAME,
+    *,
+    has_image: bool = False,
 ) -> rrb.Spatial3DView:
     """Entities in 3D, with z upwards."""
     return rrb.Spatial3DView(
         name=name,
         origin="/",
-        contents=contents,
+        contents=[*(f"+ {thing}/**" for thing in things), *(_PLAIN_IMAGE if has_image else ())],
         eye_controls=eye,
         spatial_information=rrb.SpatialInformation(frame, axes=rr.ViewCoordinates.RIGHT_HAND_Z_UP),
     )
 
 
-def image_view(
-    name: str, entity: str, bounds: rrb.VisualBounds2D | None = None
-) -> rrb.Spatial2DView:
-    """An entity in 2D, with its overlays."""
+def _image_view(name: str, bounds: rrb.VisualBounds2D | None = None) -> rrb.Spatial2DView:
+    """The image, with its overlays."""
     return rrb.Spatial2DView(
-        name=name, origin=entity, contents=["$origin/**"], visual_bounds=bounds
+        name=name, origin=paths.IMAGE, contents=["$origin/**"], visual_bounds=bounds
     )
-
-
-def series(name: str, entity: str) -> rrb.TimeSeriesView:
-    """Curves of an entity, without a legend, which would cover them."""
-    return rrb.TimeSeriesView(
-        name=name, origin=entity, contents=["$origin/**"], plot_legend=rrb.PlotLegend(visible=False)
-    )
-
-
-def _overview(
-    contents: _Contents, eye: rrb.EyeControls3D | None, calibration: Calibration | None
-) -> rrb.Container:
-    frame = paths.BASE_FRAME if contents.cell is None else paths.CELL_FRAME
-    cell = space_view("Cell", _cell_contents(contents), eye, frame)
-    # The residuals of one camera fit below the cell, those of several have a tab.
-    plots = _plots(contents, "") if contents.cell is None else []
-    left: rrb.Container | rrb.View = cell
-    if plots:
-        left = rrb.Vertical(cell, rrb.Horizontal(*plots[:1], *plots[1:][-1:]), row_shares=[3, 1])
-    verdict = _verdict(contents, None if calibration is None else calibration.verdict)
-    note = rrb.TextDocumentView(name="This view", origin=paths.VIEW_NOTE)
-    if not contents.images:
-        right = rrb.Vertical(verdict, note, row_shares=[2, 1])
-        return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
-    title = "Image: green detected, blue predicted, red residual"
-    # With several cameras, room for the largest image.
-    cameras = {} if contents.cell is None else contents.cell.cameras
-    sizes = np.array([camera.camera.resolution for camera in cameras.values()], dtype=float)
-    width, height = sizes.max(axis=0) if len(sizes) else (0.0, 0.0)
-    bounds = rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height)) if width else None
-    image = image_view(title, paths.IMAGE, bounds)
-    right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
-    return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
-
-
-def _arms(calibration: Calibration) -> list[rrb.Container]:
-    """What was found of the arms, as text."""
-    sections = calibration.by_name.robots.values()
-    if not any(
-        section.thermal is not None or (section.arm is not None and section.arm.is_calibrated)
-        for section in sections
-    ):
-        return []
-    note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
-    return [rrb.Horizontal(note, name="Arm")]
-
-
-def _verdict(contents: _Contents, verdict: Verdict | None) -> rrb.Container | rrb.View:
-    """The verdict's text below a strip in its colour, with tools and fixtures in a second tab."""
-    view: rrb.Container | rrb.View = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
-    if verdict is not None:
-        strip = rrb.Spatial2DView(
-            name=verdict.headline,
-            origin=paths.VERDICT_STRIP,
-            background=[*colours.VERDICT[verdict.status]],
-        )
-        view = rrb.Vertical(strip, view, row_shares=[1, 8], name="Verdict")
-    if not contents.frames:
-        return view
-    tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
-    return rrb.Tabs(view, tools, active_tab=0)
-
-
-def _residuals(contents: _Contents) -> rrb.Container:
-    over_views = [rrb.Horizontal(*_plots(contents, seer)) for seer in contents.seers]
-    return rrb.Vertical(*over_views, name="Residuals")
-
-
-def _coverage(contents: _Contents) -> rrb.Container:
-    directions, axes = disc_views()
-    if not contents.by_camera:
-        return rrb.Horizontal(axes, name="Coverage")
-    if not contents.images:
-        return rrb.Horizontal(directions, axes, name="Coverage")
-    image = image_view("Corners of all views in the image", paths.IMAGE_COVERAGE)
-    return rrb.Horizontal(
-        image, rrb.Vertical(directions, axes), name="Coverage", column_shares=[1.6, 1]
-    )
-
-
-def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
-    """Charts of viewing directions and rotation axes."""
-    views = []
-    for name, entity, rings_deg in (
-        ("Where the camera looks from, about the target's normal", paths.DIRECTIONS,
-         DIRECTIONS_RINGS_DEG),
-        ("Axes of rotation from view to view, about the flange's z", paths.ROTATION_AXES,
-         AXES_RINGS_DEG),
-    ):  # fmt: skip
-        # With room for labels around the rim.
-        reach_deg = (-1.2 * rings_deg[-1], 1.2 * rings_deg[-1])
-        bounds = rrb.VisualBounds2D(x_range=reach_deg, y_range=reach_deg)
-        title = f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})"
-        views.append(image_view(title, entity, bounds))
-    return views[0], views[1]
 
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
@@ -216,43 +164,16 @@ def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D
     # With several robots, the poses have different bases.
     poses = {} if session.is_network else reported_matrices(session.views)
     places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
-    return eye_on(places) if len(places) > 2 else None
+    return _eye_on(places) if len(places) > 2 else None
 
 
-def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
+def _eye_on(places: FloatArray) -> rrb.EyeControls3D:
     """Views (k, 3) points [m] from the side so that they fill the view."""
     low, high = places.min(axis=0), places.max(axis=0)
     centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))
     forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
     # From the robot's front right, above the table.
     direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
-    return rrb.EyeControls3D(position=centre + distance * size_m * direction, look_target=centre)
-
-
-def _cell_contents(contents: _Contents) -> list[str]:
-    kinds = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
-    entities = [
-        *(name for entity in kinds for name in (entity, f"{entity}s")),
-        paths.STOPS,
-        paths.FRAMES,
-        paths.SEEN_TARGET,
-        paths.CELL,
-        paths.SIGHT_LINE,
-    ]
-    # The image's overlays would clutter the frustum.
-    hidden = [f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"] if contents.images else []
-    return [*(f"+ {entity}/**" for entity in entities), *hidden]
-
-
-def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
-    plots = [
-        ("Position residual [mm]", paths.POSITION_MM),
-        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.orientations else []),
-    ]
-    if contents.images:
-        plots.append(("Reprojection error [px]", paths.REPROJECTION_PX))
-    # A legend would cover the marks at the top and bottom, which are of these views; a longer title
-    # would be cut off.
-    legend = "; red: not used" if contents.unused else ""
-    of = f"{seer}: " if seer else ""
-    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in plots]
+    return rrb.EyeControls3D(
+        position=centre + _EYE_DISTANCE * size_m * direction, look_target=centre
+    )
