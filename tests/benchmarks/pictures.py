@@ -1,4 +1,4 @@
-"""The pictures that the pages show: report, certificate, viewer and notebook card, in recordings/.
+"""The pictures that the pages show: report, arm, certificate, viewer and notebook card.
 
     PYTHONPATH=tests python tests/benchmarks/pictures.py [--quick]
 
@@ -24,11 +24,19 @@ from support.fuzz.broken_sessions import BROKEN, broken_session
 import visioncal as package
 from visioncal.present.recording import paths
 from visioncal.present.viewer.native import free_port, viewer_process
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import (
+    CellOptions,
+    cell_session,
+    fine_camera,
+    simulate,
+    write_session,
+)
 
 _FOLDER = Path(__file__).parents[2] / "recordings"
 # How long the viewer has for its drawing, without a graphics card [s].
 _PATIENCE_S = 60.0
+# Height of the viewer's own bar, whose notes are about the machine [px].
+_TITLE_PX = 37
 
 
 def main() -> None:
@@ -41,6 +49,10 @@ def main() -> None:
         broken_session(Path("cell-5"), BROKEN["one pose typed wrong"])
         visioncal("calibrate", "cell-4", "-o", "out", "--need-mm", "0.5")
         visioncal("calibrate", "cell-5", "-o", "doubted")
+        errors = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
+        options = CellOptions(robot="ur5e", **errors, views=40, camera=fine_camera())
+        cell_session(simulate(options), "cell-6", seen="corners").save(Path("cell-6"))
+        visioncal("calibrate", "cell-6", "-o", "calibrated")
         signed = ("--operator", "A. Smith", "--serial", "camera=1944301", "--serial", "robot=UR-77")
         visioncal("show", "out", "--certificate", *signed, "-o", "certificate.html")
         card = package.Calibration.load("out")._repr_html_()
@@ -51,9 +63,13 @@ def main() -> None:
                 ("report_phone", "out/report.html", 390, 1300),
                 ("certificate", "certificate.html", 800, 1130),
                 ("notebook_card", "card.html", 800, 330),
+                ("arm", "calibrated/report.html", 900, 880),
             ):
                 _sized(page, width, height, is_phone=width < 500)
                 page.visit(Path(file).absolute().as_uri())
+                if name == "arm":
+                    begin = "document.querySelector('.arm figure').scrollIntoView()"
+                    page.call("Runtime.evaluate", expression=begin)
                 _keep(name, page.picture())
             for name, folder, row in (
                 () if QUICK else (("demo", "out", 5), ("viewer", "doubted", 6))
@@ -88,7 +104,7 @@ def _viewed(recording: Path, row: int) -> np.ndarray:
             client.set_time(paths.TIMELINE, sequence=row, play_state="paused")
             client.save_screenshot(str(file))
             picture = cv2.imread(str(file))
-    return picture
+    return picture[_TITLE_PX:]
 
 
 def _keep(name: str, picture: np.ndarray) -> None:

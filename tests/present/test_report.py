@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections import Counter
 from dataclasses import replace
 from html import unescape
 
@@ -10,6 +11,7 @@ import numpy as np
 import pypdfium2
 import pytest
 from support import browser
+from support import whole_cells as two_arms
 from support.aligned_cells import made_up_cell
 from support.commands import visioncal
 from support.findings import CONTRADICTS, with_contradiction
@@ -24,13 +26,14 @@ from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
 from visioncal.present.network_layout import pairs
 from visioncal.present.recording.notes import view_markdown
+from visioncal.present.report.cell_picture import cell_picture
 from visioncal.present.report.page import render, write_certificate, write_report
 from visioncal.present.report.thumbnails import thumbnail
 from visioncal.present.tables import Table, TableRow
 from visioncal.results import ViewResult
 from visioncal.results.views import worst_view
 from visioncal.session import MemoryImages
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CellOptions, cell_session, simulate, write_session
 from visioncal.vision.boards.imaging import decode_image
 
 
@@ -132,6 +135,23 @@ def test_identifiers_of_figures_stay_apart(html):
     assert {value.removeprefix("#") for value in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(
         identifiers
     )
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", "two arms"])
+def test_the_cell_is_pictured_with_each_place_of_camera_and_board(mount):
+    options = two_arms.OPTIONS if mount == "two arms" else CellOptions(views=10, mount=mount)
+    session = cell_session(simulate(options), "cell", seen="corners")
+    found = run(session)
+    picture = str(cell_picture(found.calibration, session, found.evidence))
+    frames = {*found.calibration.tree.last} - {*found.calibration.tree.flanges} - {"cell"}
+    assert {*re.findall("<text[^>]*>([^<]*)</text>", picture)} == frames
+    # What moves is drawn in each view, what stands still once, and each arm once.
+    lines = Counter(re.findall(r'stroke="var\(--(\w+)\)"', picture))
+    if mount == "two arms":
+        assert lines["muted"] == 2
+    else:
+        moves, stands = ("accent", "good") if mount == "eye-in-hand" else ("good", "accent")
+        assert lines == {moves: 10, stands: 1, "muted": 1}
 
 
 def test_spoilt_images_do_not_spoil_the_report(sample):

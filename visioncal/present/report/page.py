@@ -64,6 +64,7 @@ def render(
         **_head("Calibration report", calibration, session),
         notes=[note] if note else [],
         steps=calibration.next_steps,
+        seen=evidence,
         # Coverage and joint plots are for one camera, one board and one robot.
         evidence=evidence if calibration.cell is None else (),
         review=f"{review} --view" if review else "",

@@ -23,11 +23,11 @@ from visioncal.results.views import rms_of
 from visioncal.session import Session
 
 # Width of a drawing, and room for labels to its left and right [px].
-_WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 105.0
+WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 105.0
 # Height of a panel with its gap, and of its scale [px].
 _PANEL, _SCALE = 120.0, 92.0
 # Distance of words above each other [px].
-_LINE_HEIGHT = 14.0
+LINE_HEIGHT = 14.0
 # Most steps of a scale, most labels of views, and most dots of a chart.
 _MOST_STEPS, _MOST_LABELS, _MOST_DOTS = 4, 25, 3000
 # Scales ignore the few largest points, which would compress the others.
@@ -74,7 +74,7 @@ class Drawing:
     def svg(self, words: str, height: float) -> Markup:
         """The element, which scales with its container."""
         return Markup(
-            f'<svg role="img" aria-label="{escape(words)}" viewBox="0 0 {_WIDTH:g} {height:g}" '
+            f'<svg role="img" aria-label="{escape(words)}" viewBox="0 0 {WIDTH:g} {height:g}" '
             f'font-size="12" fill="var(--ink)">{"".join(self.parts)}</svg>'
         )
 
@@ -100,7 +100,7 @@ class Panel:
         step = decade * next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= wanted)
         for value in step * np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1):
             y = float(self.y(value))
-            self.drawing.path("line", 1.0, f"M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}")
+            self.drawing.path("line", 1.0, f"M{_LEFT} {y:.1f}H{WIDTH - _RIGHT}")
             self.drawing.text(_LEFT - 6.0, y + 4.0, f"{value + 0.0:.6g}", "end")
         middle = self.top + 0.5 * _SCALE
         self.drawing.text(14.0, middle, label, more=f'transform="rotate(-90 14 {middle:.1f})"')
@@ -109,8 +109,8 @@ class Panel:
         """Draws a dashed line at a value of at least zero, with words to its right."""
         y = float(self.y(value))
         style = f'stroke-dasharray="{dashes}"'
-        self.drawing.path(colour, 1.2, f"M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}", style)
-        self.drawing.text(_WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
+        self.drawing.path(colour, 1.2, f"M{_LEFT} {y:.1f}H{WIDTH - _RIGHT}", style)
+        self.drawing.text(WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
 
 
 def dots(x: Iterable[float], y: Iterable[float]) -> str:
@@ -153,9 +153,9 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
                 panel.draw_level(limit, "", "bad", "1 4")
             else:
                 words, y = f"{words} \N{UPWARDS ARROW}", top
-            if rms is not None and abs(y - panel.y(rms)) < _LINE_HEIGHT:
-                y += _LINE_HEIGHT if limit < rms else -_LINE_HEIGHT
-            drawing.text(_WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
+            if rms is not None and abs(y - panel.y(rms)) < LINE_HEIGHT:
+                y += LINE_HEIGHT if limit < rms else -LINE_HEIGHT
+            drawing.text(WIDTH - _RIGHT + 5.0, y + 4.0, words, "start")
         drawing.text(_LEFT, top - 8.0, seer, "start")
         # With several cameras, each panel has other views.
         if is_cell or index == len(shown) - 1:
@@ -163,13 +163,13 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
             for x, view in [*zip(_places(len(views)), views, strict=True)][::step]:
                 drawing.text(x, top + _SCALE + 16.0, str(view.view))
     height = pitch * len(shown) + 40.0
-    drawing.text(0.5 * (_LEFT + _WIDTH - _RIGHT), height - 4.0, "view")
+    drawing.text(0.5 * (_LEFT + WIDTH - _RIGHT), height - 4.0, "view")
     return drawing.svg("Bars: residuals of each view", height)
 
 
 def _places(count: int) -> FloatArray:
     """Centres of equal parts of a panel's width [px]."""
-    return _LEFT + (np.arange(count) + 0.5) * (_WIDTH - _LEFT - _RIGHT) / count
+    return _LEFT + (np.arange(count) + 0.5) * (WIDTH - _LEFT - _RIGHT) / count
 
 
 def _scale_of(
@@ -198,7 +198,7 @@ def _draw_views(
             beyond = f"\N{BLACK UP-POINTING TRIANGLE} {significant(float(value))}"
             mark = beyond if value > panel.high else "\N{MULTIPLICATION SIGN}"
             drawing.text(x, float(panel.y(height)) - 3.0, mark, more=f'fill="var(--{colour})"')
-    width = 0.7 * (_WIDTH - _LEFT - _RIGHT) / len(views)
+    width = 0.7 * (WIDTH - _LEFT - _RIGHT) / len(views)
     for colour, path in bars.items():
         drawing.path(colour, width, path)
 
@@ -209,7 +209,7 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
     if not charts:
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
-    drawing, side = Drawing(), _WIDTH / 3.0
+    drawing, side = Drawing(), WIDTH / 3.0
     for index, chart in enumerate(charts):
         ends = np.vstack([*chart.lines])
         middle, reach = 0.5 * (ends.max(axis=0) + ends.min(axis=0)), np.ptp(ends, axis=0).max()
@@ -263,7 +263,7 @@ def residuals_over_joints(
     low, high = joints_deg.min(axis=0), joints_deg.max(axis=0)
     # Each joint has a part of the width of its own, from its smallest to its largest angle.
     centres = _places(len(low))
-    part = 0.8 * (_WIDTH - _LEFT - _RIGHT) / len(low)
+    part = 0.8 * (WIDTH - _LEFT - _RIGHT) / len(low)
     places = centres + part * ((joints_deg - low) / np.maximum(high - low, 1e-9) - 0.5)
     twists, drawing = np.array([residual for _, residual in pairs]), Drawing()
     for index, (values, label) in enumerate(
@@ -279,6 +279,6 @@ def residuals_over_joints(
         drawing.text(x, 2 * _PANEL + 14.0, f"q{joint}")
         drawing.text(x, 2 * _PANEL + 30.0, f"{start:.0f} to {end:.0f} deg")
     for index, (name, colour) in enumerate(zip("xyz", _COLOURS, strict=True)):
-        x = _WIDTH - _RIGHT - 60.0 * (2 - index)
+        x = WIDTH - _RIGHT - 60.0 * (2 - index)
         drawing.text(x, 12.0, f"target {name}", "end", f'fill="var(--{colour})"')
     return drawing.svg("Residuals of the used views over each joint's angle", 2 * _PANEL + 36.0)

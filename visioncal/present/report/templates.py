@@ -38,11 +38,11 @@ def _environment(*, has_result: bool) -> Environment:
     if not has_result:
         return environment
     from visioncal.present import advice, arms, details, facts, result_parts, torques, words
-    from visioncal.present.report import content, network, plots
+    from visioncal.present.report import cell_picture, content, network, plots
 
     called = (
         *(result_parts, facts, arms, details, torques, advice, words),
-        *(content, network, plots),
+        *(cell_picture, content, network, plots),
     )
     environment.globals |= {
         name: var

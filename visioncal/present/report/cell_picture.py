@@ -1,0 +1,189 @@
+"""A picture of the cell: its arms, and where cameras and boards stood in the views."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from visioncal.core.transforms import apply, invert
+from visioncal.core.types import FloatArray
+from visioncal.present import result_parts
+from visioncal.present.report.plots import LINE_HEIGHT, WIDTH, Drawing
+from visioncal.present.result_parts import FrameHierarchy
+from visioncal.results import Calibration, ViewResult
+from visioncal.results.evidence import ViewEvidence
+from visioncal.session import Session, View
+from visioncal.session.frames import CELL
+from visioncal.session.observations import robot_rows_at_stops
+from visioncal.vision.camera import matrix_3x3
+from visioncal.vision.targets import extent_m
+
+# Height of the picture, and what remains free at its borders [px].
+_HEIGHT, _BORDER = 340.0, 36.0
+# It is seen from so far above [rad].
+_ELEVATION_RAD = np.deg2rad(25.0)
+# Sides that it may be seen from.
+_SIDES = 72
+# Length of a drawn camera as a share of the arm's reach.
+_FRUSTUM = 0.1
+# Most views that are drawn.
+_MOST_VIEWS = 60
+_HALO = 'style="paint-order:stroke;stroke:var(--page);stroke-width:4"'
+_ROUND = 'style="stroke-linecap:round;stroke-linejoin:round"'
+# Corners of a camera's image in the order of the lines of its pyramid; 0 is its centre.
+_PYRAMID = (0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A line of the picture."""
+
+    name: str  # Frame whose name is written at the first point.
+    colour: str  # One of the page's.
+    width: float  # [px]
+    points: FloatArray  # (n, 3) in the cell [m].
+
+
+def cell_picture(
+    calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
+) -> Markup:
+    """The cell from the side: arms, and the cameras and boards of the used views.
+
+    Args:
+        calibration: The result.
+        session: Its session, for boards and joint angles; without it there is no picture.
+        evidence: Poses of the views, for one camera and robot.
+    """
+    frames = result_parts.frames(calibration)
+    if session is None or calibration.mount == "instrument" or not frames.robots:
+        return Markup("")
+    rows = robot_rows_at_stops(session.declaration, session.views)
+    by_view = {view.view: view for view in evidence}
+    cell = _Cell(calibration, session, by_view, frames, rows)
+    used = [view for view in calibration.views if view.used]
+    used = used[:: max(1, -(-len(used) // _MOST_VIEWS))]
+    arms = [*cell.arms(used)]
+    reach_m = max((float(np.ptp(arm.points, axis=0).max()) for arm in arms), default=1.0)
+    lines = [*arms, *cell.seen(used, _FRUSTUM * reach_m)]
+    if len(lines) == len(arms):
+        return Markup("")
+    # The first robot's base is upright, which the cell's frame may not be.
+    upright = invert(frames.matrices[frames.parents[min(frames.robots)]])
+    strips = [apply(upright, line.points) for line in lines]
+    starts = dict[str, list[FloatArray]]()
+    for line, strip in zip(lines, strips, strict=True):
+        starts.setdefault(line.name, []).append(strip[0])
+    middles = np.array([np.mean(each, axis=0) for each in starts.values()])
+    project = _projection(np.vstack(strips), middles)
+    drawing, lowest = Drawing(), -LINE_HEIGHT
+    for line, strip in zip(lines, strips, strict=True):
+        path = "L".join(f"{x:.1f} {y:.1f}" for x, y in project(strip))
+        drawing.path(line.colour, line.width, f"M{path}", _ROUND)
+    for (x, y), name in sorted(zip(project(middles).tolist(), starts, strict=True), key=_height):
+        lowest = max(y + 4.0, lowest + LINE_HEIGHT)
+        drawing.text(x + 12.0, lowest, name, "start", _HALO)
+    return drawing.svg("The cell: its arms, and cameras and boards in the views", _HEIGHT)
+
+
+def _height(named: tuple[Sequence[float], str]) -> float:
+    return named[0][1]
+
+
+def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Parallel projection of points (n, 3) [m] to the drawing.
+
+    It is from the side where the named points (k, 3) are farthest from each other.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
+    cos, sin, level = np.cos(angles), np.sin(angles), np.zeros(_SIDES)
+    rise = np.sin(_ELEVATION_RAD)
+    down = np.stack([rise * sin, -rise * cos, level - np.cos(_ELEVATION_RAD)], axis=1)
+    axes = np.stack([np.stack([cos, sin, level], axis=1), down], axis=1)
+    places = named @ np.swapaxes(axes, 1, 2)
+    first, second = np.triu_indices(len(named), 1)
+    between = np.linalg.norm(places[:, first] - places[:, second], axis=2)
+    best = axes[int(np.argmax(between.min(axis=1, initial=np.inf)))]
+    low, high = (points @ best.T).min(axis=0), (points @ best.T).max(axis=0)
+    room = np.array([WIDTH, _HEIGHT]) - 2.0 * _BORDER
+    scale = float(np.min(room / np.maximum(high - low, 1e-9)))
+    middle = 0.5 * np.array([WIDTH, _HEIGHT]) - scale * 0.5 * (low + high)
+    return lambda of: np.asarray(scale * (of @ best.T) + middle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cell:
+    """A cell in its views."""
+
+    calibration: Calibration  # The result.
+    session: Session  # Its session.
+    evidence: Mapping[int, ViewEvidence]  # Poses of the views, for one camera and robot.
+    frames: FrameHierarchy  # Tree of frames.
+    rows: Mapping[int, Mapping[str, View]]  # Rows with the robots' poses, by view and robot.
+
+    def flange_pose(self, flange: str, view: int) -> FloatArray | None:
+        """(4, 4) `base_from_flange` in a view; None where it is unknown."""
+        if self.calibration.cell is None:
+            return self.evidence[view].base_from_flange if view in self.evidence else None
+        row = self.rows.get(view, {}).get(self.frames.robots[flange])
+        pose = None if row is None else row.base_from_flange()
+        return None if pose is None else np.asarray(pose.as_matrix())
+
+    def pose(self, frame: str, view: int) -> FloatArray | None:
+        """(4, 4) pose of a frame in the cell in a view; None where it is unknown."""
+        matrix = np.eye(4)
+        while frame != CELL:
+            edge = self.frames.matrices.get(frame)
+            if frame in self.frames.robots:
+                edge = self.flange_pose(frame, view)
+            if edge is None:
+                return None
+            matrix, frame = edge @ matrix, self.frames.parents[frame]
+        return matrix
+
+    def arms(self, views: Sequence[ViewResult]) -> Iterator[_Line]:
+        """Each arm in the middle one of its views; a straight line without joint angles."""
+        models = result_parts.calibrated_robots(self.calibration)
+        for flange, name in self.frames.robots.items():
+            poses = {view.view: self.flange_pose(flange, view.view) for view in views}
+            known = [(view, pose) for view, pose in poses.items() if pose is not None]
+            if not known:
+                continue
+            view, pose = known[len(known) // 2]
+            row, robot = self.rows.get(view, {}).get(name), models.get(name)
+            joints_rad = None if row is None else row.joints_rad
+            places = pose[None, :3, 3]
+            if robot is not None and joints_rad is not None:
+                places = robot.link_frames(joints_rad)[:, :3, 3]
+            base, arm = self.frames.parents[flange], np.vstack([np.zeros(3), places])
+            yield _Line(base, "muted", 6.0, apply(self.frames.matrices[base], arm))
+
+    def seen(self, views: Sequence[ViewResult], size_m: float) -> Iterator[_Line]:
+        """Boards and cameras in the views, each place once."""
+        cameras = result_parts.cameras(self.calibration)
+        boards = result_parts.stated_boards(self.session)
+        drawn = set[tuple[str, bytes]]()
+        for view in views:
+            for frame in (view.seen or "target", view.seer or "cam"):
+                pose = self.pose(frame, view.view)
+                if pose is None or (frame, pose.round(4).tobytes()) in drawn:
+                    continue
+                drawn.add((frame, pose.round(4).tobytes()))
+                camera = cameras.get(frame, cameras.get(""))
+                board = boards.get(frame) or boards.get(frame.partition("_")[2])
+                if frame.startswith("cam") and camera is not None:
+                    corners = _rectangle(np.zeros(2), np.array(camera.camera.resolution), 1.0)
+                    rays = size_m * corners @ np.linalg.inv(matrix_3x3(camera.camera)).T
+                    ends = np.vstack([np.zeros(3), rays])[[*_PYRAMID]]
+                    yield _Line(frame, "accent", 1.0, apply(pose, ends))
+                elif board is not None:
+                    ends = _rectangle(*extent_m(board), 0.0)[[0, 1, 2, 3, 0]]
+                    yield _Line(frame, "good", 1.0, apply(pose, ends))
+
+
+def _rectangle(low: FloatArray, high: FloatArray, depth: float) -> FloatArray:
+    """(4, 3) corners of a rectangle at a depth."""
+    (left, top), (right, bottom) = low, high
+    return np.array(
+        [[left, top, depth], [right, top, depth], [right, bottom, depth], [left, bottom, depth]]
+    )
