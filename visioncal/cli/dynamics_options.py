@@ -21,11 +21,9 @@ from visioncal.core.choices import DYNAMICS_FILE, GAIN_SIGMA
 FRICTION = ("coulomb", "viscous", "offset")
 PLANNED_FRICTION = (*FRICTION, "motor-inertia")
 
-motions_argument = partial(
-    argument, "A session with streams of angles and torques: a folder or an .rrd."
-)
+motions_argument = partial(argument, "A session with streams of angles and torques.")
 cutoff_option = partial(
-    option, "Of the low-pass. Default: ten times the motion's band.", "--cutoff-hz", min=0.1
+    option, "Of the low-pass; else ten times the motion's band.", "--cutoff-hz", min=0.1
 )
 against_option = partial(
     option, f"A folder of identify, or its {DYNAMICS_FILE}.", "--against", default=REQUIRED
@@ -38,9 +36,7 @@ class StreamOptions:
 
     stream: list[str] | None = option("A stream with torques; may be repeated. Default: all.")
     cutoff_hz: float | None = cutoff_option()
-    gains: str | None = option(
-        "Torque for a current, by joint [N m/A], where currents were recorded.", metavar="K1,K2,..."
-    )
+    gains: str | None = option("Torque for a current, by joint [N m/A].", metavar="K1,K2,...")
     robot: str | None = robot_name()
 
 
@@ -55,21 +51,16 @@ class ExcitationOptions:
     duration: float = _motion("Duration of the exciting motion, in s.", default=20.0)
     harmonics: int = _motion("Harmonics of that period.", default=5)
     friction: str = _motion(
-        f"What is to be identified besides inertias: {', '.join(PLANNED_FRICTION)}; or none.",
+        f"Identified, too: {', '.join(PLANNED_FRICTION)}; or none.",
         default="coulomb,viscous,offset",
     )
     sweep_speeds: int = _motion("Speeds at which each joint sweeps.", default=6)
     no_sweeps: bool = _motion("Only the exciting motion.", "--no-sweeps", default=False)
     rate_hz: float = _motion(
-        "Sampling rate of the tables, in Hz.", "--rate", default=500.0, min=1.0, max=4000.0
+        "Sampling rate of the tables.", "--rate", default=500.0, min=1.0, max=4000.0
     )
-    starts: int = _motion(
-        "Random motions to search from; more take longer and find better ones.", default=4
-    )
-    seconds: float | None = _motion(
-        "End the search after this time of one core, in s, once a motion is found; the "
-        "result then depends on the computer."
-    )
+    starts: int = _motion("Random motions to search from.", default=4)
+    seconds: float | None = _motion("Longest search on one core (s).", min=1.0)
     seed: int = _motion("Random seed of the starts.", default=0, min=0)
 
 
@@ -79,9 +70,7 @@ class ArmOptions:
 
     speed: float = kept_option("Fraction of the maximum speeds.", default=0.9)
     acceleration: float = kept_option("Fraction of the maximum accelerations.", default=0.9)
-    torque_margin: float = kept_option(
-        "Safety factor on the torques of the nominal inertias.", default=1.2
-    )
+    torque_margin: float = kept_option("Safety factor on nominal torques.", default=1.2)
     tool: tuple[float, float] | None = numbers_option(
         "What sticks out of the flange, along its z, in mm.",
         form="length,radius",
@@ -92,12 +81,10 @@ class ArmOptions:
         form="kg,x,y,z",
         panel="What the arm must keep",
     )
-    range_deg: float | None = _missing(
-        "Range to either side of joints without limits.", min=1e-3, max=1e6
-    )
+    range_deg: float | None = _missing("Either way, of joints without limits.", min=1e-3, max=1e6)
     speed_deg: float | None = _missing("Maximum speed, in deg/s.", min=1e-3, max=1e6)
     acceleration_deg: float | None = _missing(
-        "Maximum acceleration, in deg/s^2.", min=1e-3, max=1e6
+        "Largest acceleration, in deg/s^2.", min=1e-3, max=1e6
     )
 
 
@@ -142,24 +129,15 @@ class DynamicsIdentifyOptions:
 
     session: Path = motions_argument()
     streams: StreamOptions
-    validate_on: str | None = option(
-        "A stream to predict. Default: the last 30 % of the fastest motion."
-    )
-    output: Path | None = option(
-        f"A folder for {DYNAMICS_FILE}, report and recording.", "-o", "--output", file_okay=False
-    )
+    validate_on: str | None = option("A stream to predict; else the end of the fastest.")
+    output: Path | None = out_folder(f"A folder for {DYNAMICS_FILE} and report.", "-o", "--output")
     friction: str = option(
-        f"Friction terms of the joints: {', '.join(FRICTION)}; or none.",
-        default="coulomb,viscous,offset",
+        f"Terms: {', '.join(FRICTION)}; or none.", default="coulomb,viscous,offset"
     )
     rotors: bool | None = option(
-        "Motors' inertia in the torques, or none in those of sensors behind the gears. "
-        "Default: whichever predicts unseen torques better.",
-        "--rotors/--no-rotors",
+        "Motors' inertia in the torques; else as fits.", "--rotors/--no-rotors"
     )
-    stribeck: bool = option(
-        "Look for humps of dry friction.", "--stribeck/--no-stribeck", default=True
-    )
+    stribeck: bool = option("Humps of friction.", "--stribeck/--no-stribeck", default=True)
     unchecked: bool = flag("Take torques that contradict the robot's inertias.")
     as_json: bool = json_flag()
 
@@ -188,9 +166,7 @@ class DynamicsPayloadOptions:
     streams: StreamOptions
     against: Path = against_option()
     same_friction: bool = flag("Friction is as it was without the payload, however it presses.")
-    gains_sigma: float = option(
-        "Sigma of each of the --gains, in percent.", default=100.0 * GAIN_SIGMA, min=0.0
-    )
+    gains_sigma: float = option("Sigma of --gains, in %.", default=100.0 * GAIN_SIGMA, min=0.0)
     as_json: bool = json_flag()
 
 

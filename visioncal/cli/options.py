@@ -1,5 +1,6 @@
 """Options of commands, declared as fields of the records that they take; shared ones once."""
 
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -41,22 +42,25 @@ def argument(words: str, default: object = REQUIRED, **attributes: object) -> An
 
 
 session_argument = partial(argument, "A session's folder, or its .rrd recording.")
-out_folder = partial(option, "The folder to write into.", "-o", "--out", file_okay=False)
 out_file = partial(option, "The file to write; otherwise, or as -, stdout.", "-o", "--out")
 json_flag = partial(flag, "Print the result as JSON to stdout, without words.", "--json")
 force_flag = partial(flag, "Replace what is there under the same name; never a folder.", "--force")
 force_bad = partial(flag, "Use a result even if its verdict is bad.", "--force")
 force_both = partial(flag, "Replace an existing file; and use a result that is bad.", "--force")
-yes_flag = partial(
-    flag, "Move the arm without asking: the cell is clear, a hand on the stop button.", "--yes"
-)
+yes_flag = partial(flag, "Do not ask: the cell is clear, a hand on the stop button.", "--yes")
 seed_option = partial(option, "Random seed.", "--seed", default=0, min=0)
 camera_name = partial(option, "Of a whole cell: which camera, as left.", "--camera")
 robot_name = partial(option, "Of a whole cell: which robot, as a.", "--robot")
 against_option = partial(
     option, "The calibration: an output folder of calibrate, or its .rrd.", default=REQUIRED
 )
-size_option = partial(option, parse=size_in, metavar="W,H")
+# Of an option for the size of images.
+SIZE: Mapping[str, Any] = {"parse": size_in, "metavar": "W,H"}
+
+
+def out_folder(words: str = "The folder to write into.", *names: str, **attributes: object) -> Any:  # noqa: ANN401
+    """The option of a folder to write into; see `option`."""
+    return option(words, *(names or ("-o", "--out")), file_okay=False, **attributes)
 
 
 def numbers_option(
@@ -87,10 +91,7 @@ class PartOptions:
 class NeedOptions:
     """Required accuracy of the task."""
 
-    need_mm: float | None = option(
-        "Required accuracy of picks, in mm, on which the verdict is based; replaces the "
-        "need in session.toml."
-    )
+    need_mm: float | None = option("Required accuracy of picks, in mm, in place of the session's.")
     need_deg: float | None = option("The same in rotation, in degrees.")
 
 
@@ -98,9 +99,7 @@ class NeedOptions:
 class WorkOptions:
     """How a session is processed, and which drawings are made."""
 
-    threads: int | None = option(
-        "Images searched in parallel; by default one a core. The result is the same.", min=1
-    )
+    threads: int | None = option("Images searched in parallel; else one a core.", min=1)
     no_report: bool = flag(f"Leave {REPORT} out, which takes a second to draw.")
     no_recording: bool = flag(f"Leave {RECORDING} out, for the viewer.")
     images: ImagesKept = option(

@@ -62,31 +62,17 @@ class CalibrateOptions:
     need: NeedOptions
     work: WorkOptions
     out: Path = out_folder(default=Path("out"))
-    views: tuple[int, ...] | None = option(
-        "These views alone, as those before or after something moved.",
-        metavar="1-12,14",
-        parse=views_in,
-    )
-    solver: SolverName = option(
-        "The joint fit, or a closed form by name; all are compared anyway.", default="joint"
-    )
+    views: tuple[int, ...] | None = option("These views alone.", metavar="1-12,14", parse=views_in)
+    solver: SolverName = option("The joint fit, or a closed form.", default="joint")
     level: str = option(
         "What is calibrated of the arm: hand-eye (nothing), offsets (of its joints), "
         "kinematics, elastic (bending joints, too), thermal (drift with temperature, too).",
         default="auto",
         metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
     )
-    convention: Convention | None = option(
-        "Convention of the arm's joint table in the result; by default the stated one."
-    )
-    corrected: bool = flag(
-        "Targets are corrected for the calibrated arm (visioncal correct) before they are "
-        "sent; else the verdict is about picks by the controller's own poses."
-    )
-    dense: bool = flag(
-        "Fit the board to all pixels of images that are too blurred, by focus or motion, "
-        "for the corners to be found."
-    )
+    convention: Convention | None = option("Of the arm's joint table; else as stated.")
+    corrected: bool = flag("Targets are sent corrected (visioncal correct), and judged so.")
+    dense: bool = flag("Fit the board to all pixels of images that are too blurred for corners.")
     as_json: bool = json_flag()
     verbose: bool = flag("Also show every solver's result.", "-v", "--verbose")
 
@@ -101,24 +87,14 @@ class BatchOptions:
     bad; 2: there is none.
     """
 
-    out: Path = option(
-        "Folder for the results, one in each session's.",
-        "-o",
-        "--out",
-        default=REQUIRED,
-        file_okay=False,
-    )
+    out: Path = out_folder(default=REQUIRED)
     need: NeedOptions
     sessions: list[str] | None = argument(
-        "Sessions, recordings, folders with some below them, or globs.", default=None
+        "Sessions, recordings, their folders, or globs.", default=None
     )
-    workers: int | None = option(
-        "Number of parallel workers, on one core each; by default one a core.", min=1
-    )
+    workers: int | None = option("Parallel workers, one core each; else one a core.", min=1)
     scheduler: str | None = option(
-        "A Dask scheduler, as tcp://HOST:8786, whose workers see the same files; needs "
-        "the extra cluster.",
-        metavar="ADDRESS",
+        "A Dask scheduler, as tcp://HOST:8786 (extra cluster).", metavar="ADDRESS"
     )
     level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
     no_report: bool = flag(f"Leave each {REPORT} out.")
@@ -134,25 +110,15 @@ class ShowOptions:
     --viewer --web the page's URL goes to stdout, and only this machine can reach it; Ctrl-C ends.
     """
 
-    result: Path = argument(
-        "An output folder, its calibration.json, or a recording (.rrd); with --viewer a plan, too.",
-        metavar="OUT",
-    )
+    result: Path = argument("An output folder, its calibration.json, or an .rrd.", metavar="OUT")
     out: Path | None = option("The page; report.html or certificate.html otherwise.", "-o", "--out")
     viewer: bool = flag("Open the recording in the rerun viewer, instead.")
     web: bool = flag("With --viewer: in a browser, not in a window.", needs="viewer")
-    view: int | None = option(
-        "With --viewer: the number of the view to open the window at. Default: the worst; "
-        "in a browser the first.",
-        needs="viewer",
-    )
+    view: int | None = option("With --viewer: at which view; else the worst.", needs="viewer")
     certificate: bool = flag("One page to print and sign, instead.")
     operator: str = option("With --certificate: who calibrated.", default="", needs="certificate")
     serial: list[tuple[str, str]] | None = option(
-        "With --certificate, as camera=1234.",
-        metavar="WHAT=NUMBER",
-        parse=serial_in,
-        needs="certificate",
+        "As camera=1234.", metavar="WHAT=NUMBER", parse=serial_in, needs="certificate"
     )
 
 
@@ -168,9 +134,7 @@ class VerifyOptions:
     against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
-    output: Path | None = option(
-        f"A folder for {REPORT} and {VERIFY}.", "-o", "--output", file_okay=False
-    )
+    output: Path | None = out_folder(f"A folder for {REPORT} and {VERIFY}.", "-o", "--output")
     as_json: bool = json_flag()
 
 
@@ -195,36 +159,21 @@ class ExportOptions:
     nothing was written, for the reason given; 3: nothing was, as the result's verdict is bad.
     """
 
-    source: Path = argument(
-        "An output folder, its calibration.json or dynamics.json, a recording (.rrd), or "
-        "a file of frames."
-    )
-    to: str = option(
-        "A format by its name, as ros, urdf, ur or easy-handeye; --list has all of them.",
-        default=REQUIRED,
-        metavar="FORMAT",
-    )
+    source: Path = argument("An output folder, its .json, a recording, or a file of frames.")
+    to: str = option("A format, as ros or ur; see --list.", default=REQUIRED, metavar="FORMAT")
     part: PartOptions
     out: Path | None = out_file()
-    edge: str | None = option(
-        "The transform; where none is named the camera's, the only tool or the only "
-        "fixture, as the format has it. Of an aligned cell any frame from any other, or all."
-    )
+    edge: str | None = option("The transform; of a cell any frame from any other, or all.")
     inverse: bool = flag("Write the inverse of it.")
     parent: str | None = option("Exported name of the frame in which the pose is given.")
     child: str | None = option("Exported name of the frame whose pose it is.")
     number: int | None = option("Number of the controller's tool or base.")
     mass_kg: float | None = option("The tool's mass, for ABB's tooldata (kg).")
     cog_mm: tuple[float, float, float] | None = option(
-        "Its centre of mass in the flange's frame: X Y Z (mm)."
+        "Its centre of mass in the flange: X Y Z (mm)."
     )
-    convention: str | None = option(
-        "robot-dh: convention of its joint table; modified is Craig's.",
-        metavar="|".join(get_args(Convention)),
-    )
-    calibration_hash: str | None = option(
-        "ur-kinematics: the hash that ur_calibration extracts.", "--hash"
-    )
+    convention: str | None = option("Of robot-dh's table.", metavar="|".join(get_args(Convention)))
+    calibration_hash: str | None = option("Hash of ur_calibration, for ur-kinematics.", "--hash")
     force: bool = force_both()
     _list: bool = flag("List the formats.", "--list", callback=_show_formats, is_eager=True)
 
@@ -237,36 +186,21 @@ class CorrectOptions:
     status 3: nothing was, as the calibration's verdict is bad.
     """
 
-    targets: Path = argument(
-        "A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
-        "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
-    )
+    targets: Path = argument("A table with the columns of views.csv; others are kept.")
     calibration: Path = against_option("-c", "--against", "--calibration")
     part: PartOptions
     out: Path | None = out_file()
-    tool: str | None = option(
-        "Frame of the targets and of the corrected ones: a tool of the calibration, or "
-        "cam; by default the flange."
-    )
-    seed_joints: str | None = option(
-        "Joint angles near which the first target is reached, in radians; else the "
-        "middle of the joints' limits. Each further target is reached near to the one before.",
-        metavar="Q1,Q2,...",
-    )
+    tool: str | None = option("Frame of the targets: a tool, or cam; else the flange.")
+    seed_joints: str | None = option("Joints [rad] near the first target's.", metavar="Q1,Q2,...")
     payload_kg: float = option("Payload on the flange, for joints that bend (kg).", default=0.0)
     payload_m: tuple[float, float, float] = numbers_option(
-        "Its centre of mass in the flange's frame (m).", form="x,y,z", default="0,0,0"
+        "Its centre in the flange [m].", form="x,y,z", default="0,0,0"
     )
     widest_deg: float = option(
-        "Warn where a joint turns farther than this from one target to the next.",
-        default=math.degrees(WIDEST_RAD),
-        min=1e-3,
-        max=720.0,
+        "Warn of wider turns.", default=math.degrees(WIDEST_RAD), min=1e-3, max=720.0
     )
     temperatures: str | None = option(
-        "Temperatures of the links behind the joints, in degrees Celsius, for an arm "
-        "whose drift was calibrated; else as warm as it was when its session began.",
-        metavar="T1,T2,...",
+        "Of the links [deg C], for an arm with drift.", metavar="T1,T2,..."
     )
     skip: bool = flag("Write the other targets where some are refused.", "--skip-unreachable")
     force: bool = force_both()
@@ -287,13 +221,9 @@ class FrameOptions:
     """Destination and name of a frame."""
 
     calibration: Path | None = option(
-        "An output folder of calibrate: what it knows is used, and the frame joins it.",
-        "-c",
-        "--calibration",
+        "An output folder, which the frame joins.", "-c", "--calibration"
     )
-    out: Path | None = option(
-        "A file of frames (.json) to put it into instead; made where missing.", "-o", "--out"
-    )
+    out: Path | None = option("A file of frames (.json) to put it into, instead.", "-o", "--out")
     name: str | None = option("Name of the frame: gripper, jig_2.")
     force: bool = force_flag()
 
@@ -303,7 +233,7 @@ class TouchOptions(RobotPoseOptions):
     """Convention and repeatability of touches."""
 
     touch_noise: float | None = option(
-        "Repeatability of a touch, per axis, in mm.", "--touch-noise-mm", min=1e-4, max=1e3
+        "Sigma of touches, per axis.", "--touch-noise-mm", min=1e-4, max=1e3
     )
 
     @property
@@ -332,9 +262,7 @@ class TcpOptions:
     written: TouchOptions
     part: PartOptions
     touches: Path | None = argument(
-        "A table with a row a touch: the columns of views.csv, kind (point, z or xz) and "
-        "point. Or a session whose images show a target on the tool.",
-        default=None,
+        "A table of touches, or a session that shows the tool.", default=None
     )
     point: tuple[float, float, float] | None = point_option()
     as_json: bool = json_flag()
@@ -354,19 +282,10 @@ class FixtureOptions:
     goes: FrameOptions
     written: TouchOptions
     part: PartOptions
-    touches: Path | None = argument(
-        "A table with a row a touch: the columns of views.csv, and kind (origin, x or xy) "
-        "or, with --cad, point. Or a session whose images show a target on the fixture.",
-        default=None,
-    )
-    cad: Path | None = option(
-        "A table of the drawing: point, x_mm, y_mm, z_mm (or x_m ...), sigma_mm."
-    )
+    touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
+    cad: Path | None = option("Points of the drawing: point, x_mm, y_mm, z_mm, sigma_mm.")
     cad_unit: str | None = option("What x, y, z in it are in.", metavar="|".join(UNITS_M))
-    tool: str | None = option(
-        "What touched: a tool of the calibration, a file of frames (frames.json, or "
-        "frames.json:gripper), or none, where the poses are of the tip itself."
-    )
+    tool: str | None = option("A tool of the calibration or of a file, or none: poses of the tip.")
     point: tuple[float, float, float] | None = point_option()
     as_json: bool = json_flag()
 
@@ -383,22 +302,12 @@ class TouchTestOptions:
 
     session: Path = session_argument()
     calibration: Path = against_option("-c", "--calibration")
-    tool: str | None = option(
-        "Which tool of the calibration has the tip, see tcp; its only tool need not be "
-        "named. none: a gauge of --clearance-mm before the flange."
-    )
+    tool: str | None = option("The tool that touches; none: a gauge of --clearance-mm.")
     clearance_mm: float | None = option(
-        "With --tool none: the flange comes no nearer to the board, and a gauge of this "
-        "length has the tip; longer than all that the flange carries.",
-        min=0.0,
-        max=2000.0,
+        "Length of that gauge, beyond all on the flange.", min=0.0, max=2e3
     )
-    height_mm: float = option(
-        "Hovering height, before the touch.", default=50.0, min=1.0, max=1000.0
-    )
-    gaps_mm: str | None = option(
-        "Measured gaps from tip to point, in their order.", metavar="A,B,C,D,E"
-    )
+    height_mm: float = option("Height of the hover.", default=50.0, min=1.0, max=1000.0)
+    gaps_mm: str | None = option("Gaps from tip to point, in order.", metavar="A,B,C,D,E")
     force: bool = force_bad()
     as_json: bool = json_flag()
 
@@ -412,8 +321,7 @@ class LocateOptions:
     """
 
     source: Path | None = argument(
-        "A session, or one image (png, jpg, tif, bmp, webp); may be left out with --pixel.",
-        default=None,
+        "A session, or one image; not needed with --pixel.", default=None
     )
     calibration: Path = against_option("-c", "--calibration")
     pixel: list[tuple[float, float]] | None = numbers_option(
@@ -424,18 +332,13 @@ class LocateOptions:
     point: tuple[float, float, float] | None = numbers_option(
         "A point of the target, instead of its origin.", "--point-mm", form="x,y,z", scale=1e-3
     )
-    target: str | None = option(
-        "What to look for, instead of the session's own: a name in targets/, a .toml, or "
-        "in one word as marker_DICT_4X4_50_10_48mm; or one of a whole cell's, as floor."
-    )
+    target: str | None = option("Another target than the session's; see convert.")
     camera: str | None = camera_name()
     robot: str | None = robot_name()
     view: int | None = option("Which of the session's views; else all that show the target.")
     pose: tuple[float, ...] | None = numbers_option(
         "Pose of the flange at the image, in metres, for a camera on the flange.", form=POSE
     )
-    sigma_px: float | None = option(
-        "Noise of a feature's coordinate; else that of the calibration's corners."
-    )
+    sigma_px: float | None = option("Noise of a feature; else that of the corners.")
     force: bool = force_bad()
     as_json: bool = json_flag()

@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 
 from visioncal.cli.options import (
     REQUIRED,
+    SIZE,
     argument,
     flag,
     force_flag,
@@ -16,7 +17,6 @@ from visioncal.cli.options import (
     out_folder,
     seed_option,
     session_argument,
-    size_option,
     yes_flag,
 )
 from visioncal.cli.parsing import names_in, pair_in
@@ -38,6 +38,7 @@ _cell = partial(option, panel="The cell, where the source does not say it")
 _certainty = partial(option, panel="How well it is known")
 kept_option = partial(option, panel="What the arm must keep")
 _span = partial(numbers_option, form="near,far", scale=1e-3, panel="What the arm must keep")
+_size = partial(option, default=0.0, min=0.0, max=100.0)
 _record_cell = partial(option, panel="The cell, where no plan says it")
 _taking = partial(option, panel="How views are taken")
 _moving = partial(option, panel="How the arm is moved")
@@ -54,6 +55,8 @@ MOST_FOR_NEED = 40
 _USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
 _FORMS = f"{', '.join(POSE_FORMS)}, or a rotation such as euler-ZYX-deg, quaternion-wxyz"
 _UNITS = "|".join(UNITS_M)
+_BOARD = "A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm"
+_ROUGH, _POSE = "In mm and degrees, about fixed x, y, z.", "'X Y Z RX RY RZ'"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +72,7 @@ class DemoOptions:
     out: Path = out_folder(default=Path("demo"))
     views: int = option("Number of views.", default=20, min=5, max=200)
     seed: int = seed_option()
-    live: bool = flag(
-        "Plan the stops and record them, with a UR's own client library and a simulated controller."
-    )
+    live: bool = flag("Plan and record the stops, with a UR's client library and a simulated arm.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,76 +83,38 @@ class SimulateOptions:
     mount: CameraMount = option("Where the camera is.", default="eye-in-hand")
     views: int = option("Number of views.", default=20, min=1)
     robot: str = option("The arm.", default="ur10e", metavar="|".join(SIMULATED_ARMS))
-    camera: Literal["wide", "fine", "fisheye"] = option(
-        "1280 x 800, 2448 x 2048, or a fisheye.", default="wide"
-    )
+    camera: Literal["wide", "fine", "fisheye"] = option("Its size and lens.", default="wide")
     board: Literal[
         "charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"
     ] = option("The board's pattern.", default="charuco")
     second_board: bool = flag("A second board, a checkerboard, beside it.")
-    robot_sigma_mm: float = option(
-        "Repeatability of the robot (mm).", default=0.03, min=0.0, max=100.0
-    )
-    robot_sigma_mrad: float = option(
-        "Repeatability of its rotation (mrad).", default=0.05, min=0.0, max=100.0
-    )
-    arm_sigma_mm: float = option(
-        "Sigma of the errors of the arm's lengths (mm).", default=0.0, min=0.0, max=100.0
-    )
-    arm_sigma_mrad: float = option(
-        "Sigma of the errors of its angles (mrad).", default=0.0, min=0.0, max=100.0
-    )
+    robot_sigma_mm: float = _size("Repeatability of the robot (mm).", default=0.03)
+    robot_sigma_mrad: float = _size("Repeatability of its rotation (mrad).", default=0.05)
+    arm_sigma_mm: float = _size("Sigma of the errors of the arm's lengths (mm).")
+    arm_sigma_mrad: float = _size("Sigma of the errors of its angles (mrad).")
     wrong_views: int = option("Views whose reported pose is wrong.", default=0, min=0)
-    board_scale: float = option(
-        "Ratio of printed to stated size of the board.", default=1.0, min=0.5, max=2.0
-    )
-    with_intrinsics: bool = option(
-        "Whether the session states the camera's intrinsics.", default=True
-    )
-    images: bool = option(
-        "Whether to render images; pose pairs are written otherwise.", default=True
-    )
-    sweep: bool = option(
-        "A sweep without stops: pose pairs by one clock, the robot by another.", default=False
-    )
+    board_scale: float = option("Printed over stated size.", default=1.0, min=0.5, max=2.0)
+    with_intrinsics: bool = option("Whether the session states the lens.", default=True)
+    images: bool = option("Whether to render images; else pose pairs.", default=True)
+    sweep: bool = option("A sweep without stops, by two clocks: pose pairs.", default=False)
     clock_offset_ms: float = option("With --sweep: lead of the camera's clock (ms).", default=37.0)
     readout_ms: float = option(
-        "With --sweep: readout time from an image's first row to its last (ms); unless "
-        "0, the frames have corners (corners.csv) in place of poses.",
-        default=0.0,
+        "With --sweep: readout of an image (ms); gives corners, not poses.", default=0.0
     )
-    warm_up: bool = option(
-        "A cold arm that works for 100 minutes: pose pairs, and its joints' temperatures.",
-        default=False,
-    )
+    warm_up: bool = option("A cold arm that works for 100 minutes: pose pairs.", default=False)
     cell: str | None = option(
-        f"A whole cell: {', '.join(SIMULATED_CELLS)}, or a file that describes one.",
-        metavar="NAME|FILE.toml",
+        f"A whole cell: {', '.join(SIMULATED_CELLS)}, or its file.", metavar="NAME|FILE"
     )
     instrument: Instrument | None = option(
-        "A tracker that reads one point or three on the flange, or a probe; of a whole "
-        "cell on every flange."
+        "A tracker that reads points on every flange, or a probe."
     )
-    torques: bool = flag(
-        "Streams of a moving arm's torques, without views; of a whole cell beside its views."
-    )
+    torques: bool = flag("Streams of a moving arm's torques; without views, but for a whole cell.")
     touches: bool = flag("Also touches of a tool and a fixture by every robot, in touches.csv ...")
-    currents: bool = option(
-        "Motor currents: with --warm-up for temperatures, with --torques for torques.",
-        default=False,
-    )
-    stiffness_knm: float | None = option(
-        "Stiffness of every joint (kN m/rad); rigid if left out.", min=0.1
-    )
-    payload_kg: list[float] | None = option(
-        "Payload of the arm (kg); repeated for stops in turn.", min=0.0
-    )
-    recording: int = option(
-        "Another recording of the same cell: fresh stops, for verify and locate.", default=0, min=0
-    )
-    camera_moved_mm: float = option(
-        "How far the camera was knocked (mm); the first.", default=0.0, min=0.0, max=100.0
-    )
+    currents: bool = option("Currents, with --warm-up or --torques.", default=False)
+    stiffness_knm: float | None = option("Stiffness of every joint (kN m/rad).", min=0.1)
+    payload_kg: list[float] | None = option("Payload (kg); repeated for stops in turn.", min=0.0)
+    recording: int = option("Number of another recording of the cell.", default=0, min=0)
+    camera_moved_mm: float = _size("How far the first camera was knocked (mm).")
     seed: int = seed_option()
     given: frozenset[str]  # Names of the fields that were typed.
 
@@ -166,16 +129,14 @@ class BoardOptions:
     columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
     rows: int | None = option("The same along y.")
     square_mm: float | None = option(
-        "Side of a square, distance of rows of circles; left out: the largest."
+        "Side of a square, or distance of circles' rows; else the largest."
     )
     marker_mm: float | None = option("Side of the markers of a ChArUco board.")
     dictionary: str = option("As DICT_5X5_100, DICT_APRILTAG_36h11.", default="")
     legacy: bool = flag("The ChArUco layout from before OpenCV 4.6.")
     marker_id: int | None = option("Id of a single marker; an AprilGrid's first.", "--id")
     size_mm: float | None = option("Side of a single marker or a tag; left out: the largest.")
-    spacing: float | None = option(
-        "White between an AprilGrid's tags, as a share of their side: 0.3."
-    )
+    spacing: float | None = option("White between an AprilGrid's tags, in their sides: 0.3.")
     border: int | None = option("Dark modules around their bits: 2, as Kalibr has it.")
     diameter_mm: float | None = option("Diameter of circles.")
     asymmetric: bool = flag("Every second row of circles is shifted by half.")
@@ -191,15 +152,10 @@ class TargetMakeOptions:
     """
 
     target: str | None = argument(
-        "A board that comes with visioncal, or the path of a .toml; or describe one by "
-        "--kind and the options after it.",
-        default=None,
+        "A board of visioncal's, or a .toml; or see --kind.", default=None
     )
     out: Path = option("Folder for the files.", "-o", "--out", default=Path(), file_okay=False)
-    page: str | None = option(
-        "A5 to A0, letter, legal, tabloid, or a size as 500x300 (width x height, mm). "
-        "Left out: A4, or the smallest larger one for a board of given size."
-    )
+    page: str | None = option("A5 to A0, letter, legal, tabloid, or 500x300 (mm); else as it fits.")
     landscape: bool | None = option("Left out: as the board fits.", "--landscape/--portrait")
     dpi: float = option("Resolution of the PNG, in pixels per inch.", default=300.0)
     board: BoardOptions
@@ -214,9 +170,7 @@ class TargetCheckOptions:
     """
 
     image: Path = argument("A photograph of the board: png, jpg, tif, bmp or webp.")
-    square_mm: float | None = option(
-        "Measured side of a square; of a tag for an AprilGrid or a single one."
-    )
+    square_mm: float | None = option("Measured side of a square, or of a tag.")
     out: Path | None = option("Write the description here.", "-o", "--out")
     as_json: bool = json_flag()
     force: bool = flag("Replace a description that is there.")
@@ -226,27 +180,20 @@ class TargetCheckOptions:
 class StopOptions:
     """What is planned."""
 
-    add: int | None = _what(
-        "How many stops to add to a recorded session, which counts.", min=1, max=500
-    )
+    add: int | None = _what("How many stops to add to a recorded session.", min=1, max=500)
     to_verify: bool = flag(
-        "Calibrated stops with the widest spread, five by default, to be repeated for visioncal "
-        "verify.",
-        "--verify",
+        "Calibrated stops to repeat for visioncal verify, five by default.", "--verify"
     )
     purpose: str = _what(
         "What they are for.", "--for", default="hand-eye", metavar="|".join(PURPOSES)
     )
     stops: int | None = _what(f"How many stops: {_USUAL_STOPS}.", min=1, max=500)
     need_mm: float | None = _what(
-        "Fewer stops where they predict that 95 % of picks land within so many mm; up to "
-        f"{MOST_FOR_NEED} stops where no number is given."
+        f"The fewest stops, up to {MOST_FOR_NEED}, with 95 % of picks within it."
     )
     need_deg: float | None = _what("The same of the rotation, in degrees.")
     start_joints: str | None = _what(
-        "The arm's present joint angles, in radians; without them the path to the first "
-        "stop is not checked.",
-        metavar="Q1,Q2,...",
+        "The arm's present joints [rad], for the way to the first.", metavar="Q1,Q2,..."
     )
     candidates: int = _what("Number of candidate stops.", default=1500, min=12, max=20000)
     seed: int = _what("Random seed of the candidate stops.", default=0, min=0)
@@ -257,41 +204,22 @@ class PlanCellOptions:
     """Options of the cell; None for those that were not given."""
 
     robot: str | None = _cell("The robot, where a session names none.")
-    target: str | None = _cell(
-        "The board: a name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm."
-    )
-    camera: str | None = _cell(
-        "The lens: four numbers in pixels, a file of intrinsics, or an earlier calibration.",
-        metavar="FX,FY,CX,CY | FILE",
-    )
-    resolution: tuple[int, int] | None = size_option(
-        "Size of the images in pixels.", panel="The cell, where the source does not say it"
-    )
+    target: str | None = _cell(_BOARD)
+    camera: str | None = _cell("Numbers [px], or a file of the lens.", metavar="FX,FY,CX,CY | FILE")
+    resolution: tuple[int, int] | None = _cell("Size of the images in pixels.", **SIZE)
     mount: Mount | None = _cell("Where the camera is.")
-    cam: str | None = _cell(
-        "Rough place of the camera on the flange (or in the base), in mm and degrees: "
-        "turned about the fixed axes x, then y, then z. It looks along its z.",
-        metavar="'X Y Z RX RY RZ'",
-    )
+    cam: str | None = _cell(f"Rough camera on the flange (or in the base). {_ROUGH}", metavar=_POSE)
     board: str | None = _cell(
-        "Rough place of the board in the base (or on the flange), in the same form. Its z "
-        "points into the paper: face up is '... 180 0 0'.",
-        metavar="'X Y Z RX RY RZ'",
+        "Rough board in the base (or on the flange); face up: 180 0 0.", metavar=_POSE
     )
-    guess_mm: float = _certainty(
-        "Sigma of both rough positions, per axis, in mm.", default=20.0, min=0.1, max=500.0
-    )
-    guess_deg: float = _certainty(
-        "The same of their rotations, in degrees.", default=5.0, min=0.01, max=45.0
-    )
+    guess_mm: float = _certainty("Sigma of both places, in mm.", default=20.0, min=0.1, max=500.0)
+    guess_deg: float = _certainty("The same of both rotations.", default=5.0, min=0.01, max=45.0)
     noise_px: float | None = _certainty(
-        "Sigma of a corner in the image; by default 0.1, or as recorded.", min=0.0, max=1e3
+        "Sigma of a corner; else 0.1, or as recorded.", min=0.0, max=1e3
     )
-    noise_mm: float | None = _certainty(
-        "Sigma of the robot at a stop, per axis; by default 0.03, or as recorded.", min=0.0, max=1e3
-    )
+    noise_mm: float | None = _certainty("The robot's; else 0.03, or as recorded.", min=0.0, max=1e3)
     noise_deg: float | None = _certainty(
-        "The same of its rotation; by default 0.003, or as recorded.", min=0.0, max=1e3
+        "Its rotation's; else 0.003, or as recorded.", min=0.0, max=1e3
     )
 
     def options(self, *names: str) -> dict[str, object]:
@@ -304,21 +232,14 @@ class ClearanceOptions:
     """Clearances that the arm must keep in any motion."""
 
     boxes: list[str] | None = kept_option(
-        "An obstacle, by its centre in the base and its lengths, in mm; may be repeated.",
-        "--box",
-        metavar="NAME:X,Y,Z:SX,SY,SZ",
+        "Obstacles in the base, in mm.", "--box", metavar="NAME:X,Y,Z:SX,SY,SZ"
     )
-    floor: str = kept_option(
-        "Height of the floor or table in the base, in mm.", default="0", metavar="Z|none"
-    )
+    floor: str = kept_option("Height of the floor in the base.", default="0", metavar="Z|none")
     clearance_mm: float = kept_option(
-        "Distance of the arm from floor, board, boxes and itself.",
-        default=30.0,
-        min=0.0,
-        max=1000.0,
+        "Distance of the arm from floor, board, boxes and itself.", default=30.0, min=0.0, max=1e3
     )
     margin_deg: float = kept_option(
-        "Distance of the joints from their limits.", default=3.0, min=0.0, max=90.0
+        "Distance of joints from their limits.", default=3.0, min=0.0, max=90.0
     )
 
 
@@ -327,17 +248,11 @@ class SightOptions:
     """Conditions that the camera must keep."""
 
     tilt_deg: float = kept_option(
-        "Largest angle between the line of sight and the board's normal.",
-        default=50.0,
-        min=5.0,
-        max=80.0,
+        "Largest tilt of the board to the sight.", default=50.0, min=5.0, max=80.0
     )
-    edge_px: float = kept_option(
-        "Distance of the board from the image's edge.", default=20.0, min=0.0, max=10000.0
-    )
+    edge_px: float = kept_option("Board's distance from the edge.", default=20.0, min=0.0, max=1e4)
     distance_m: tuple[float, float] | None = _span(
-        "Distance of the camera from the board; by default as the board fills the image.",
-        "--distance-mm",
+        "Camera's from the board; else as it fills the image.", "--distance-mm"
     )
     focus_m: tuple[float, float] | None = _span("Depths at which images are sharp.", "--focus-mm")
 
@@ -350,9 +265,7 @@ class PlanOptions:
     a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
     """
 
-    source: str = argument(
-        "A robot (a built-in name, a .urdf or .toml), a session, or an output folder of calibrate."
-    )
+    source: str = argument("A robot, a session, or an output folder of calibrate.")
     wanted: StopOptions
     words: PlanCellOptions
     kept: ClearanceOptions
@@ -365,13 +278,11 @@ class PlanOptions:
 class RecordCellOptions:
     """The cell, where there is no plan."""
 
-    target: str | None = _record_cell(
-        "The board: a name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm."
-    )
+    target: str | None = _record_cell(_BOARD)
     robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
     mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
     pose_form: str | None = _record_cell(
-        "With a manual arm: how poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
+        "How poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
     )
 
 
@@ -381,13 +292,10 @@ class TakingOptions:
 
     frames: int = _taking("Frames a view.", default=3, min=1, max=100)
     still_px: float = _taking(
-        "Image motion above which no view is taken.", default=Stillness.image_px, min=0.01, max=10.0
+        "Largest motion of a still image.", default=Stillness.image_px, min=0.01, max=10.0
     )
     settle_s: float = _taking(
-        "How long arm and image must be still before a view.",
-        default=Stillness.quiet_s,
-        min=0.0,
-        max=30.0,
+        "How long all must be still.", default=Stillness.quiet_s, min=0.0, max=30.0
     )
     speed: float = _moving("Speed of the fastest joint, in rad/s; at most 1.5.", default=PLAN_SPEED)
 
@@ -396,9 +304,7 @@ class TakingOptions:
 class DeviceOptions:
     """Camera settings."""
 
-    resolution: tuple[int, int] | None = size_option(
-        "Size of the images in pixels.", panel="What the camera is set to"
-    )
+    resolution: tuple[int, int] | None = _device("Size of the images in pixels.", **SIZE)
     exposure_us: int | None = _device("Exposure time in microseconds.")
     gain: int | None = _device("ISO, or the device's own unit.")
     focus: int | None = _device("Lens position, in the device's own unit.")
@@ -412,25 +318,11 @@ class RecordOptions:
     recording ended early, the arm stands still, and --resume continues it.
     """
 
-    out: Path = option(
-        "The session's folder; a new one.",
-        "-o",
-        "--out",
-        default=REQUIRED,
-        metavar="SESSION",
-        file_okay=False,
-    )
+    out: Path = out_folder("The session's folder; a new one.", default=REQUIRED, metavar="SESSION")
     arm: str = option(
-        "The arm: a UR by its address, or poses that you type from the pendant.",
-        default=REQUIRED,
-        metavar="ur:HOST|manual",
+        "A UR by its address, or typed poses.", default=REQUIRED, metavar="ur:HOST|manual"
     )
-    camera: str = option(
-        "The camera: an OAK (oak:SERIAL for one of several), a webcam, or a network "
-        "camera's stream.",
-        default=REQUIRED,
-        metavar="oak|uvc:N|uvc:URL",
-    )
+    camera: str = option("OAK, webcam or stream.", default=REQUIRED, metavar="oak|uvc:N|uvc:URL")
     described: RecordCellOptions
     takes: TakingOptions
     device: DeviceOptions
@@ -448,17 +340,15 @@ class RobotPoseOptions:
     """Options for the convention of the robot's poses."""
 
     robot_columns: tuple[str, ...] | None = _names(
-        "Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
-        "--robot-columns",
-        "--robot-key",
+        "Position first: X,Y,Z,A,B,C.", "--robot-columns", "--robot-key"
     )
     robot_form: str | None = _poses(f"Their convention: {_FORMS}.")
     robot_unit: str | None = _poses("Unit of their positions.", metavar=_UNITS)
     robot_inverse: bool | None = _poses(
-        "They give the base in the flange.", "--robot-inverse/--robot-as-is"
+        "They give base in flange.", "--robot-inverse/--robot-as-is"
     )
     joint_columns: tuple[str, ...] | None = _names(
-        "Columns or keys of the joint angles.", "--joint-columns", "--joint-key"
+        "Of joint angles.", "--joint-columns", "--joint-key"
     )
     joint_unit: Literal["rad", "deg"] = _poses("Unit of the joint angles.", default="rad")
     robot_model: str | None = _poses("A built-in robot, or the path of a .urdf or .toml.")
@@ -470,37 +360,23 @@ class ForeignOptions(RobotPoseOptions):
 
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
     mount: CameraMount | None = _recording("Where the camera is.")
-    target: str | None = _recording(
-        "A name in targets/, a .toml, or in one word as checkerboard_9x6_23.6mm, "
-        "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250, marker_DICT_4X4_50_10_48mm."
-    )
+    target: str | None = _recording(f"{_BOARD}, charuco_5x7_36.2mm_18.3mm_DICT_6X6_250.")
     tip: str | None = _recording("The frame that the poses are of.")
     camera_columns: tuple[str, ...] | None = _names(
-        "Columns or keys of measured poses of the target: rvec,tvec.",
-        "--camera-columns",
-        "--camera-key",
+        "Of the target's poses.", "--camera-columns", "--camera-key"
     )
     camera_form: str | None = _poses("As --robot-form.")
     camera_unit: str | None = _poses("Unit of their positions.", metavar=_UNITS)
     camera_inverse: bool | None = _poses(
-        "They give the camera in the target.", "--camera-inverse/--camera-as-is"
+        "They give camera in target.", "--camera-inverse/--camera-as-is"
     )
-    camera_file: Path | None = _poses(
-        "A second file with the camera's poses; with times in both, the clocks' offset is found."
-    )
-    images: Path | None = _camera(
-        "The folder of the images; matched by name, by number, or in order."
-    )
+    camera_file: Path | None = _poses("A second file with the camera's poses; clocks are compared.")
+    images: Path | None = _camera("Folder of the images; matched by name, number, or order.")
     image_column: str | None = _camera(
-        "The column or key that names each row's image.", "--image-column", "--image-key"
+        "Column of the image's name.", "--image-column", "--image-key"
     )
-    intrinsics: str | None = _camera(
-        "A file (ROS, OpenCV, Kalibr, ViSP, .npz, .json), or `estimate` to ignore those "
-        "of the source."
-    )
-    resolution: tuple[int, int] | None = size_option(
-        "Size of the images, in pixels, that the intrinsics hold for.", panel="Its camera"
-    )
+    intrinsics: str | None = _camera("A file of any form, or `estimate` to ignore the source's.")
+    resolution: tuple[int, int] | None = _camera("Size of the images in pixels.", **SIZE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -516,17 +392,12 @@ class ConvertOptions:
     written: ForeignOptions
     force: bool = force_flag()
     guess: bool = _doubt("Try other readings, and print them.", "--guess", default=False)
-    yes: bool = _doubt(
-        "Take the best one where it stands out clearly.", "--yes", default=False, needs="guess"
-    )
+    yes: bool = _doubt("Take one that stands out.", "--yes", default=False, needs="guess")
     mirror_poses: bool = _doubt(
-        "Mirror the robot's poses where its frame is left-handed.",
-        "--mirror-poses",
-        default=False,
-        needs="guess",
+        "Mirror left-handed poses.", "--mirror-poses", default=False, needs="guess"
     )
     exchange: tuple[int, int] | None = _doubt(
-        "Two views whose images are exchanged, by number: 8,17.", parse=pair_in
+        "Two views whose images are exchanged: 8,17.", parse=pair_in
     )
 
 
