@@ -18,7 +18,8 @@ from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.session.kinds import instrument_names, known_instrument, stated_instrument
+from visioncal.session.document import InstrumentTable
+from visioncal.session.kinds import known_instruments, stated_instrument
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 
@@ -90,24 +91,24 @@ def test_wrong_rows_are_named_and_left_out():
 
 
 def test_known_instruments_grow_noisy_with_distance_and_unknown_ones_are_refused():
-    assert len(instrument_names()) == 15
-    tracker = known_instrument("leica-at960")
+    assert len(known_instruments()) == 13
+    tracker = known_instruments()["leica-at960"]
     places = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])
     # 20 um at 5 m is what is commonly said of it.
     assert tracker.sigmas_m(places) == pytest.approx([17.5e-6, 20e-6])
     assert tracker.sigma_rad == pytest.approx(9e-5)
-    assert known_instrument("zeiss-contura").sigma_per_m == 0.0
+    assert known_instruments()["zeiss-contura"].sigma_per_m == 0.0
     # What is stated comes before the table.
-    stated = stated_instrument("leica-at960", 5e-5, None, None)
+    stated = stated_instrument(InstrumentTable(name="leica-at960", sigma_m=5e-5))
     assert (stated.sigma_m, stated.sigma_per_m, stated.sigma_rad) == (5e-5, 0.5e-6, 9e-5)
-    assert stated_instrument("ours", 1e-4, 1e-6, None).sigma_per_m == 1e-6
-    for arguments, words in (
-        (("leica-at96", None, None, None), "not in the table .* Did you mean leica-at960"),
-        (("ours", None, 1e-6, None), "noise is not stated. State sigma_m .*zeiss-contura"),
-        (("renishaw-xl80", 1e-6, None, None), "measures lengths along its beam; readings of pl"),
+    ours = {"name": "ours", "sigma_per_m": 1e-6}
+    assert stated_instrument(InstrumentTable(**ours, sigma_m=1e-4)).sigma_per_m == 1e-6
+    for table, words in (
+        ({"name": "leica-at96"}, "not in the table .* Did you mean leica-at960"),
+        (ours, "noise is not stated. State sigma_m .*zeiss-contura"),
     ):
         with pytest.raises(DataError, match=words):
-            stated_instrument(*arguments)
+            stated_instrument(InstrumentTable(**table))
 
 
 def test_without_a_model_poses_give_the_frames_alone():

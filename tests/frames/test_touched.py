@@ -429,7 +429,7 @@ def test_a_drawings_own_sigma_counts(tmp_path, tool_file):
     # Seven points of 0.1 mm with a tip of 0.2 mm; the eighth would turn them by 10 mrad.
     assert np.abs(np.array(found["matrix"]) - FRAME).max() < 2e-3
     cad.write_text(text.replace(",50,", ",-50,"))
-    assert "sigma_um is negative" in visioncal("fixture", touches, "--cad", cad, "--tool=none").err
+    assert "the sigma is negative" in visioncal("fixture", touches, "--cad", cad, "--tool=none").err
 
 
 def test_which_tool_touched(tmp_path, tool_file):

@@ -142,7 +142,7 @@ def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
     path.write_text(path.read_text() + "img9.png; {X 1, Y 2}\n")
     raised(DataError, r"poses\.txt, line 5.*is no pose", read_fields, path)
     path.write_text("{X 1,Y 2,Z 3,A 4,B 5,C 6}\np[0.1, 0.2, 0.3, 0, 0, 1]\n")
-    raised(DataError, "line 2: another maker's form than KUKA", read_fields, path)
+    raised(DataError, "of several makers: kuka, ur", read_fields, path)
     path.write_text("p[0,0,0,0,0,1]\np[0,0,0,0,0,1] p[0.1,0,0,0,0,1]\n")
     raised(DataError, r"line 2.*is no pose", read_fields, path)
 

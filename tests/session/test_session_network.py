@@ -140,7 +140,7 @@ def test_every_storage_of_it_is_the_same_session(folder, tmp_path):
 @pytest.mark.parametrize(
     ("name", "old", "new", "words"),
     [
-        ("views.csv", "2,0,,right,", "2,0,,rigth,", "'rigth' is not declared.* left, right.*right"),
+        ("views.csv", "2,0,,right,", "2,0,,rigth,", "names rigth .* left, right.*right"),
         ("views.csv", "2,0,,right,", "2,0,,,", "column camera must name the one that.* view 2"),
         ("views.csv", "0,0,,left,a", "0,0,,left,", "the one whose pose or joints .* view 0"),
         ("views.csv", "0,0,,left", "0,0,intrinsics,left", "the row has x_m; leave that empty"),

@@ -2,10 +2,19 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import Annotated, Any, Literal, Self, TypeAlias, cast
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
@@ -24,10 +33,9 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
 
-# Default place of a need.
-VIEWS: Literal["views"] = "views"
 # Largest plausible reach of an arm [m].
 _FAR_M = 20.0
+_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 
 
 class TableModel(BaseModel):
@@ -61,6 +69,23 @@ class CameraTable(TableModel):
         matrix, distortion = np.array(self.matrix, float), np.array(self.distortion, float)
         return Camera(self.model, self.size, matrix, distortion)
 
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        counts, count = _COEFFICIENTS[self.model], len(self.distortion or ())
+        if self.distortion is not None and count not in counts:
+            needed = " or ".join(map(str, counts))
+            raise ValueError(
+                f'has {count} coefficients of distortion, but the "{self.model}" model needs '
+                f"{needed} (0 for those that are not used)"
+            )
+        if (self.matrix is None) != (self.distortion is None):
+            raise ValueError("has one of matrix and distortion: give both or neither")
+        if self.matrix is not None and self.resolution is None:
+            raise ValueError("has no resolution, and its matrix holds for one alone")
+        if self.matrix is not None and min(self.matrix[:2]) <= 0:
+            raise ValueError(f"has the matrix {self.matrix}, but fx and fy must be above 0")
+        return self
+
 
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
@@ -89,38 +114,38 @@ class ClockTable(TableModel):
     camera_minus_robot_s: Number = 0.0
 
 
+def _place(at: object) -> object:
+    numbers = at if isinstance(at, list) else []
+    is_place = len(numbers) == 3 and all(type(number) in (int, float) for number in numbers)
+    if at != "views" and not (is_place and all(abs(number) <= _FAR_M for number in numbers)):
+        raise ValueError(
+            f'is {at!r}, but must be "views" or [x, y, z] in the base, in metres (under {_FAR_M:g})'
+        )
+    return at
+
+
 class NeedTable(TableModel):
     """`[need]`. Required accuracy of picks [mm], [deg], and where; see `types.Need`."""
 
     mm: Positive | None = None
     deg: Positive | None = None
     corrected: bool = False
-    # "views" or three numbers: checked by `wrong_place`.
-    at: Any = VIEWS
+    # "views" or three numbers.
+    at: Annotated[Any, AfterValidator(_place)] = "views"
 
     @property
     def need(self) -> Need:
         """The typed need."""
-        if self.at == VIEWS:
+        if self.at == "views":
             return Need(self.mm, self.deg, corrected=self.corrected)
         x, y, z = map(float, self.at)
         return Need(self.mm, self.deg, (x, y, z), self.corrected)
 
-    def wrong_place(self) -> str:
-        """Message for an invalid `at`; empty where it is valid."""
-        if self.at == VIEWS:
-            return ""
-        numbers = self.at if isinstance(self.at, list) else []
-        if len(numbers) != 3 or not all(type(number) in (int, float) for number in numbers):
-            return f'is {self.at!r}, but must be "{VIEWS}" or [x, y, z] in the base [m]'
-        if not all(abs(number) < np.inf for number in numbers):
-            return f"is {self.at!r}, but must be finite numbers: [x, y, z] in the base [m]"
-        if not all(abs(number) <= _FAR_M for number in numbers):
-            return (
-                f"is {self.at!r}, farther than any arm reaches: it is in the base, in metres "
-                f"(under {_FAR_M:g})"
-            )
-        return ""
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if self.mm is None and self.deg is None and not self.corrected:
+            raise ValueError("says neither mm nor deg: give how near picks have to come")
+        return self
 
 
 class PriorTable(TableModel):
@@ -136,6 +161,19 @@ class PriorTable(TableModel):
     quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
     sigma_rad: MeasuredSigma | None = None
 
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        turn, is_placed = self.quaternion_xyzw, {self.x_m, self.y_m, self.z_m} != {None}
+        if not is_placed and turn is None:
+            raise ValueError("names no component: x_m, y_m or z_m, or quaternion_xyzw")
+        if is_placed and self.sigma_m is None:
+            raise ValueError("has no sigma_m, the standard deviation of x_m, y_m and z_m")
+        if (turn is None) != (self.sigma_rad is None):
+            raise ValueError("needs quaternion_xyzw and sigma_rad together, or neither")
+        if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
+            raise ValueError(f"has quaternion_xyzw {turn}, but its length must be 1")
+        return self
+
 
 class TargetTable(TableModel):
     """`[targets.NAME]`, one of several. target: a name in targets/, or the path of a .toml."""
@@ -146,7 +184,6 @@ class TargetTable(TableModel):
 Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
 KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
-_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 # Names that can be part of a frame's name: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 # Largest plausible offsets on a flange and in a cell [m]; offsets of more than 3 mm and 100 mm that
@@ -267,121 +304,58 @@ def _dotted(location: Sequence[int | str]) -> str:
     return path.removeprefix(".")
 
 
-def _error_message(entry: Mapping[str, Any]) -> str:
-    """Message for a field, from an entry of pydantic's list of errors."""
-    context = entry.get("ctx", {})
-    needed = {
-        "int_type": "a whole number",
-        "float_type": "a number",
-        "finite_number": "a finite number",
-        "string_type": 'a "text"',
-        "list_type": "a [list]",
-        "dict_type": "a table",
-        "model_type": "a table",
-        "literal_error": str(context.get("expected")).replace("'", '"'),
-        "greater_than": f"a number above {context.get('gt', 0):g}",
-        "greater_than_equal": f"a number of at least {context.get('ge', 0):g}",
-        "less_than_equal": f"a number of at most {context.get('le', 0):g}",
-        "too_short": f"a list of {context.get('min_length')}",
-        "too_long": f"a list of {context.get('max_length')}",
-    }
-    kind = str(entry["type"])
-    if kind == "missing":
-        return f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
-    if kind == "string_type" and entry["loc"] == ("target",):
-        return (
-            f"is {entry['input']!r}, but must be a name in targets/, or the path of a .toml with it"
-        )
-    return f"is {entry['input']!r}, but must be {needed.get(kind, kind)}"
-
-
-_TARGET = "a name in targets/, or the path of a .toml"
 _MISSING = {
     "schema": " (schema = 1)",
     "name": ' (name = "...")',
     "mount": ' (mount = "eye-in-hand" or "eye-to-hand")',
-    "target": f" (target = {_TARGET})",
+    "target": " (target = a name in targets/, or the path of a .toml)",
 }
 
 
+def _error_message(entry: Mapping[str, Any]) -> str:
+    """Message for a field, from an entry of pydantic's list of errors."""
+    if entry["type"] == "missing":
+        return f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
+    if entry["type"] == "value_error":
+        return str(entry["ctx"]["error"])
+    is_table = entry["type"] in ("model_type", "dict_type")
+    needed = "must be a table" if is_table else entry["msg"].replace("Input should", "must")
+    return f"is {entry['input']!r}, but {needed}"
+
+
 def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:
-    """Contradictions between well-typed fields: (dotted path, message)."""
-    camera = declaration.camera
+    """Contradictions between well-typed tables: (dotted path, message)."""
     reads = declaration.instrument is not None or bool(declaration.instruments) or not observed
     implied = declaration.is_network or (reads and not declaration.named("camera"))
     if declaration.mount is None and not implied:
         yield "mount", "is missing" + _MISSING["mount"]
-    if camera is not None:
-        yield from _camera_contradictions(camera, "camera")
-    for name, one in declaration.cameras.items():
-        yield from _camera_contradictions(one, f"cameras.{name}")
     for kind in KINDS:
-        yield from _plural_contradictions(declaration, kind)
+        several: Mapping[str, TableModel] = getattr(declaration, f"{kind}s")
+        if several and getattr(declaration, kind) is not None:
+            one = "target = ..." if kind == "target" else f"[{kind}]"
+            yield (
+                f"{kind}s",
+                f"is there beside {kind}: give {one} for one, [{kind}s.NAME] for several",
+            )
+        for name in several:
+            if not NAME.fullmatch(name):
+                words = "is a name of other than letters, digits and _ after a letter"
+                yield f"{kind}s.{name}", words
     for name in declaration.clocks:
         if name not in declaration.cameras:
             yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
-    yield from _prior_contradictions(declaration)
-    need = declaration.need
-    if need is not None and need.mm is None and need.deg is None and not need.corrected:
-        yield "need", "says neither mm nor deg: give how near picks have to come"
-    if need is not None and (wrong := need.wrong_place()):
-        yield "need.at", wrong
+    yield from _far_priors(declaration)
 
 
-def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]:
+def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
     for edge, prior in declaration.prior.items():
-        turn, places = prior.quaternion_xyzw, (prior.x_m, prior.y_m, prior.z_m)
-        if not any(place is not None for place in places):
-            if turn is None:
-                needed = "x_m, y_m or z_m, or quaternion_xyzw"
-                yield f"prior.{edge}", f"names no component, but must give {needed}"
-        elif prior.sigma_m is None:
-            words = "is missing (the standard deviation of the measured components)"
-            yield f"prior.{edge}.sigma_m", words
-        if (turn is None) != (prior.sigma_rad is None):
-            yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
-        if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
-            yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
         on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
         most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
-        for axis, place in zip("xyz", places, strict=True):
+        for axis in ("x_m", "y_m", "z_m"):
+            place = getattr(prior, axis)
             if place is not None and abs(place) > most:
                 words = f"is {place:g}, but is in metres, at most {most:g} {where}"
-                yield f"prior.{edge}.{axis}_m", words
-
-
-def _plural_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
-    plural, one = f"{kind}s", "target = ..." if kind == "target" else f"[{kind}]"
-    several: Mapping[str, TableModel] = getattr(declaration, plural)
-    if several and getattr(declaration, kind) is not None:
-        yield plural, f"is there beside {kind}: give {one} for one, [{plural}.NAME] for several"
-    for name in several:
-        if not NAME.fullmatch(name):
-            yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
-
-
-def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str, str]]:
-    counts = _COEFFICIENTS[camera.model]
-    if camera.distortion is not None and len(camera.distortion) not in counts:
-        needed = " or ".join(map(str, counts))
-        yield (
-            f"{path}.distortion",
-            f'has {len(camera.distortion)} coefficients, but the "{camera.model}" model needs '
-            f"{needed} (0 for those that are not used)",
-        )
-    if camera.matrix is not None:
-        if camera.distortion is None:
-            yield f"{path}.distortion", f"is missing beside {path}.matrix: give both or neither"
-        if camera.resolution is None:
-            yield f"{path}.resolution", f"is missing: {path}.matrix holds for one resolution only"
-        for place, letter in enumerate(("fx", "fy")):
-            if camera.matrix[place] <= 0:
-                yield (
-                    f"{path}.matrix[{place}]",
-                    f"is {camera.matrix[place]!r}, but {letter} must be above 0",
-                )
-    elif camera.distortion is not None:
-        yield f"{path}.matrix", f"is missing beside {path}.distortion: give both or neither"
+                yield f"prior.{edge}.{axis}", words
 
 
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
@@ -392,21 +366,17 @@ def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
-    if declaration.camera is not None:
-        yield from _camera_warnings(declaration.camera, f"{label}: camera")
-    for name, camera in declaration.cameras.items():
-        yield from _camera_warnings(camera, f"{label}: cameras.{name}")
-
-
-def _camera_warnings(camera: CameraTable, path: str) -> Iterator[str]:
-    if camera.matrix is not None and camera.resolution is not None:
-        (width, height), (_, _, cx, cy) = camera.resolution, camera.matrix
-        if not (0 < cx < width and 0 < cy < height):
-            yield (
-                f"{path}.matrix puts the principal point at ({cx:g}, {cy:g}) px, outside "
-                f"the image of {width} x {height} px. Check the order fx, fy, cx, cy and that the "
-                "matrix belongs to this resolution."
-            )
+    for name, table in declaration.named("camera").items():
+        camera = cast(CameraTable, table)
+        if camera.matrix is not None and camera.resolution is not None:
+            (width, height), (_, _, cx, cy) = camera.resolution, camera.matrix
+            if not (0 < cx < width and 0 < cy < height):
+                path = f"cameras.{name}" if name else "camera"
+                yield (
+                    f"{label}: {path}.matrix puts the principal point at ({cx:g}, {cy:g}) px, "
+                    f"outside the image of {width} x {height} px. Check the order fx, fy, cx, cy "
+                    "and that the matrix belongs to this resolution."
+                )
 
 
 def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:

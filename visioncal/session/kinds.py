@@ -1,12 +1,10 @@
 """Camera, robot, target and instrument of each row, and their files; a table of known instruments.
 
 Boards and robots are shared between sessions, so files that session.toml names may be outside of
-the session's folder. Since a session may be untrusted, a warning names each such file, and its
-errors are reported without its content.
+the session's folder, and a warning names each of them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,13 +13,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, absence, is_inside, parse_toml, read_text
+from visioncal.core.files import absence, is_inside, parse_toml, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import READ_AGAIN
-from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
+from visioncal.robot import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session.columns import POSITION
-from visioncal.session.document import KINDS, Declaration, Kind, RobotTable
+from visioncal.session.document import KINDS, Declaration, InstrumentTable, Kind, RobotTable
 from visioncal.session.table import View
 from visioncal.vision.targets import misspelt_keys, read_target, target_from_document
 
@@ -32,11 +30,11 @@ _FILE = Path(__file__).with_name("instruments.toml")
 class Instrument:
     """Noise of an instrument's readings, as standard deviations."""
 
-    words: str  # Description of the instrument.
     sigma_m: float  # Of each coordinate of a position, at the instrument's origin [m].
     sigma_per_m: float = 0.0  # Its growth with the distance from there [m/m].
     # Of a probe's rotation about each axis; None where unknown [rad].
     sigma_rad: float | None = None
+    words: str = ""  # Description of a known instrument.
 
     def sigmas_m(self, places: FloatArray) -> FloatArray:
         """Standard deviations (m,) of each coordinate of (m, 3) measured positions [m]."""
@@ -44,70 +42,35 @@ class Instrument:
         return np.asarray(self.sigma_m + self.sigma_per_m * distance)
 
 
-def instrument_names() -> tuple[str, ...]:
-    """Names of the instruments in the table."""
-    return tuple(sorted(_table()))
+@cache
+def known_instruments() -> Mapping[str, Instrument]:
+    """The table of known instruments, by name."""
+    rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
+    return {row.pop("name"): Instrument(**row) for row in rows}
 
 
-def known_instrument(name: str) -> Instrument | None:
-    """Finds an instrument in the table; None where it is not there.
-
-    Raises:
-        DataError: It measures only lengths or angles, no positions.
-    """
-    row = _table().get(name.strip().lower())
-    if row is None:
-        return None
-    words = row.text("words")
-    if "measures" in row.content:
-        raise DataError(
-            f"instrument {name!r}: the {words} measures {row.text('measures')}; readings of "
-            "places (meas_x_m, meas_y_m, meas_z_m) are needed.",
-            culprits=["session.toml: instrument.name"],
-        )
-    return Instrument(
-        words,
-        row.number("sigma_m"),
-        row.number("sigma_per_m", 0.0),
-        row.number("sigma_rad") if "sigma_rad" in row.content else None,
-    )
-
-
-def stated_instrument(
-    name: str, sigma_m: float | None, sigma_per_m: float | None, sigma_rad: float | None
-) -> Instrument:
-    """Instrument of a session: stated values, with those of the table for the others.
+def stated_instrument(table: InstrumentTable) -> Instrument:
+    """Instrument of a session: stated values, with those of a known one for the others.
 
     Raises:
         DataError: The name is unknown and no noise is stated.
     """
-    in_table = known_instrument(name)
-    if sigma_m is None and in_table is None:
+    known = known_instruments()
+    values = vars(known[name]) if (name := table.name.strip().lower()) in known else {}
+    stated = {key: getattr(table, key) for key in ("sigma_m", "sigma_per_m", "sigma_rad")}
+    values = values | {key: value for key, value in stated.items() if value is not None}
+    if "sigma_m" not in values:
         raise DataError(
-            f"session.toml: the instrument {name!r} is not in the table of known ones, and its "
-            "noise is not stated.",
+            f"session.toml: the instrument {table.name!r} is not in the table of known ones, and "
+            "its noise is not stated.",
             culprits=["session.toml: instrument"],
-            next_step=f"{did_you_mean(name, instrument_names())} State sigma_m (and sigma_per_m) "
-            f"in [instrument], or name one of {', '.join(instrument_names())}.".strip(),
+            next_step=f"{did_you_mean(table.name, known)} State sigma_m (and sigma_per_m) in "
+            f"[instrument], or name one of {', '.join(sorted(known))}.".strip(),
         )
-    base = Instrument(name, 0.0) if in_table is None else in_table
-    return Instrument(
-        base.words,
-        base.sigma_m if sigma_m is None else sigma_m,
-        base.sigma_per_m if sigma_per_m is None else sigma_per_m,
-        base.sigma_rad if sigma_rad is None else sigma_rad,
-    )
-
-
-@cache
-def _table() -> Mapping[str, DocumentTable]:
-    rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
-    return {row["name"]: DocumentTable(row, f"{_FILE.name}, {row['name']}") for row in rows}
+    return Instrument(**values)
 
 
 _Test: TypeAlias = Callable[[View], bool]
-
-_SUFFIXES = {"target": (".toml",), "model": ROBOT_SUFFIXES}
 
 
 def is_camera_observation(view: View) -> bool:
@@ -125,16 +88,15 @@ def is_instrument_reading(view: View) -> bool:
     return view.reading_m is not None
 
 
-# By kind: which rows must name one of several, what the column names, and a hint for the remedy.
-_NAMING_RULES: Mapping[Kind, tuple[_Test, str, str]] = {
-    "camera": (is_camera_observation, "the one that took a row's image", ""),
-    "robot": (has_robot_state, "the one whose pose or joints a row has", ""),
+# By kind: which rows must name one of several, and what the column names.
+_NAMING_RULES: Mapping[Kind, tuple[_Test, str]] = {
+    "camera": (is_camera_observation, "the one that took a row's image"),
+    "robot": (has_robot_state, "the one whose pose or joints a row has"),
     "target": (
         is_camera_observation,
-        "the one that a row shows",
-        "; one image that shows several takes a row for each, with the same stop",
+        "the one that a row shows (of several in one image, each in a row of the same stop)",
     ),
-    "instrument": (is_instrument_reading, "the one that read a row's meas_ columns", ""),
+    "instrument": (is_instrument_reading, "the one that read a row's meas_ columns"),
 }
 
 
@@ -158,48 +120,62 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
     for kind in KINDS:
         named = {view.number: view.text.get(kind, "").strip() for view in views}
         declared = list(declaration.named(kind))
-        if declared in ([], [""]):
-            names = sorted({*named.values()} - {""})
-            if len(names) > 1:
-                tables = ", ".join(f"[{kind}s.{name}]" for name in names)
-                of_target = ", each with target = a name or a path" if kind == "target" else ""
-                raise DataError(
-                    f"views.csv, column {kind}: it names {', '.join(names)}, but session.toml "
-                    f"{f'has the one {kind} for all' if bool(declared) else 'declares none'}.",
-                    culprits=[f"session.toml: {kind}s"],
-                    next_step=f"Declare {tables}{of_target}.",
-                )
-            continue
-        known = ", ".join(declared)
-        unknown = {view: name for view, name in named.items() if name and name not in declared}
+        is_plain = declared in ([], [""])
+        names = sorted({*named.values()} - {""})
+        needs, whose = _NAMING_RULES[kind]
+        # A column of one name beside a singular table is no matter.
+        unknown = [name for name in names if name not in declared] if len(names) > is_plain else []
         if unknown:
-            view, name = next(iter(unknown.items()))
+            rows = [str(view) for view, name in named.items() if name in unknown]
+            has = "the one for all" if is_plain and declared else ", ".join(declared) or "none"
             raise DataError(
-                f"views.csv, view {view}, column {kind}: {name!r} is not declared; session.toml "
-                f"declares {known}.",
-                culprits=[f"views.csv: view {index}" for index in unknown],
-                next_step=did_you_mean(name, declared)
-                or f"Add [{kind}s.{name}], or correct the row.",
+                f"views.csv, column {kind}: it names {', '.join(unknown)} in view {some_of(rows)}, "
+                f"but of {kind}s session.toml declares {has}.",
+                culprits=[f"session.toml: {kind}s", *(f"views.csv: view {row}" for row in rows)],
+                next_step=did_you_mean(unknown[0], declared)
+                or f"Declare {', '.join(f'[{kind}s.{name}]' for name in unknown)}"
+                f"{', each with target = a name or a path' * (kind == 'target')}, or correct the "
+                "rows.",
             )
-        needs, whose, hint = _NAMING_RULES[kind]
         without = [str(row.number) for row in views if needs(row) and not named[row.number]]
         if len(declared) > 1 and without:
             raise DataError(
-                f"views.csv: of several {kind}s ({known}), the column {kind} must name {whose}; it "
-                f"is empty in view {some_of(without)}.",
+                f"views.csv: of several {kind}s ({', '.join(declared)}), the column {kind} must "
+                f"name {whose}; it is empty in view {some_of(without)}.",
                 culprits=[f"views.csv: view {name}" for name in without],
-                next_step=f"Name the {kind} in each of these rows{hint}.",
+                next_step=f"Name the {kind} in each of these rows.",
             )
 
 
-def kind_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
-    """Warnings of declared cameras, robots, targets and instruments that no row names."""
+def kind_warnings(
+    declaration: Declaration, views: Sequence[View], document: Mapping[str, Any] | None
+) -> Iterator[str]:
+    """Warnings of what no row names, and of misspelt keys of targets (`document`)."""
     for kind in KINDS:
         declared = declaration.named(kind)
         named = {view.text.get(kind, "").strip() for view in views}
         for name in declared if len(declared) > 1 else ():
             if name not in named:
                 yield f"session.toml: {kind}s.{name}: no row of views.csv names it."
+    for name, path in (paths := _declared_targets(declaration)).items():
+        described = document if len(paths) == 1 else (document or {}).get(name)
+        for words in misspelt_keys(described or {}):
+            yield f"{path}: {words}"
+
+
+def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
+    """Warnings that name the files outside of the folder that were read."""
+    named = [(path, "target") for path in _declared_targets(declaration).values()]
+    robots = (getattr(table, "model", None) for table in declaration.named("robot").values())
+    named += [(path, "model") for path in robots if path is not None]
+    for path, key in dict.fromkeys(named) if folder is not None else ():
+        file = (folder or Path()) / path.replace("\\", "/")
+        is_file = path.lower().endswith(ROBOT_SUFFIXES) and not absence(file)
+        if is_file and folder is not None and not is_inside(file, folder):
+            yield (
+                f"session.toml: {key} = {path!r} lies outside of the session's folder: "
+                f"{file.resolve()} was read."
+            )
 
 
 def read_robots(
@@ -224,11 +200,7 @@ def read_robots(
         if not isinstance(table, RobotTable) or table.model is None:
             continue
         try:
-            with without_content(table.model, "model", folder):
-                model = read_robot_document(table.model, tip=table.tip, folder=folder)
-                if outside_file(table.model, "model", folder) is not None:
-                    # Recordings contain only valid robots.
-                    Robot.from_document(model)
+            model = read_robot_document(table.model, tip=table.tip, folder=folder)
         except DataError as error:
             path = f"robots.{name}" if name else "robot"
             problems.append(f"session.toml: {path}.model: {error}")
@@ -238,64 +210,6 @@ def read_robots(
     if len(declaration.robots) > 1:
         return models or None, problems
     return next(iter(models.values()), None), problems
-
-
-@contextmanager
-def without_content(named: str, field: str, folder: Path | None) -> Iterator[None]:
-    """Removes the content of a file outside of the folder from the errors of reading it.
-
-    Args:
-        named: The file, as session.toml names it; built-in names are no files.
-        field: The field that names it: `target` or `model`.
-        folder: The session's folder; None where it has none.
-
-    Raises:
-        DataError: Instead of the errors of reading it, or it is a link to another kind of file.
-    """
-    file = outside_file(named, field, folder)
-    if file is None or absence(file):
-        yield
-        return
-    refusal = DataError(
-        f"{file}, outside of the session's folder, is no {field} that can be read.",
-        culprits=[f"session.toml: {field}"],
-        next_step="Copy it into the session's folder: then the message says what is wrong with it.",
-    )
-    if file.suffix.lower() not in _SUFFIXES[field]:
-        raise refusal
-    try:
-        yield
-    except DataError as error:
-        raise refusal from error
-
-
-def outside_file(named: str, field: str, folder: Path | None) -> Path | None:
-    """The file outside of the folder that a field names; None for any other."""
-    if folder is None or not named.lower().endswith(_SUFFIXES[field]):
-        return None
-    path = folder / named.replace("\\", "/")
-    try:
-        return None if is_inside(path, folder) else path.resolve()
-    except (OSError, ValueError, RuntimeError):
-        return path
-
-
-def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
-    """Warnings that name the files outside of the folder that were read."""
-    fields: tuple[tuple[Kind, str], ...] = (("target", "target"), ("robot", "model"))
-    places = dict.fromkeys(
-        (getattr(table, field), field)
-        for kind, field in fields
-        for table in declaration.named(kind).values()
-        if getattr(table, field) is not None
-    )
-    for named, field in places:
-        file = outside_file(named, field, folder)
-        if file is not None and not absence(file):
-            yield (
-                f"session.toml: {field} = {named!r} lies outside of the session's folder: {file} "
-                "was read."
-            )
 
 
 # The column of views.csv that names the target of a row.
@@ -342,24 +256,14 @@ def read_targets(
 
 
 def _load(path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
-    with without_content(path, "target", folder):
-        try:
-            return read_target(path, folder)
-        except DataError as error:
-            if "metres, such as" not in error.message:
-                raise
-            # All sizes in millimetres can be converted at once.
-            raise type(error)(
-                error.message, culprits=error.culprits, next_step=str(READ_AGAIN)
-            ) from error
-
-
-def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
-    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
-    for name, path in (paths := _declared_targets(declaration)).items():
-        described = document if len(paths) == 1 else (document or {}).get(name)
-        for words in misspelt_keys(described or {}):
-            yield f"{path}: {words}"
+    try:
+        return read_target(path, folder)
+    except DataError as error:
+        if "metres, such as" not in error.message:
+            raise
+        # All sizes in millimetres can be converted at once.
+        step = str(READ_AGAIN)
+        raise DataError(error.message, culprits=error.culprits, next_step=step) from error
 
 
 def _declared_targets(declaration: Declaration) -> dict[str, str]:
@@ -370,24 +274,17 @@ def _declared_targets(declaration: Declaration) -> dict[str, str]:
 
 
 def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
-    """Checks that target and camera are declared where there are images.
-
-    Raises:
-        DataError: One is not declared, and a view has an image or corners.
-    """
-    with_image = [view for view in views if view.image or view.has_corners]
-    for field, declared, example in (
-        (
-            "target",
-            declaration.target or declaration.targets or None,
-            'target = "charuco_9x6_30mm", or the name or .toml of your board',
-        ),
-        ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
-    ):
-        if with_image and declared is None:
+    """Checks that target and camera are declared where a view has an image; raises DataError."""
+    view = next((view for view in views if view.image or view.has_corners), None)
+    examples: tuple[tuple[Kind, str], ...] = (
+        ("target", 'target = "charuco_9x6_30mm", or the name or .toml of your board'),
+        ("camera", "[camera]"),
+    )
+    for kind, example in examples:
+        if view is not None and not declaration.named(kind):
             raise DataError(
-                f"session.toml: {field} is missing, but view {with_image[0].number} has "
-                f"{'an image' if with_image[0].image else 'rows in corners.csv'}.",
-                culprits=[f"session.toml: {field}"],
+                f"session.toml: {kind} is missing, but view {view.number} has "
+                f"{'an image' if view.image else 'rows in corners.csv'}.",
+                culprits=[f"session.toml: {kind}"],
                 next_step=f"Add {example}.",
             )

@@ -43,7 +43,6 @@ from visioncal.session.kinds import (
     outside_warnings,
     read_robots,
     read_targets,
-    target_warnings,
 )
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.saving import digest_of, save_session
@@ -543,8 +542,7 @@ def _build(
         *declaration_warnings(declaration, "session.toml"),
         *cols.column_warnings(columns, "views.csv"),
         *view_warnings(views),
-        *kind_warnings(declaration, views),
-        *target_warnings(declaration, target_document),
+        *kind_warnings(declaration, views, target_document),
     ]
     check_kinds_named(declaration, views)
     check_frames(declaration, views)

@@ -15,9 +15,9 @@ from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.kinds import (
     Instrument,
-    instrument_names,
     is_camera_observation,
     is_instrument_reading,
+    known_instruments,
     name_of,
     stated_instrument,
 )
@@ -178,9 +178,9 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
             "how good they are.",
             culprits=["session.toml: instrument"],
             next_step="Add [instrument] with sigma_m (and sigma_per_m), or with one of these as "
-            f"its name: {', '.join(instrument_names())}.",
+            f"its name: {', '.join(sorted(known_instruments()))}.",
         )
-    instrument = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
+    instrument = stated_instrument(table)
     has_rotations = any(row.instrument_from_probe() is not None for row in rows)
     if instrument.sigma_rad is None and has_rotations:
         raise DataError(

@@ -39,10 +39,6 @@ class PoseImportOptions:
         stated = {name: value for name, value in vars(self).items() if value not in ((), None)}
         return replace(source, **stated)
 
-    def applied_to(self, poses: PoseNumbers) -> PoseNumbers:
-        """The poses with the user's options in place of the declared reading."""
-        return poses.read_as(self.reading(poses.reading))
-
     def reading(self, declared: Reading) -> Reading:
         """The declared reading with the user's options in its place.
 

@@ -16,12 +16,12 @@ from visioncal.interchange.formats.reading import Fields
 from visioncal.session.columns import SELECTORS, joint_columns
 
 # An ordinal indicator is common for the degree sign, too.
-DEGREES = ("deg", "degrees", "°", "º")
-ANGLE_UNITS = (*DEGREES, "rad", "radians")
+_DEGREES = ("deg", "degrees", "°", "º")
+_ANGLES = (*_DEGREES, "rad", "radians")
 # q1_rad is a joint; q1 alone is part of a quaternion.
 _UNIT = re.compile(
-    rf"(?!q[0-9])(.*?)[ _]*+(?:[(\[] *({'|'.join([*UNITS_M, *ANGLE_UNITS])}) *[)\]]"
-    rf"|(?<=_)({'|'.join([*UNITS_M, *ANGLE_UNITS])}))",
+    rf"(?!q[0-9])(.*?)[ _]*+(?:[(\[] *({'|'.join([*UNITS_M, *_ANGLES])}) *[)\]]"
+    rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
     re.IGNORECASE,
 )
 _POSITION_WORDS = {"translation", "position", "pos", "tvec", "trans", "xyz", "t"}
@@ -38,8 +38,8 @@ _SIDE_WORDS = {"robot": {"robot", "arm", "effector"}, "camera": {"charuco", "aru
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 
 
-def _without_unit(name: str) -> tuple[str, str]:
-    """Splits a field's name from its unit: `rx(deg)`, `X [mm]`, `x_m`."""
+def without_unit(name: str) -> tuple[str, str]:
+    """A field's name without its unit, and that, or none: `rx(deg)`, `X [mm]`, `x_m`."""
     match = _UNIT.fullmatch(name)
     return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
@@ -80,7 +80,7 @@ def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tupl
 
 
 def _words(name: str) -> list[str]:
-    return [part for part in re.split(r"[\W_]+|(2)", _without_unit(name)[0].lower()) if part]
+    return [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
 
 
 def _is_of(words: Sequence[str], whose: str) -> bool:
@@ -163,13 +163,10 @@ _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 def known_names(
     fields: Fields, candidates: Sequence[tuple[str, ...]], taken: Collection[str]
 ) -> tuple[str, ...]:
-    """Finds the first set of names whose fields all exist and are free, ignoring case and units.
+    """Full names of the first candidate whose fields all exist and are not taken; else empty.
 
-    A text field counts only within a set of several names, so that a wrong cell is reported by its
-    place.
-
-    Returns:
-        The fields' full names; empty where no set is complete.
+    Case and units are ignored. A text field counts only within a set of several names, so that a
+    wrong cell is reported by its place.
     """
     # A single number in a field called `robot` or `camera` is a selector, not a pose.
     numbers = (
@@ -182,7 +179,7 @@ def known_names(
     full = {end: name for name in free_names if endings[end := name.rsplit(".", 1)[-1]] == 1}
     full |= {name: name for name in free_names}
     # An exact match of a name goes before one in another case or with a unit.
-    plain = {name: _without_unit(name)[0].lower() for name in full}
+    plain = {name: without_unit(name)[0].lower() for name in full}
     counts = Counter(plain.values())
     without_units = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
     full = without_units | {word.lower(): name for word, name in full.items()} | full
@@ -200,17 +197,10 @@ def pose_names(
     whose: str,
     taken: Collection[str],
 ) -> tuple[str, ...]:
-    """Finds the fields that hold poses.
+    """Full names of the fields with the poses of the `robot` or `camera`; empty where none fit.
 
-    Args:
-        fields: The fields.
-        given: Names that the user gives.
-        unnamed: The pose columns of a table without a header.
-        whose: `robot` or `camera`.
-        taken: Full names of fields with another use.
-
-    Returns:
-        Full names; empty where no fields are recognised.
+    They are those that the user gives, else the `unnamed` columns of a table without a header, else
+    fields with a known name that are not `taken`.
 
     Raises:
         DataError: The user names a field that does not exist.
@@ -226,20 +216,11 @@ def pose_names(
 def poses_from(
     fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: str
 ) -> tuple[PoseNumbers, tuple[str, ...]]:
-    """Reads poses from fields.
+    """Reads the poses of the `robot` or `camera` from fields, with notes on assumptions.
 
     16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 are its
     upper three rows, or a position and a rotation by rows, whichever gives rotations; otherwise a
     position of three numbers and a rotation, ordered as names such as rvec and tvec show.
-
-    Args:
-        fields: The fields.
-        names: The fields that hold the poses.
-        requested: The user's options.
-        whose: `robot` or `camera`, for messages.
-
-    Returns:
-        The poses, and notes on assumptions.
 
     Raises:
         DataError: There are no such fields, or their numbers are no poses.
@@ -250,8 +231,7 @@ def poses_from(
             raise DataError(
                 f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not "
                 f"as {requested.form}.",
-                culprits=[fields.places[0]],
-                next_step="Leave --robot-form out.",
+                culprits=["--robot-form"],
             )
         requested = replace(requested, form=fields.form)
     if not requested.names and len(names) == 7 and requested.is_scalar_first:
@@ -261,33 +241,39 @@ def poses_from(
         names = (*names[:3], *sorted(names[3:], key=lambda name: order.get(name, 0)))
     blocks = [fields.column(name) for name in names]
     sizes = [block.shape[1] for block in blocks]
-    places, flat = fields.places, np.hstack(blocks)
+    flat, unit, notes = np.hstack(blocks), requested.unit, tuple[str, ...]()
     if sum(sizes) in (12, 16) and 9 not in sizes:
-        numbers = PoseNumbers(*_matrices(flat), Reading("matrix"), places)
-        return _checked(requested.applied_to(numbers), requested, whose, ())
-    positions, rotations, rotation_names = flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
-    if len(blocks) == 2:
-        rotation_first = sizes[1] == 3
-        if sizes[0] == sizes[1]:
-            rotation_first = _ROTATION_NAME.search(names[0]) is not None
-        positions, rotations = blocks[::-1] if rotation_first else blocks
-        rotation_names = (names[0] if rotation_first else names[1],)
-    if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
-        raise DataError(
-            f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
-            "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
-            culprits=list(names),
-            next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
+        positions, rotations = _matrices(flat)
+        rotation = "matrix"
+    else:
+        positions, rotations, rotation_names = flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
+        if len(blocks) == 2:
+            rotation_first = sizes[1] == 3
+            if sizes[0] == sizes[1]:
+                rotation_first = _ROTATION_NAME.search(names[0]) is not None
+            positions, rotations = blocks[::-1] if rotation_first else blocks
+            rotation_names = (names[0] if rotation_first else names[1],)
+        if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
+            raise DataError(
+                f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
+                "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
+                culprits=list(names),
+                next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
+            )
+        units = {without_unit(name)[1] for name in names}
+        rotation, notes = _likely_rotation(
+            rotations.shape[1], rotation_names, requested, whose, degrees=bool(units & {*_DEGREES})
         )
-    units = {_without_unit(name)[1] for name in names}
-    rotation, notes = _likely_rotation(
-        rotations.shape[1], rotation_names, requested, whose, degrees=bool(units & {*DEGREES})
-    )
-    numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
-    lengths = units - {"", *ANGLE_UNITS}
-    if len(lengths) == 1:
-        requested = replace(requested, unit=requested.unit or lengths.pop())
-    return _checked(requested.applied_to(numbers), requested, whose, notes)
+        lengths = units - {"", *_ANGLES}
+        unit = unit or (lengths.pop() if len(lengths) == 1 else None)
+    if unit is None and requested.form not in POSE_FORMS:
+        notes = (
+            *notes,
+            f"The {whose}'s positions are taken for metres, as the source does not say; "
+            f"--{whose}-unit names another unit.",
+        )
+    reading = replace(requested, unit=unit).reading(Reading(rotation))
+    return PoseNumbers(positions, rotations, reading, fields.places), notes
 
 
 def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
@@ -327,7 +313,7 @@ def joints_from(
         place = fields.places[int(np.argmax(bad))]
         raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
     ends = [name.rsplit(".", 1)[-1].lower() for name in names]
-    if degrees or all(any(unit in end for unit in DEGREES) for end in ends):
+    if degrees or all(any(unit in end for unit in _DEGREES) for end in ends):
         return np.deg2rad(joints), ()
     if (largest := np.abs(joints).max(initial=0.0)) > _MOST_TURNS_RAD:
         words = f"Joint angles up to {largest:.0f} are no radians"
@@ -428,31 +414,3 @@ def _likely_rotation(
             f"radians, as the source does not say; --{whose}-form names another form.",
         )
     return "rotation-vector", ()
-
-
-def _checked(
-    numbers: PoseNumbers, requested: PoseImportOptions, whose: str, notes: tuple[str, ...]
-) -> tuple[PoseNumbers, tuple[str, ...]]:
-    infinite = np.isinf(numbers.positions).any(axis=1) | np.isinf(numbers.rotations).any(axis=1)
-    if infinite.any():
-        place = numbers.places[int(np.argmax(infinite))]
-        raise DataError(
-            f"{place}: a number of the pose is infinite.",
-            culprits=[place],
-            next_step="Correct it, or leave the whole pose of that row empty.",
-        )
-    if requested.unit is None and requested.form not in POSE_FORMS:
-        notes = (
-            *notes,
-            f"The {whose}'s positions are taken for metres, as the source does not say; "
-            f"--{whose}-unit names another unit.",
-        )
-    form = ROTATION_FORMS[numbers.reading.rotation]
-    if form.size != numbers.rotations.shape[1]:
-        raise DataError(
-            f"{numbers.places[0]}: the {whose}'s rotation has {numbers.rotations.shape[1]} "
-            f"numbers; {form.words} has {form.size}.",
-            culprits=[numbers.places[0]],
-            next_step=f"Name the fields with --{whose}-columns and the form with --{whose}-form.",
-        )
-    return numbers, notes

@@ -19,7 +19,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
 # Layout of a table without a header by its number of columns: (times, robot pose, camera pose),
 # each pose a position with a quaternion or a matrix by rows.
@@ -96,17 +95,11 @@ class Fields:
         if full not in self.numbers:
             cells = zip(self.places, self.texts[full], strict=True)
             odd = ((place, word) for place, word in cells if word and not is_number(word))
-            # JSON may also have numbers in quotes.
-            place, text = next(odd, (self.places[0], self.texts[full][0]))
-            step = "Correct the cell, or leave the whole pose of that row empty."
-            if _DECIMAL_COMMA.fullmatch(text):
-                step = (
-                    "Save the table with semicolons or tabs: with these, decimal commas are read."
-                )
+            place, text = next(odd, (self.places[0], ""))
             raise DataError(
                 f"{place}: {full} holds {text[:40]!r}; a number is needed.",
                 culprits=[place],
-                next_step=step,
+                next_step="Correct the cell, or leave the whole pose of that row empty.",
             )
         return self.numbers[full].reshape(len(self), -1)
 
@@ -123,21 +116,12 @@ class Fields:
 
 
 def fields_of_table(table: TextTable, path: Path) -> Fields:
-    """Reads the columns of a table; a column of numbers in all filled cells becomes numeric.
-
-    Stacked or adjacent 4 x 4 matrices give a row each.
-    """
+    """Reads the rows of a table; stacked or adjacent 4 x 4 matrices give a row each."""
     if matrices := _stacked_matrices(table, path):
         return matrices
-    columns = list(zip(*table.rows, strict=True))
-    texts = dict(zip(table.columns, columns, strict=True))
-    numbers = {
-        name: np.array([float(cell) if cell else np.nan for cell in cells])
-        for name, cells in texts.items()
-        if any(cells) and all(not cell or is_number(cell) for cell in cells)
-    }
-    places = tuple(table.place(index) for index in range(len(table.rows)))
-    return Fields(path.stem, path.parent, places, numbers, texts)
+    records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    places = [table.place(index) for index in range(len(table.rows))]
+    return fields_of_records(records, places, path.stem, path.parent)
 
 
 def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
@@ -166,37 +150,34 @@ def fields_of_records(
     folder: Path,
     views: tuple[int, ...] = (),
 ) -> Fields:
-    """Fields of n records as `flattened` returns them; a value missing in a row is NaN."""
+    """Fields of n records of texts and arrays, as `flattened` returns them.
+
+    Texts that are numbers in all filled rows are numbers, too; a value missing in a row is NaN.
+    """
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, tuple[str, ...]] = {}
     ragged: dict[str, str] = {}
     for key in dict.fromkeys(name for record in records for name in record):
         values = [record.get(key) for record in records]
         if any(isinstance(value, str) for value in values):
-            texts[key] = tuple("" if value is None else str(value) for value in values)
+            cells = texts[key] = tuple("" if value is None else str(value) for value in values)
+            if any(cells) and all(not cell or is_number(cell) for cell in cells):
+                numbers[key] = np.array([float(cell) if cell else np.nan for cell in cells])
             continue
-        if bad := [at for at, value in enumerate(values) if isinstance(value, list)]:
-            ragged[key] = (
-                f"{places[bad[0]]}: {key} is no regular list or matrix of numbers: its lists "
-                "differ in length, or hold something else."
-            )
-            continue
-        arrays = [value if isinstance(value, np.ndarray) else None for value in values]
-        shapes = Counter(array.shape for array in arrays if array is not None)
-        if not shapes:
-            continue
-        shape = shapes.most_common(1)[0][0]
-        odd = [at for at, array in enumerate(arrays) if array is not None and array.shape != shape]
-        if odd:
-            ragged[key] = (
-                f"{places[odd[0]]}: {key} has the shape {shapes.most_common()[-1][0]}; most rows "
-                f"have {shape}."
-            )
-            continue
-        rows = [np.full(shape, np.nan) if array is None else array for array in arrays]
-        numbers[key] = np.array(rows).reshape(len(rows), *shape)
-        if not shape:
-            texts[key] = _cells(numbers[key])
+        shapes = Counter(value.shape for value in values if isinstance(value, np.ndarray))
+        shape = shapes.most_common(1)[0][0] if shapes else ()
+        for place, value in zip(places, values, strict=True):
+            if value is not None and getattr(value, "shape", None) != shape:
+                ragged[key] = (
+                    f"{place}: {key} is no regular list or matrix of numbers of the shape {shape}, "
+                    "as most rows have."
+                )
+                break
+        else:
+            empty = np.full(shape, np.nan)
+            numbers[key] = np.array([empty if value is None else value for value in values], float)
+            if not shape:
+                texts[key] = _cells(numbers[key])
     return Fields(name, folder, tuple(places), numbers, texts, views, ragged)
 
 
@@ -223,40 +204,6 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     except (ValueError, TypeError, OverflowError):
         return {name: record}
     return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
-
-
-def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
-    """Fields of arrays whose first axis counts the rows; others are left out.
-
-    Raises:
-        DataError: There is no array with rows.
-    """
-    lengths = Counter(len(array) for array in arrays.values() if array.ndim > 1)
-    lengths = lengths or Counter(len(array) for array in arrays.values() if array.ndim == 1)
-    if not lengths:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items()) or "nothing"
-        raise DataError(
-            f"{path} holds {shapes}; arrays with one row a pose are needed.", culprits=[str(path)]
-        )
-    rows = lengths.most_common(1)[0][0]
-    fitting = {
-        name: array
-        for name, array in arrays.items()
-        if array.ndim and len(array) == rows and array.size <= _MOST_NUMBERS * max(rows, 1)
-    }
-    numbers = {
-        name: array.astype(float) for name, array in fitting.items() if array.dtype.kind in "fiub"
-    }
-    texts = {name: _cells(number) for name, number in numbers.items() if number.ndim == 1}
-    texts |= {
-        name: tuple(
-            value.decode("latin-1") if isinstance(value, bytes) else str(value) for value in array
-        )
-        for name, array in fitting.items()
-        if array.dtype.kind in "US" and array.ndim == 1
-    }
-    places = tuple(f"{path.name}, row {at}" for at in range(rows))
-    return Fields(path.stem, path.parent, places, numbers, texts)
 
 
 def _cells(numbers: FloatArray) -> tuple[str, ...]:
@@ -331,7 +278,7 @@ def read_fields(path: Path) -> Fields:
     """
     suffix = path.suffix.lower()
     if suffix in (".npz", ".npy"):
-        return fields_of_arrays(read_arrays(path), path)
+        return fields_of_document(_lists(read_arrays(path)), path)
     if suffix in DOCUMENTS:
         return fields_of_document(read_document(path), path)
     if lines := _pendant(path):
@@ -346,6 +293,19 @@ def read_fields(path: Path) -> Fields:
     return fields_of_table(table, path)
 
 
+def _lists(arrays: Mapping[str, Array]) -> dict[str, object]:
+    """Arrays as lists of rows; without images and other large ones."""
+    small = {
+        name: array
+        for name, array in arrays.items()
+        if array.ndim and array.size <= _MOST_NUMBERS * max(len(array), 1)
+    }
+    return {
+        name: (np.char.decode(array, "latin-1") if array.dtype.kind == "S" else array).tolist()
+        for name, array in small.items()
+    }
+
+
 def read_document(path: Path) -> object:
     """Reads JSON, YAML or OpenCV's XML.
 
@@ -358,38 +318,35 @@ def read_document(path: Path) -> object:
 
 
 def fields_of_document(document: object, path: Path) -> Fields:
-    """Rows from a list of records, the longest such lists in a mapping, or a mapping of lists.
+    """Rows from a list of records, from lists of one length in a mapping, or a mapping of records.
 
     Raises:
         DataError: It holds no rows.
     """
+    views: tuple[int, ...] = ()
     # Names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
     if isinstance(document, Mapping):
         numbered = _numbered(document)
+        lists = {k: v for k, v in document.items() if isinstance(v, list) and v}
+        lists = {k: v for k, v in lists.items() if isinstance(v[0], Mapping)} or lists
         if len(numbered) > 1:
-            places = [f"{path.name}, {index}" for index in numbered]
-            rows = [flattened(mapping) for mapping in numbered.values()]
-            return fields_of_records(rows, places, path.stem, path.parent, tuple(numbered))
-        lists = [value for value in document.values() if isinstance(value, list) and value]
-        tables = [value for value in lists if isinstance(value[0], Mapping)]
-        if (
-            not tables
-            and document
-            and all(isinstance(value, Mapping) for value in document.values())
-        ):
-            document = list(document.values())
+            document, views = list(numbered.values()), tuple(numbered)
         elif lists:
-            count = max(len(table) for table in tables or lists)
+            counts = Counter(map(len, lists.values()))
+            count = max(counts, key=lambda length: (counts[length], length))
             columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
+            only = len(columns) == 1 and isinstance(next(iter(columns.values()))[0], Mapping)
             rows = [{k: v[at] for k, v in columns.items()} for at in range(count)]
-            document = next(iter(columns.values())) if tables and len(columns) == 1 else rows
+            document = next(iter(columns.values())) if only else rows
+        elif all(isinstance(value, Mapping) for value in document.values()):
+            document = list(document.values())
     if not isinstance(document, list) or not document:
         raise DataError(
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
         )
-    places = [f"{path.name}, entry {at}" for at in range(len(document))]
+    places = [f"{path.name}, entry {at}" for at in views or range(len(document))]
     records = [flattened(value) for value in document]
-    return fields_of_records(records, places, path.stem, path.parent)
+    return fields_of_records(records, places, path.stem, path.parent, views)
 
 
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
@@ -415,31 +372,27 @@ def _pendant(path: Path) -> Fields | None:
     None where neither of the first two lines holds such a pose.
     """
     lines = [
-        (at, line)
+        (f"{path.name}, line {at}", line)
         for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
         if line.strip() and not line.strip().startswith(_COMMENTS)
     ]
     # The first line may be a header.
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
-    return None if first is None else _fields_of_lines(path, lines[first:])
-
-
-def _fields_of_lines(path: Path, lines: Sequence[tuple[int, str]]) -> Fields:
-    places = tuple(f"{path.name}, line {at}" for at, _ in lines)
-    texts = [line for _, line in lines]
-    images = tuple(match[0] if (match := _IMAGE.search(text)) else "" for text in texts)
-    poses = [
-        read_pose(_IMAGE.sub(" ", text), place) for text, place in zip(texts, places, strict=True)
-    ]
-    form = poses[0].form
-    others = [place for place, pose in zip(places, poses, strict=True) if pose.form != form]
-    if others:
+    if first is None:
+        return None
+    records, forms = [], dict[str, str]()
+    for place, line in lines[first:]:
+        pose, image = read_pose(_IMAGE.sub(" ", line), place), _IMAGE.search(line)
+        forms.setdefault(pose.form.name, place)
+        numbers = write_pose(pose.pose, pose.form)
+        record = dict(zip(_NAMES[len(numbers)], numbers, strict=True))
+        records.append(record | ({"image": image[0]} if image else {}))
+    if len(forms) > 1:
         raise DataError(
-            f"{some_of(others)}: another maker's form than {form.words}, as {places[0]} has.",
-            culprits=others,
+            f"{path}: poses in the forms of several makers: {', '.join(forms)}.",
+            culprits=[*forms.values()],
             next_step="Put the poses of one robot into a file of their own.",
         )
-    numbers = np.array([write_pose(pose.pose, form) for pose in poses])
-    columns = dict(zip(_NAMES[numbers.shape[1]], numbers.T, strict=True))
-    named = {"image": images} if any(images) else {}
-    return Fields(path.stem, path.parent, places, columns, named, form=form.name)
+    places = [place for place, _ in lines[first:]]
+    fields = fields_of_records(records, places, path.stem, path.parent)
+    return replace(fields, form=next(iter(forms)))

@@ -16,9 +16,9 @@ from visioncal.calibration.pipeline.guess_inputs import (
     with_camera_poses,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
+from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
@@ -41,13 +41,9 @@ from visioncal.vision.boards.kind import LARGEST_M
 
 # Least number and correlation of pose steps by which joints and poses are of one log.
 _FEWEST_STEPS, _LEAST_CORRELATION = 4, 0.9
-# Largest size of a printed square.
-_LARGEST_MM = 1e3 * LARGEST_M
 # Rotations with larger numbers are in degrees [rad].
 _LARGEST_RAD = 7.0
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
-# Units of a board's size that is too large for metres, the most likely first.
-_BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -91,42 +87,23 @@ class DoubtfulSession:
 def load_for_rereading(path: Path) -> DoubtfulSession:
     """Loads a session for rereading, even where its poses or its board's size are invalid.
 
-    A board too large for metres is read in the unit with which the chain closes, else in
-    millimetres; positions and rotations may be in columns or forms that sessions do not have.
+    A board too large for metres is read in millimetres; positions and rotations may be in columns
+    or forms that sessions do not have.
 
     Raises:
         DataError: It is no session.
     """
     plain, robot = _other_columns(path) or (None, None)
     file = path / "session.toml"
-    name = read_toml(file, file.name).get("target") if file.is_file() else None
-    stated_target = {}
-    if isinstance(name, str) and name.endswith(".toml"):
-        stated_target = read_toml(path / name, name)
-    lengths = (stated_target.get(name) for name in ("square_m", "size_m"))
-    numbers = (side for side in lengths if isinstance(side, int | float))
-    side = next((number for number in numbers if LARGEST_M < number < _LARGEST_MM), None)
-    if side is None:
+    name = str(read_toml(file, file.name).get("target")) if file.is_file() else ""
+    stated = read_toml(path / name, name) if name.endswith(".toml") else {}
+    sides = (stated.get(key) for key in ("square_m", "size_m"))
+    side = next((side for side in sides if isinstance(side, int | float)), 0.0)
+    if not LARGEST_M < side < 1e3 * LARGEST_M:
         return DoubtfulSession(Session.load(path, table=plain), robot)
-    by_unit = {}
-    for unit in _BOARD_UNITS:
-        if UNITS_M[unit] * side <= LARGEST_M:
-            target = _scaled(stated_target, UNITS_M[unit])
-            by_unit[unit] = Session.load(path, target_document=target, table=plain)
-    scores = {unit: _closing_score(session, robot) for unit, session in by_unit.items()}
-    unit = min(scores, key=lambda index: scores[index])
-    note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
-    return DoubtfulSession(replace(by_unit[unit], warnings=(note, *by_unit[unit].warnings)), robot)
-
-
-def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
-    """Score of the chain's closure as declared; infinite where it does not close."""
-    try:
-        declared = DoubtfulSession(session, robot).guess().declared
-    except VisioncalError:
-        # The candidate reading that is then tried reports the error.
-        return np.inf
-    return declared.fit.score if declared.fit.closes else np.inf
+    session = Session.load(path, target_document=_scaled(stated, 1e-3), table=plain)
+    note = f"{name} cannot be in metres: {side:g} is read as {side:g} mm."
+    return DoubtfulSession(replace(session, warnings=(note, *session.warnings)), robot)
 
 
 def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
@@ -301,8 +278,6 @@ def _replace_cells(
 
 
 def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
-    if factor == 1.0:
-        return target
     return {
         name: factor * value if name in _LENGTHS and isinstance(value, int | float) else value
         for name, value in target.items()
