@@ -46,10 +46,10 @@ def bad(sample):
         views[number] = replace(views[number], used=False, reason="blurred")
     tilted = Remedy("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
     found = (
-        Finding("weak_motion", "Its z is weakly determined.", tilted),
-        Finding("place", "Its y is weakly determined.", tilted),
         Finding("wrong_views", "View 1 is wrong.", Remedy("Look at it."), (1,), 0.9),
+        Finding("weak_motion", "Its z is weakly determined.", tilted),
         Finding("lens", "The lens is another.", Remedy("Measure it."), probability=0.3),
+        Finding("place", "Its y is weakly determined.", tilted),
         Finding("note", "It was cold."),
     )
     return replace(sample.calibration, views=tuple(views), verdict=Verdict("bad", found))

@@ -150,7 +150,7 @@ def check_usable(verdict: "Verdict", what: str, *, force: bool) -> tuple[str, ..
     """
     if verdict.status != "bad":
         return ()
-    found = verdict.ordered
+    found = verdict.findings
     count = f" (all {len(found)} reasons are in its report)" if len(found) > 1 else ""
     words = f"The verdict of {what} is bad{count}:"
     if force:

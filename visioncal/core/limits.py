@@ -44,8 +44,6 @@ class CalibrationLimits:
     # Stops of the robot in the fit; fewer do not suffice to check the result.
     stops: tuple[int, int] = (10, 5)
     lost_share: Pair = (0.25, 0.6)  # Share of views that could not be used.
-    # Left-out over in-sample scatter; large where each view has high leverage.
-    optimism: Pair = (1.6, 4.0)
     outlier: float = 6.0  # Residual of a view over the median of all views.
     holdout: float = 4.0  # Residuals of held-out views over those of views left out in turn.
 

@@ -10,7 +10,6 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
-from visioncal.core.finding_kinds import CALIBRATED_ARM, KINDS, MISSING, Kind
 from visioncal.core.number_format import percent, ranges
 from visioncal.core.summaries import html_card
 
@@ -18,9 +17,9 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
 # Number of findings, and of steps, that are shown first; least probability of causes among them,
 # of causes with steps, and of causes that are likely beside the first.
-_SHOWN, _LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
+_SHOWN, LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
 # From this probability on, causes are ranked by their kinds.
-_SURE = 0.99
+SURE = 0.99
 # Smaller than any need [mm]: for findings on what is left out of a result, which do not impair it.
 LEAST_NEED_MM = 1e-3
 _HEADLINES = {
@@ -28,6 +27,8 @@ _HEADLINES = {
     "check": "Check before use",
     "bad": "Bad: do not use",
 }
+# Kinds of what is no doubt: praise, and remarks.
+AGREEMENT, NOTE = "agreement", "note"
 # Commands of remedies.
 CALIBRATE, ADD_VIEWS = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add"
 PLAN = f"{ADD_VIEWS} 5"
@@ -77,6 +78,12 @@ def or_alone(words: str, views: Sequence[int]) -> Remedy:
     return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if are_enough else "")
 
 
+def without(views: Sequence[int], residuals: str) -> str:
+    """How well the other views predict each other, beside some that were left out."""
+    left_out = f"view {views[0]}" if len(views) == 1 else "these views"
+    return f"Without {left_out}, the others predict each other to {residuals}."
+
+
 READ_AGAIN = Remedy(
     "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
 )
@@ -95,6 +102,8 @@ class Finding:
     # Whether this probability follows from the limit of its test (or comparison) alone, the same in
     # all sessions: it ranks causes, and is not stated.
     by_limit: Annotated[bool, DROPPED] = False
+    # Whether its probability is its share of the errors of picks: a source of errors, no mistake.
+    is_share: Annotated[bool, DROPPED] = False
     without_it: Annotated[str, DROPPED] = ""  # The result without it, as a sentence.
     # Whether it alone makes a result bad.
     is_fatal: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
@@ -114,11 +123,6 @@ class Finding:
         return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
 
     @property
-    def of_kind(self) -> Kind:
-        """What a verdict makes of it, by its kind."""
-        return KINDS.get(self.kind, Kind(self.kind))
-
-    @property
     def reason(self) -> str:
         """Its text and advice."""
         return self.words if self.do is None else f"{self.words} {self.do}"
@@ -134,7 +138,7 @@ class Verdict:
     """Whether a result can be trusted."""
 
     status: VerdictStatus  # The judgement.
-    # The reasons: doubts, fatal ones first, findings on needs, then notes.
+    # The reasons in reading order: the likeliest cause, its effect, then the rest.
     findings: tuple[Finding, ...] = ()
     # The least need for which it is good [mm]; None where errors are unexplained.
     good_for_mm: float | None = None
@@ -169,55 +173,30 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All findings with advice, the most likely cause first."""
-        return tuple(finding.reason for finding in self.ordered)
-
-    @property
-    def ordered(self) -> tuple[Finding, ...]:
-        """All findings, the most likely cause first."""
-        likeliest = (cause for cause in self.causes[:1] if not cause.of_kind.is_source)
-        distinct = {id(finding): finding for finding in (*likeliest, *self.findings)}
-        return tuple(distinct.values())
+        """All findings with advice."""
+        return tuple(finding.reason for finding in self.findings)
 
     @property
     def causes(self) -> tuple[Finding, ...]:
-        """Possible causes of doubts, likeliest first."""
+        """Possible causes of doubts, likeliest first; those that are as good as certain as read."""
         possible = (finding for finding in self.findings if finding.probability)
-
-        def order(finding: Finding) -> tuple[float, int, float]:
-            most = -finding.probability
-            return max(most, -_SURE), finding.of_kind.order, most
-
-        return tuple(sorted(possible, key=order))
-
-    @property
-    def ranked(self) -> tuple[Finding, ...]:
-        """All findings in reading order: the likeliest cause, its effect, then the rest."""
-        causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
-        sized = (finding for finding in self.findings if finding.of_kind.size)
-        costs = sorted(sized, key=lambda finding: finding.of_kind.size)
-        missing = [finding for finding in self.findings if finding.kind == MISSING]
-        # Behind a likely cause, and not where the result is of no use.
-        of_use = [] if self.status == "bad" else self.findings
-        to_correct = [finding for finding in of_use if finding.kind == CALIBRATED_ARM]
-        ordered = [*missing, *causes[:1], *to_correct, *costs[:1], *causes[1:], *self.findings]
-        return tuple({id(finding): finding for finding in ordered}.values())
+        return tuple(sorted(possible, key=lambda finding: -min(finding.probability, SURE)))
 
     @property
     def top(self) -> tuple[str, ...]:
         """The first findings as sentences."""
-        return tuple(map(self._line, self.ranked[:_SHOWN]))
+        return tuple(map(self._line, self.findings[:_SHOWN]))
 
     @property
     def rest(self) -> tuple[str, ...]:
         """The remaining findings as sentences."""
-        return tuple(map(self._line, self.ranked[_SHOWN:]))
+        return tuple(map(self._line, self.findings[_SHOWN:]))
 
     def _line(self, finding: Finding) -> str:
         likely = "" if finding.by_limit else f" ({percent(finding.probability)})"
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
         how = "Most likely" if finding in self.causes[:1] else how
-        is_likely = finding.probability >= _LEAST_LIKELY and not finding.of_kind.is_source
+        is_likely = finding.probability >= LEAST_LIKELY and not finding.is_share
         begin = f"{how}{likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()
 
@@ -226,7 +205,7 @@ class Verdict:
         """Advice on the findings, in their order, without repetitions."""
         unlikely = [cause for cause in self.causes[1:] if cause.probability < _LIKELY]
         steps: dict[str, Remedy] = {}
-        for finding in self.ranked:
+        for finding in self.findings:
             if finding.do is not None and finding not in unlikely:
                 steps.setdefault(finding.do.command or finding.do.words, finding.do)
         return tuple(steps.values())[:_SHOWN]

@@ -13,11 +13,10 @@ from visioncal.core.codec import KEPT, Key, Vector, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
-from visioncal.core.finding_kinds import NOTE
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
+from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel, Consistent, random_motion
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion

@@ -9,11 +9,10 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.finding_kinds import AGREEMENT
 from visioncal.core.limits import FixtureLimits, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import AGAIN, Finding, Remedy, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
 from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of

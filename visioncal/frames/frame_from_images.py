@@ -10,11 +10,10 @@ import numpy as np
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.finding_kinds import AGREEMENT
 from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import Finding, Verdict, remarks
+from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
 from visioncal.frames.fixture import sigma_findings

@@ -1,24 +1,17 @@
-"""The robots' arms of a cell: reading, calibration one by one, covariance, findings."""
+"""The robots' arms of a cell: reading, calibration one by one, covariance."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages import thermal
-from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.kinematics import doubts, findings
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
-from visioncal.calibration.stages.residual_findings import arm_findings, step_finding
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.finding_kinds import NOTE
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
-from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
@@ -100,53 +93,6 @@ def covariance_from_other_sources(
     if steps and steps[0].kind != DRIFT:
         parts[STEP] = steps[0].spread
     return parts
-
-
-def doubts_of_arms(
-    arms: Mapping[str, RobotArm],
-    steps: tuple[Step, ...],
-    results: Mapping[str, ArmReport],
-    level: str,
-    cell: Cell,
-) -> Iterator[Finding]:
-    """Findings against the robots' arms, and on what moved during the session."""
-
-    def joint(slip: Step) -> str:
-        matched, index = arms[slip.of].matched, slip.candidate.joint
-        words = f"joint {index + 1}" if matched is None else joint_words(index, matched.robot)
-        return words if len(arms) == 1 else f"{words} of robot {slip.of}"
-
-    for robot, arm in arms.items():
-        for finding in (*_findings_on(arm, level), *results[robot].doubts):
-            yield finding.of(_robot_name(arms, robot))
-    yield from step_finding(steps, cell, joint)
-
-
-def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmReport]) -> Iterator[str]:
-    """Notes on the arms that are no reason for doubt."""
-    for robot, arm in arms.items():
-        drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
-        levels = () if arm.kinematics is None else findings(arm.kinematics)
-        for remark in remarks((*drifts, *levels, *results[robot].notes), NOTE):
-            yield remark.of(_robot_name(arms, robot)).words
-
-
-def _findings_on(arm: RobotArm, level: str) -> Iterator[Finding]:
-    is_cold = level == thermal.LEVEL and arm.thermal is None
-    if is_cold or (arm.joints_rad is None and level not in ("auto", "hand-eye")):
-        words = f"It stays as it reports itself: its rows lack what --level {level} needs."
-        step = "Record joint angles, and name the arm as [robot] model in session.toml"
-        step += "; record temp1_c ... or current1_a ... in a stream." * is_cold or "."
-        yield Finding("level", words, Remedy(step))
-    if arm.kinematics is not None:
-        yield from doubts(arm.kinematics)
-    if arm.errors is not None:
-        yield from arm_findings(arm.errors, calibrated=arm.model is not None)
-
-
-def _robot_name(arms: Mapping[str, RobotArm], robot: str) -> str:
-    """Name of the robot in a finding; empty for a single robot."""
-    return "" if len(arms) == 1 else f"Robot {robot}"
 
 
 def change_each(

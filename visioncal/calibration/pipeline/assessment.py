@@ -15,12 +15,6 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.cell_fit import CellFit
-from visioncal.calibration.pipeline.fault_messages import (
-    PoseFault,
-    explained_outliers,
-    movements,
-    versions,
-)
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arm_report import ArmReport
@@ -28,10 +22,16 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views
+from visioncal.calibration.stages.likely_steps import likely_steps
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.residual_findings import likely_steps
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
+from visioncal.calibration.suspects.outliers import (
+    PoseFault,
+    explained_outliers,
+    movements,
+    versions,
+)
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter

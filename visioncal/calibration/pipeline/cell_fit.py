@@ -1,6 +1,6 @@
 """The fit of a cell: inliers, camera parameters and arms, with its views on the problem."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -8,12 +8,10 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.fit_messages import lens_and_board_findings
 from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import Finding
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.outliers import InlierFit
@@ -69,16 +67,13 @@ class CellFit:
         corners, arms = fitted.linearised, model.arms
         return replace(self, inlier_fit=inlier_fit, linearised_corners=corners, arms=arms)
 
-    def camera_findings(self, covariance: FloatArray) -> Iterator[Finding]:
-        """Findings on lenses and boards; see `stages.fit_messages`."""
-        if self.linearised_corners is not None:
-            fitted = ConvergedFit(self.linearised_corners, self.inlier_problem, self.inlier_fit.fit)
-            arms, stated = self.arms.values(), None
-            if any(arm.model is not None for arm in arms):
-                stated = self.inlier_problem
-                for arm in arms:
-                    stated = arm.without_errors(stated)
-            yield from lens_and_board_findings(self.frame_model, fitted, covariance, stated)
+    @property
+    def joint_fit(self) -> ConvergedFit | None:
+        """The fit of lenses and boards with the inliers; None without images."""
+        seen = self.linearised_corners
+        if seen is None:
+            return None
+        return ConvergedFit(seen, self.inlier_problem, self.inlier_fit.fit)
 
     @property
     def residual_px(self) -> dict[str, float]:

@@ -6,22 +6,15 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
 from visioncal.calibration.pipeline.connectivity import (
-    connection_advice,
     measuring_advice,
     robot_motion,
 )
-from visioncal.calibration.pipeline.fault_messages import moved_finding
-from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.need import PickInputs, predict_picks
-from visioncal.calibration.stages.priors import components
-from visioncal.calibration.stages.random_effects import random_effect_findings
 from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
@@ -29,12 +22,10 @@ from visioncal.calibration.suspects.judged import (
     PointAccuracy,
     Sensor,
 )
-from visioncal.calibration.suspects.ranking import is_of_chain
+from visioncal.calibration.suspects.registry import found_in
 from visioncal.core.conventions import controller_form
-from visioncal.core.finding_kinds import NOTE
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of
-from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
@@ -56,29 +47,11 @@ from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
 def findings_of(run: RunState) -> Findings:
     """Collects the input of the verdict."""
-    answer, cell_fit = run.assessment, run.cell_fit
-    frames = cell_fit.cell.tree.branches.keys()
+    answer = run.assessment
+    frames = run.cell_fit.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
-    explained = {cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    worst, places, of_cell = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
-    of_arms = doubts_of_arms(
-        cell_fit.arms, answer.steps, answer.arms, cell_fit.level, cell_fit.cell
-    )
-    found = [*of_arms, *lens_findings(answer.lenses)]
-    of_rest = [
-        *(
-            component.finding
-            for component in components(
-                answer.problem, answer.state, answer.covariance, cell_fit.cell.priors
-            )
-        ),
-        *cell_fit.camera_findings(answer.covariance),
-        *random_effect_findings(
-            cell_fit.inlier_problem, cell_fit.inlier_fit.fit, answer.covariance
-        ),
-    ]
-    if any(map(is_of_chain, (*found, *of_rest))) or not cell_fit.inlier_fit.used.all():
-        found += lens_changes(cell_fit)
+    explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
+    worst, places = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
     is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
@@ -86,19 +59,8 @@ def findings_of(run: RunState) -> Findings:
         _arms(answer),
         worst,
         places,
-        (
-            *(fault.found for fault in answer.faults),
-            *found,
-            *run.warnings,
-            *(finding for finding in of_rest if finding.kind != NOTE),
-            *of_cell,
-            *_unconnected(run),
-        ),
-        (
-            *run.notes,
-            *notes_on_arms(cell_fit.arms, answer.arms),
-            *(finding.reason for finding in of_rest if finding.kind == NOTE),
-        ),
+        (*found_in(run), *run.warnings),
+        run.notes,
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
@@ -154,28 +116,17 @@ def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, Floa
     return {seer: np.array(errors) for seer, errors in strays.items()}
 
 
-def _unconnected(run: RunState) -> Iterator[Finding]:
-    for frame in run.cell_fit.unconnected:
-        if run.mount is not None and frame.startswith("target"):
-            words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
-            step = Remedy("Add views that show it, or delete it from session.toml.")
-            yield Finding("unseen_target", words, step)
-        else:
-            step = Remedy(connection_advice(run.cell, frame))
-            yield Finding("untied", f"{frame} is tied to nothing.", step)
-
-
-_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence[Finding]]
+_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy]]
 
 
 def _pair_accuracy(run: RunState) -> _Parts:
-    """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
+    """Worst directions, and accuracy where the views look, of one camera and one robot."""
     answer, work, mount = run.assessment, run.uncertainty, run.session.mount
     place = _place("Where the views look, a point", work.budget_mm, work.radius95_mm)
     names = chain_words(answer.problem, mount).names
     found = directions(answer.problem, answer.state, answer.covariance, names)
     worst = [direction for _, direction in found]
-    return worst, [place], [*_measured_pose_findings(run)]
+    return worst, [place]
 
 
 def _place(words: str, budget_mm: Mapping[str, float], radius95_mm: float) -> PointAccuracy:
@@ -185,23 +136,8 @@ def _place(words: str, budget_mm: Mapping[str, float], radius95_mm: float) -> Po
     return PointAccuracy(words, in_words, radius95_mm)
 
 
-def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
-    """Finding on measured poses whose scale differs from the robot's."""
-    usable = run.poses.keys() - run.reasons.keys()
-    views = [view for view in run.base_from_flange if view in usable]
-    if run.cameras or run.mount == "instrument" or not views:
-        return
-    poses = np.array([run.base_from_flange[view] for view in views])
-    seen = np.array([run.poses[view].cam_from_target[0] for view in views])
-    parent = poses if run.mount == "eye-in-hand" else invert(poses)
-    # The camera may have a name.
-    (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
-    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
-        yield finding
-
-
 def _cell_accuracy(run: RunState) -> _Parts:
-    """Worst directions, accuracy of the frames, and moved frames of a whole cell."""
+    """Worst directions and accuracy of the frames of a whole cell."""
     answer, cell, budget = run.assessment, run.cell_fit.cell, run.assessment.budget_mm
     absorbing = {*_absorbing(run)}
     edges = {frame: edge for frame, edge in answer.last_edges.items() if frame not in absorbing}
@@ -212,7 +148,6 @@ def _cell_accuracy(run: RunState) -> _Parts:
             _place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
-        [moved_finding(move) for move in answer.moved],
     )
 
 

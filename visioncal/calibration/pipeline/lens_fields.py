@@ -1,20 +1,14 @@
-"""Lens errors beyond the camera models: their size, and findings where they are significant."""
+"""Lens errors beyond the camera models: their size, and the section of the result."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.calibration.pipeline.cell_fit import CellFit
-from visioncal.core.finding_kinds import LENS_CHANGED
-from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
-from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
-from visioncal.estimation.lens_field import LensLevels, depths_m, displacements, distances
-from visioncal.estimation.lens_levels import SIGNIFICANT
-from visioncal.estimation.lens_step import lens_step
+from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
 from visioncal.results.lens import LensField
 
 # Variance of displacements that is negligible beside that of corners; grid points per image axis.
@@ -119,79 +113,3 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
     values, vectors = np.linalg.eigh(np.outer(size, size) * covariance)
     kept = values > _NEGLIGIBLE
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])
-
-
-def lens_changes(cell_fit: CellFit) -> Iterator[Finding]:
-    """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
-    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
-    if seen is None or optics is None:
-        return
-    stations = {row.view: row.station for row in cell_fit.cell.rows}
-    for which, (name, problem) in enumerate(optics.problems.items()):
-        # Images for the intrinsics alone have no time.
-        timed = np.array([view in stations for view in problem.stack.views])
-        points = optics.points[problem.stack.ids]
-        stack = replace(problem.stack, points=points, zooms=None)
-        stack = stack.keep(timed[stack.view_of])
-        order = np.argsort([stations[view] for view in stack.views], kind="stable")
-        compressed, camera = seen.compressed[which], optics.camera(name)
-        poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
-        if compressed.coefficients is not None and problem.levels is not None:
-            far = distances(stack, poses)[stack.view_of]
-            columns = displacements(stack.px, camera, far, replace(problem.levels, breathing=0.0))
-            beyond = columns @ compressed.coefficients.mean[: columns.shape[2]]
-        step = lens_step(stack, camera, poses, beyond, order)
-        if step is None:
-            continue
-        at, change, sigmas, gain = step
-        first, (zoom, x, y) = stations[stack.views[int(order[at])]], change.tolist()
-        yield Finding(
-            LENS_CHANGED,
-            f"{_named(name, len(optics.problems))} changed: {cell_fit.cell.start_words(first)}, "
-            f"its focal length is {figure(100.0 * abs(zoom))} % "
-            f"{'longer' if zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * float(sigmas[0]))} "
-            f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
-            f"{figure(float(sigmas[1:].max()))} px), by the corners alone; the result is between "
-            "both lenses.",
-            cell_fit.cell.or_separately(
-                "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
-            ),
-            mahalanobis_sq=gain,
-        )
-
-
-def _named(camera: str, count: int) -> str:
-    return "The lens" if count == 1 else f"The lens of {camera}"
-
-
-def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
-    """Findings on significant lens errors."""
-    for name, lens in lenses.items():
-        of, levels, (field, *changes) = _named(name, len(lenses)), lens.levels, lens.levels.gains
-        if field > SIGNIFICANT:
-            yield Finding(
-                "lens_field",
-                f"{of} departs from its model: corners of one part of the image are off alike, by "
-                f"{figure(lens.field_px)} px. The result counts it, and belongs to this lens.",
-                Remedy(
-                    "Give matrix and distortion of a model that fits the lens, or keep the work in "
-                    "the middle of the image."
-                ),
-                mahalanobis_sq=field,
-                up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
-            )
-        percents = [100.0 * lens.noise_px * share for share in (levels.breathing, levels.jitter)]
-        when = ("where the distance doubles", "from view to view")
-        how = [
-            f"by {figure(percent)} % {words}"
-            for percent, words, gain in zip(percents, when, changes, strict=True)
-            if gain > SIGNIFICANT
-        ]
-        if how:
-            yield Finding(
-                "focus",
-                f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
-                Remedy("Fix the focus (no autofocus), or work at one distance."),
-                mahalanobis_sq=max(changes),
-                up_to_mm=10.0 * max(percents) * lens.distance_m,
-            )

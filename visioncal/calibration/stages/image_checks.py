@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.finding_kinds import MISSING
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
@@ -36,7 +35,7 @@ def missing_images(session: Session) -> Finding | None:
     images = some_of([view.image for view in missing], _LISTED)
     views = tuple(view.number for view in missing)
     return Finding(
-        MISSING,
+        "missing_images",
         f"{len(missing)} of {len(searched)} images are missing: {images}.",
         Remedy(
             "Copy them there; or in views.csv, correct their folder and names, or delete the rows "

@@ -7,11 +7,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.finding_kinds import NOTE
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import FramePrior, State

@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import LEVER_M, stops_of
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.effects.lenses import LinearisedCorners
@@ -23,7 +21,6 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.estimation.solve import Solution
 
 # With fewer stops, no such error is distinguished from noise.
 _FEWEST_STOPS = 12
@@ -116,17 +113,3 @@ def random_effect_rms(problem: Problem, state: State, robot: str) -> FloatArray:
             error += effect.flange_jacobian[robot] @ problem.values_of(effect.name, state)
     squares = error[stops_of(problem, robot)].reshape(-1, 2, 3) ** 2
     return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
-
-
-def random_effect_findings(
-    problem: Problem, fit: Solution, covariance: FloatArray
-) -> Iterator[Finding]:
-    """Findings on the random effects of a fit, given the covariance (p, p) of its unknowns."""
-    for effect in of_random_effects(problem.effects):
-        name, _, owner = effect.name.partition(" of ")
-        kind, columns = _KINDS[name], problem.effect_columns[effect.name]
-        values = problem.values_of(effect.name, fit.state)
-        squared = float(values @ np.linalg.solve(covariance[columns, columns], values))
-        if squared > chi2_limit(FALSE_ALARM, len(values)):
-            found = Finding(kind.kind, kind.says(values), Remedy(kind.do), mahalanobis_sq=squared)
-            yield found.of(owner if len(problem.robots) > 1 else "")

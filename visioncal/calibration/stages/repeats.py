@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
-from visioncal.core.finding_kinds import REPEATED_READINGS
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray
@@ -49,7 +48,7 @@ def without_repeats(seen: T) -> T:
     views, originals = listed([*repeated]), listed([*dict.fromkeys(repeated.values())])
     # Readings may be of another time that is not stated.
     finding = Finding(
-        "repeated_views" if seen.corners else REPEATED_READINGS,
+        "repeated_views" if seen.corners else "repeated_readings",
         f"Views {views} repeat {originals}: what was read is the same, or differs by less than "
         f"{APART_MM:g} mm and {APART_DEG:g} deg at the same pose and without a time or a stop of "
         "its own. They count once.",

@@ -6,17 +6,26 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.need import Picks, need_met
-from visioncal.calibration.suspects.checks import (
+from visioncal.calibration.suspects.judged import Findings
+from visioncal.calibration.suspects.limits import (
     collect_findings,
     is_scattered,
     remedy_for_uncertainty,
 )
-from visioncal.calibration.suspects.judged import Findings
 from visioncal.calibration.suspects.ranking import correcting, is_negligible, rank_causes
-from visioncal.core.finding_kinds import AGREEMENT, CALIBRATED_ARM, GOOD_FOR, NEED, NOTE
+from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent, rounded_up
-from visioncal.core.verdict import Finding, Verdict, VerdictStatus, remarks
+from visioncal.core.verdict import (
+    AGREEMENT,
+    LEAST_LIKELY,
+    NOTE,
+    SURE,
+    Finding,
+    Verdict,
+    VerdictStatus,
+    remarks,
+)
 from visioncal.results import NeedMet
 from visioncal.results.conditions import uncorrected_words
 
@@ -64,18 +73,39 @@ def judge(findings: Findings) -> Verdict:
             )
         ]
     if met is not None:
-        stated.insert(len(stated) * is_met, Finding(NEED, _need_words(findings, met)))
+        stated.insert(len(stated) * is_met, Finding("need", _need_words(findings, met)))
     elif good_for_mm is not None:
         stated.append(_good_for(findings, good_for_mm, status))
     if not doubts:
         stated.append(_agreement(findings, is_enough=status == "good"))
-    stated += [warning for warning in findings.warnings if not warning.of_kind.is_doubt]
-    verdict = Verdict(status, (*stated, *notes), good_for_mm, uncorrected_mm)
-    if not is_calibrated:
-        return verdict
-    step = None if findings.corrects_targets else correcting(findings.need)
-    found = Finding(CALIBRATED_ARM, uncorrected_words(verdict), step)
-    return replace(verdict, findings=(*verdict.findings, found))
+    stated += [warning for warning in warnings if not SUSPECTS[warning.kind].is_doubt]
+    stated += notes
+    verdict = Verdict(status, (), good_for_mm, uncorrected_mm)
+    if is_calibrated:
+        step = None if findings.corrects_targets else correcting(findings.need)
+        stated.append(Finding("calibrated_arm", uncorrected_words(verdict), step))
+    return replace(verdict, findings=in_reading_order(stated, status))
+
+
+def in_reading_order(findings: Sequence[Finding], status: VerdictStatus) -> tuple[Finding, ...]:
+    """What is missing, the likeliest cause, its cost, other likely causes, then the rest."""
+
+    def by_likelihood(finding: Finding) -> tuple[float, int, float]:
+        most = -finding.probability
+        return max(most, -SURE), SUSPECTS[finding.kind].order, most
+
+    likely = (finding for finding in findings if finding.probability >= LEAST_LIKELY)
+    causes = sorted(likely, key=by_likelihood)
+    sized = (finding for finding in findings if SUSPECTS[finding.kind].size)
+    costs = sorted(sized, key=lambda finding: SUSPECTS[finding.kind].size)
+    missing = [finding for finding in findings if finding.kind == "missing_images"]
+    # Not where the result is of no use.
+    of_use = [] if status == "bad" else findings
+    to_correct = [finding for finding in of_use if finding.kind == "calibrated_arm"]
+    # Sources of what picks err by come behind that.
+    first = [cause for cause in causes[:1] if not cause.is_share]
+    ordered = [*missing, *first, *to_correct, *costs[:1], *causes, *findings]
+    return tuple({id(finding): finding for finding in ordered}.values())
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
@@ -92,7 +122,7 @@ def _good_for(findings: Findings, good_for_mm: float, status: VerdictStatus) -> 
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     return Finding(
-        GOOD_FOR,
+        "good_for",
         f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more at "
         f"{figure(worst.distance_m)} m from the {sensor}{corrected}.",
     )

@@ -24,27 +24,15 @@ import numpy as np
 from scipy.special import chdtrc
 
 from visioncal.calibration.stages.need import CONTROLLER, Picks
-from visioncal.core.finding_kinds import (
-    ARM_ERRORS,
-    CHAIN,
-    EXCHANGED,
-    FACT,
-    KINDS,
-    LENS_CHANGED,
-    UNEXPLAINED,
-    Kind,
-)
+from visioncal.calibration.suspects.arm import NO_JOINTS
+from visioncal.calibration.suspects.registry import SUSPECTS
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, EXCHANGED, FACT, UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Need
 from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy, Verdict
-from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import NeedMet
 
-_KINDS: Mapping[str, Kind] = {
-    **KINDS,
-    **{effect.kind: Kind(effect.kind, 1e-4, CHAIN) for effect in RANDOM_EFFECTS},
-}
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
@@ -54,11 +42,6 @@ MEASURE_BOARD = Remedy(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
     "square (of a marker size_m, its side), and square_sigma_m, how well it is known, of the "
     "target: more views tell neither."
-)
-# Remedy for errors of an arm whose joints are not known.
-NO_JOINTS = Remedy(
-    "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
-    "calibrate then estimates the arm, too."
 )
 # Error sources of picks: kind of the finding, words, and remedy.
 _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
@@ -118,7 +101,7 @@ def explained_by(verdict: Verdict, found: Finding) -> Verdict:
     if verdict.causes and verdict.causes[0].kind == EXCHANGED:
         # The views themselves show the exchange; the finding's command undoes it.
         return verdict
-    kind = _KINDS[found.kind]
+    kind = SUSPECTS[found.kind]
     odds = _odds(kind.chance)
     rest = [finding for finding in verdict.findings if finding.kind not in kind.hides]
     if kind.chance > FACT:
@@ -155,8 +138,8 @@ def rank_causes(
         KeyError: A kind is not in the catalogue.
     """
     found = _with_probabilities(doubts, left_out_mm)
-    sigmas = [finding for finding in found if _KINDS[finding.kind].is_sigma]
-    sigma = min(sigmas, key=lambda finding: _KINDS[finding.kind].size, default=None)
+    sigmas = [finding for finding in found if SUSPECTS[finding.kind].is_sigma]
+    sigma = min(sigmas, key=lambda finding: SUSPECTS[finding.kind].size, default=None)
     # A sigma far beyond its limit alone makes a result bad, with no likely mistake.
     is_likely = any(finding.probability >= _LIKELIER for finding in found)
     decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
@@ -165,7 +148,7 @@ def rank_causes(
     is_sized = is_scattered or any(doubt.until_mm == 0.0 for doubt in doubts)
     if picks and not decides and (unmet or (met is None and too_large and is_sized)):
         causes = {finding.kind for finding in found if finding.probability}
-        known = causes.union(*(_KINDS[kind].inflates for kind in causes))
+        known = causes.union(*(SUSPECTS[kind].inflates for kind in causes))
         for source in _sources(picks, met, more):
             if source.kind in known:
                 continue
@@ -192,7 +175,7 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
     """Findings with their probabilities among rivals; only the first of a kind is a cause."""
     first: dict[str, Finding] = {}
     for finding in doubts:
-        if _KINDS[finding.kind].chance:
+        if SUSPECTS[finding.kind].chance:
             first.setdefault(finding.kind, finding)
     hidden = {*_hidden({doubt.kind: doubt for doubt in reversed(doubts)})}
     misfit_mm = left_out_mm if UNEXPLAINED in first else 0.0
@@ -202,12 +185,12 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
     }
 
     def weighed(finding: Finding) -> Finding:
-        name, misfit = finding.kind, _KINDS[finding.kind].misfit
+        name, of_chain = finding.kind, SUSPECTS[finding.kind].of_chain
         found = replace(finding, do=None) if name in hidden else finding
         if first.get(name) is not finding:
             return found
-        among = [rival for rival in odds if rival != name and _KINDS[rival].misfit == misfit]
-        rivals = sum(odds[rival] for rival in among) if misfit else 0.0
+        among = (rival for rival in odds if rival != name and SUSPECTS[rival].of_chain)
+        rivals = sum(odds[rival] for rival in among) if of_chain else 0.0
         # "None of these" has odds one, unless `unexplained` stands for it as a finding.
         none = float(name != UNEXPLAINED and not (rivals and UNEXPLAINED in odds))
         probability = odds[name] / (none + odds[name] + rivals)
@@ -226,19 +209,20 @@ def _hidden(first: Mapping[str, Finding]) -> Iterator[str]:
         for kind in first.keys() - {name}:
             # Errors of the arm that are more evident are no effect of what the corners alone show.
             is_clearer = (
-                name == LENS_CHANGED
+                name == "lens_changed"
                 and kind == ARM_ERRORS
                 and arm is not None
                 and arm.mahalanobis_sq > finding.mahalanobis_sq
             )
-            if not is_clearer and {kind, _KINDS[kind].misfit} & {*_KINDS[name].hides}:
+            among = {kind, CHAIN} if SUSPECTS[kind].of_chain else {kind}
+            if not is_clearer and among & {*SUSPECTS[name].hides}:
                 yield kind
 
 
 def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
     """Odds of a finding, bounded by the share of the misfit that it can explain."""
     # By its chi-square, or the limit of its test.
-    chance = _KINDS[doubt.kind].chance
+    chance = SUSPECTS[doubt.kind].chance
     if doubt.mahalanobis_sq:
         chance = min(max(float(chdtrc(1.0, doubt.mahalanobis_sq)), FACT), chance)
     odds = _odds(chance)
@@ -246,11 +230,6 @@ def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
         return odds
     most = (doubt.up_to_mm / misfit_mm) ** 2 * odds / (1.0 + odds)
     return most / (1.0 - most)
-
-
-def is_of_chain(found: Finding) -> bool:
-    """Whether a finding explains that views disagree, or that the flange is off."""
-    return _KINDS[found.kind].misfit == CHAIN
 
 
 def _odds(chance: float) -> float:
@@ -290,6 +269,7 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
             f"{words}.",
             correcting(need) if name == CONTROLLER else do or more,
             probability=size**2 / total**2,
+            is_share=True,
             without_it=without,
             until_mm=0.0,
         )

@@ -18,12 +18,11 @@ from visioncal.calibration.verification.change_hypotheses import (
 )
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.triggers import Trigger
-from visioncal.core.finding_kinds import AGREEMENT
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGAIN, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions

@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.core.finding_kinds import EXCHANGED
+from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference

@@ -1,20 +1,18 @@
 """Checks of a result against its limits: by its views, motion, corners and arms."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
-from visioncal.calibration.suspects.ranking import (
-    MEASURE_BOARD,
-    NO_JOINTS,
-    add_views_remedy,
-)
-from visioncal.core.finding_kinds import UNEXPLAINED
+from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_remedy
+from visioncal.calibration.suspects.registry import SUSPECTS
+from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
-from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at
+from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at, without
 from visioncal.results import Rms, ViewResult
 
 _LIMITS = CalibrationLimits()
@@ -40,7 +38,7 @@ def collect_findings(judged: Findings) -> list[Finding]:
     # With fatal scatter, sigmas say nothing about the motion. A step inflates all of them, and more
     # views do not help.
     is_wild = any(doubt.is_fatal for doubt in scatter)
-    is_wild |= any(warning.of_kind.is_step for warning in judged.warnings)
+    is_wild |= any("calibration" in SUSPECTS[found.kind].inflates for found in judged.warnings)
     return [
         *scatter,
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
@@ -50,25 +48,13 @@ def collect_findings(judged: Findings) -> list[Finding]:
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _lost_views(sensor)),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _corner_noise(sensor)),
         *robots,
-        *(_warned(warning, judged) for warning in judged.warnings if warning.of_kind.is_doubt),
+        *(warning for warning in judged.warnings if SUSPECTS[warning.kind].is_doubt),
     ]
 
 
 def is_scattered(judged: Findings) -> bool:
     """Whether views disagree with each other by more than in a sound cell."""
     return any(_scatter(judged))
-
-
-def _warned(warning: Finding, judged: Findings) -> Finding:
-    """A stage's warning, with the residuals of the other views where it left some out."""
-    if not warning.of_kind.leaves_out:
-        return warning
-    return replace(warning, without_it=_without(warning.views, judged.held_out))
-
-
-def _without(views: Sequence[int], held_out: Rms) -> str:
-    left_out = f"view {views[0]}" if len(views) == 1 else "these views"
-    return f"Without {left_out}, the others predict each other to {held_out.words}."
 
 
 def _ratio(first: Rms, second: Rms) -> float:
@@ -112,16 +98,6 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             is_fatal=is_fatal,
             until_mm=0.0,
         )
-    ratio = _ratio(judged.held_out, judged.rms)
-    if ratio > _LIMITS.optimism[0] and not any(arm.by_functions for arm in judged.arms):
-        yield Finding(
-            "optimism",
-            f"Views left out fit {ratio:.1f} times worse than views in the fit: there are too few "
-            "views for their noise.",
-            _tilted(judged),
-            is_fatal=ratio > _LIMITS.optimism[1],
-            until_mm=0.0,
-        )
 
 
 def _residual(view: ViewResult) -> str:
@@ -142,7 +118,7 @@ def _left_out(pair: JudgedPair) -> Iterator[Finding]:
         f"Compare images and poses: repeat, or in views.csv, delete the rows of view {listed}.",
         look_at(views[0]),
     )
-    yield Finding("wrong_views", words, step, views, without_it=_without(views, pair.held_out))
+    yield Finding("wrong_views", words, step, views, without_it=without(views, pair.held_out.words))
 
 
 def _holdout(pair: JudgedPair) -> Iterator[Finding]:

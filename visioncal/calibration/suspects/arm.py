@@ -1,0 +1,69 @@
+"""Errors of arms: those that follow the posture, and what an arm's calibration leaves to say."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages import thermal
+from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.kinematics import doubts, findings
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.core.number_format import mm_and_deg
+from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
+from visioncal.estimation.arm import LEVER_M, SIGNIFICANT
+
+# Remedy for errors of an arm whose joints are not known.
+NO_JOINTS = Remedy(
+    "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
+    "calibrate then estimates the arm, too."
+)
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    arms, reports = run.cell_fit.arms, run.assessment.arms
+    for name, arm in arms.items():
+        drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
+        levels = () if arm.kinematics is None else (*findings(arm.kinematics),)
+        notes = remarks((*drifts, *levels, *reports[name].notes), NOTE)
+        for finding in (*_of(arm, run.cell_fit.level), *reports[name].doubts, *notes):
+            yield finding.of("" if len(arms) == 1 else f"Robot {name}")
+
+
+def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
+    is_cold = level == thermal.LEVEL and arm.thermal is None
+    if is_cold or (arm.joints_rad is None and level not in ("auto", "hand-eye")):
+        words = f"It stays as it reports itself: its rows lack what --level {level} needs."
+        step = "Record joint angles, and name the arm as [robot] model in session.toml"
+        step += "; record temp1_c ... or current1_a ... in a stream." * is_cold or "."
+        yield Finding("level", words, Remedy(step))
+    if arm.kinematics is not None:
+        yield from doubts(arm.kinematics)
+    errors = arm.errors
+    if errors is None or not errors.is_significant:
+        return
+    likely = f"(likelihood ratio {errors.gain:.0f}, noise stays under {SIGNIFICANT:.0f})"
+    if errors.fit_sigmas is not None:
+        turn_rad, shift_m = (np.sqrt(3.0) * errors.fit_sigmas).tolist()
+        words = (
+            f"Residuals follow the arm's posture, or last from stop to stop {likely}: a look near "
+            f"the views errs by {mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))} (rms). "
+            "More views will not help: joint angles or a kinematic calibration of the arm will."
+        )
+        do = NO_JOINTS
+    elif arm.model is None:
+        size = mm_and_deg(1e3 * LEVER_M * errors.sigma, float(np.rad2deg(errors.sigma)))
+        words = (
+            f"Residuals follow the arm's posture {likely}: its links are off from the model by "
+            f"typically {size}; they were estimated along."
+        )
+        step = "Add stops all over the workspace, so that the arm can be calibrated along."
+        do = Remedy(step, f"{PLAN} --for kinematics")
+    else:
+        return
+    words += " What of these errors looks the same in all views is in no residual, and counts in "
+    words += "the covariance."
+    yield Finding(ARM_ERRORS, words, do, until_mm=0.0, mahalanobis_sq=errors.gain)
+
+
+ERRORS = Suspect(ARM_ERRORS, _found, 1e-4, True, order=1)

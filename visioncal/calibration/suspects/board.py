@@ -1,0 +1,167 @@
+"""Boards and rigs whose size or shape is not as stated."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.distance_scale import distance_scale
+from visioncal.calibration.suspects.lens import has_changed
+from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.core.number_format import figure
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
+from visioncal.core.transforms import invert
+from visioncal.core.types import FloatArray, Target
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.estimation.joint import (
+    ConvergedFit,
+    MeasuredScale,
+    measured_scale,
+    scale_by_stated_arms,
+)
+from visioncal.session.frames import frame_name
+from visioncal.vision.boards import kind_of
+
+# Manufacturing accuracy of rigs, as a share of their size.
+_SAME_SIZE = 5e-4
+# Accuracy of printed boards [m].
+_LEAST_BEND_M = 1e-5
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    """Boards of another size by the robot's motion, or of another shape; notes where allowed."""
+    cell_fit, covariance = run.cell_fit, run.assessment.covariance
+    fitted, model = cell_fit.joint_fit, cell_fit.frame_model
+    if fitted is None:
+        yield from _of_measured_poses(run)
+        return
+    stated = None
+    if any(arm.model is not None for arm in cell_fit.arms.values()):
+        stated = cell_fit.inlier_problem
+        for arm in cell_fit.arms.values():
+            stated = arm.without_errors(stated)
+    optics = fitted.camera_parameters
+    scene = next(iter(optics.problems.values())).scene
+    for board, target in enumerate(scene.targets):
+        called = f"board {scene.names[board]}".strip()
+        frame = frame_name("target", scene.names[board])
+        measured = measured_scale(model, fitted, frame, board)
+        if board not in optics.printed:
+            if stated is not None:
+                measured = scale_by_stated_arms(fitted, stated, frame) or measured
+            yield from _point_findings(target, optics.values[optics.shape_of(board)])
+            if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
+                yield scale_finding(f"target {target.name}", target, measured, measured)
+            continue
+        place = optics.shape_of(board)[0]
+        if measured.is_another and place in fitted.linearised.moving:
+            (at,) = fitted.columns_of(np.array([place]))
+            sigma = float(covariance[at, at] ** 0.5)
+            written = replace(measured, scale=float(optics.values[place]), sigma=sigma)
+            yield scale_finding(called, target, measured, written)
+        yield from _shape_findings(fitted, board, called)
+
+
+def _of_measured_poses(run: RunState) -> Iterator[Finding]:
+    """Measured poses whose scale differs from the robot's."""
+    usable = run.poses.keys() - run.reasons.keys()
+    views = [view for view in run.base_from_flange if view in usable]
+    if run.mount in (None, "instrument") or run.cameras or not views:
+        return
+    poses = np.array([run.base_from_flange[view] for view in views])
+    seen = np.array([run.poses[view].cam_from_target[0] for view in views])
+    parent = poses if run.mount == "eye-in-hand" else invert(poses)
+    # The camera may have a name.
+    (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
+    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
+        yield finding
+
+
+def scale_finding(
+    called: str, target: Target, measured: MeasuredScale, written: MeasuredScale
+) -> Finding:
+    """Finding on a board or rig of another size; a note where its stated sigma allows it.
+
+    `measured` is the scale by the robot's motion, `written` that of the result, with its total
+    sigma.
+    """
+    share = f"{figure(100 * measured.stated_sigma)} %"
+    size = (
+        f"By the robot's motion the {called} is {figure(100 * abs(written.scale))} % "
+        f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
+        f"{figure(100 * written.sigma)} %)"
+    )
+    if not measured.contradicts:
+        allowed = f"{size}. The stated size allows this (to within {share})."
+        return Finding(NOTE, f"{allowed} The result goes by both.")
+    if target.is_rig:
+        words = f"{size}. The result goes by the table of its points."
+        do = (
+            "Measure the distance of two points that are far apart. If the robot is right, "
+            f"multiply the table's x_m, y_m and z_m by {1 + written.scale:.5g}; else check the arm."
+        )
+    else:
+        kind, side = kind_of(target), 1e3 * target.square_m
+        found = side * (1 + written.scale)
+        words = (
+            f"{size}: {kind.sides} of {found:.4g} mm, not of {side:.4g} mm (stated to within "
+            f"{share}). The result takes the robot's scale; if the board is right, the arm's model "
+            "is off by as much."
+        )
+        do = (
+            f"Measure the board over its whole width. If the robot is right, write {kind.size_key} "
+            f"= {1e-3 * found:.4g} in the board's .toml; else check the arm."
+        )
+    total = measured.sigma**2 + measured.stated_sigma**2
+    square = measured.scale**2 / total
+    return Finding("board_size", words, Remedy(do, CALIBRATE), mahalanobis_sq=square)
+
+
+def _shape_findings(fitted: ConvergedFit, board: int, called: str) -> Iterator[Finding]:
+    """Finding on a bent, stretched or sheared board, beyond the accuracy of printing."""
+    optics = fitted.camera_parameters
+    shape = optics.shape_of(board)[1:]
+    aspect, *bends, shear = shape
+    drawn = optics.with_values(shape, np.zeros(len(shape))).corners[board]
+    off_m = np.linalg.norm(optics.corners[board] - drawn, axis=1).max()
+    if not has_changed(fitted, shape) or off_m < _LEAST_BEND_M:
+        return
+    parts = []
+    if has_changed(fitted, np.array([aspect])):
+        longer = float(optics.values[aspect])
+        far, near = ("y", "x") if longer > 0 else ("x", "y")
+        parts.append(
+            f"longer along its {far} than along its {near}, by {figure(100 * abs(longer))} %"
+        )
+    if has_changed(fitted, np.array([shear])):
+        corner_deg = 90.0 - np.rad2deg(float(optics.values[shear]))
+        parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
+    if has_changed(fitted, np.array(bends)) or not parts:
+        depth = figure(1e3 * float(np.ptp(optics.corners[board][:, 2])))
+        parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
+    words = f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest."
+    flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
+    yield Finding("board_shape", words, Remedy(flat))
+
+
+def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
+    """Finding where a point of a rig contradicts the rig's table; `moved_m` is empty if exact."""
+    if not len(moved_m):
+        return
+    sigmas = np.array(target.point_sigmas_m)
+    distances = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
+    worst = int(np.argmax(distances / sigmas))
+    if (distances[worst] / sigmas[worst]) ** 2 > chi2_limit(FALSE_ALARM / len(sigmas), 3):
+        yield Finding(
+            "board_shape",
+            f"Point {target.point_numbers[worst]} of target {target.name} lies "
+            f"{figure(1e3 * float(distances[worst]))} mm from where its table has it, which is "
+            f"stated to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by "
+            "both.",
+            Remedy("Measure the point again."),
+        )
+
+
+SIZE = Suspect("board_size", _found, 2.7e-3, True)
+SHAPE = Suspect("board_shape", None, 1e-4, True)

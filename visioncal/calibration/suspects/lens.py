@@ -1,0 +1,197 @@
+"""Lenses: stated ones that do not fit, errors beyond their models, and changes during a session."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, INFLATED, Suspect
+from visioncal.core.limits import CONTRADICTION
+from visioncal.core.number_format import counted, figure
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.estimation.joint import ConvergedFit, moved_mahalanobis_sq
+from visioncal.estimation.lens_field import displacements, distances
+from visioncal.estimation.lens_levels import SIGNIFICANT
+from visioncal.estimation.lens_step import lens_step
+from visioncal.estimation.scene import ONLY_CAMERA
+from visioncal.estimation.solve import covariance_of, held_shift
+from visioncal.vision.camera import normalise, project
+
+# Changes of intrinsics or corners below this show in no image [px].
+_LEAST_MOVE_PX = 0.1
+_NEW_LENS = Remedy(
+    "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
+    "the camera anew.",
+    CALIBRATE,
+)
+
+
+def _stated(run: RunState) -> Iterator[Finding]:
+    """Stated intrinsics and noise of corners that the corners contradict."""
+    fitted = run.cell_fit.joint_fit
+    if fitted is None:
+        return
+    for camera in fitted.camera_parameters.problems:
+        for finding in _of_camera(fitted, camera):
+            yield finding.of("" if camera == ONLY_CAMERA else camera)
+
+
+def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
+    optics, seen = fitted.camera_parameters, fitted.linearised
+    problem, lens = optics.problems[camera], optics.lens_of(camera)
+    stack, compressed = problem.stack, seen.compressed[[*optics.problems].index(camera)]
+    unknowns, stated_px = problem.unknowns(compressed), stack.stated_px
+    shown_px = stack.shown_px(compressed.residuals, unknowns)
+    is_wider = stated_px is not None and shown_px > stated_px
+    if is_wider and stack.contradicts(compressed.residuals, unknowns):
+        yield Finding(
+            "corner_noise",
+            f"The corners scatter by {figure(shown_px)} px, and corners.csv states "
+            f"{figure(stated_px or 0.0)} px (sigma_px of a typical corner). The result goes by the "
+            "scatter.",
+            Remedy(
+                "Look for errors of the detector, the lens or the target that sigma_px leaves out."
+            ),
+        )
+    free = np.intersect1d(lens, seen.moving)
+    if problem.scene.mode == "refine" and not len(free):
+        views = counted(len(stack.views), "view", ("leaves", "leave"))
+        yield Finding(
+            "remark",
+            f'intrinsics = "refine" was not done: {len(stack.px)} corners in {views} too '
+            "little to judge by.",
+            Remedy(
+                "Show a board with more corners, or more views, or state matrix_sigma_px, how well "
+                "fx, fy, cx, cy are known."
+            ),
+        )
+    if not problem.scene.estimated and has_changed(fitted, free):
+        moves, sigmas_px = (optics.values - optics.stated)[lens[:4]], problem.stated_sigma[:4]
+        moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
+        rays = normalise(problem.scene.camera, stack.px)
+        rays = np.column_stack([rays, np.ones(len(rays))])
+        before, after = (project(at, rays) for at in (problem.scene.camera, optics.camera(camera)))
+        moved_px = np.nanmax(np.linalg.norm(after - before, axis=1), initial=0.0)
+        is_wrong = problem.scene.matrix_sigma_px is None
+        is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * sigmas_px))
+        if is_wrong and moved_px > _LEAST_MOVE_PX:
+            words = f"The given intrinsics do not fit these images and were refined: {moved}"
+            yield Finding("lens", words, _NEW_LENS)
+        else:
+            allowed = "within what is stated, or by less than images show"
+            yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
+    if np.isin(lens, seen.free[seen.held]).any():
+        at = fitted.columns_of(lens[:4])
+        moves = held_shift(fitted.problem, fitted.fit)[at]
+        covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
+        squared = float(moves @ np.linalg.solve(covariance, moves))
+        if np.abs(moves).max() > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(at)):
+            yield Finding(
+                "lens",
+                "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
+                f'{_px(moves)} px. But intrinsics = "hold" keeps them; what this does to the '
+                "result counts in its sigmas.",
+                _NEW_LENS,
+                mahalanobis_sq=squared,
+            )
+
+
+def has_changed(fitted: ConvergedFit, places: np.ndarray) -> bool:
+    """Whether values of lenses and boards differ significantly from the stated ones."""
+    free = np.intersect1d(places, fitted.linearised.moving)
+    if not len(free):
+        return False
+    return bool(moved_mahalanobis_sq(fitted, free) > chi2_limit(FALSE_ALARM, len(free)))
+
+
+def _px(values: FloatArray) -> str:
+    return ", ".join(f"{'-' if value < 0 else '+'}{figure(abs(value))}" for value in values)
+
+
+def _beyond(run: RunState) -> Iterator[Finding]:
+    """Significant errors beyond the model: of a part of the image, and changes of the focus."""
+    lenses = run.assessment.lenses
+    for name, lens in lenses.items():
+        of, levels, (field, *changes) = _named(name, len(lenses)), lens.levels, lens.levels.gains
+        if field > SIGNIFICANT:
+            yield Finding(
+                "lens_field",
+                f"{of} departs from its model: corners of one part of the image are off alike, by "
+                f"{figure(lens.field_px)} px. The result counts it, and belongs to this lens.",
+                Remedy(
+                    "Give matrix and distortion of a model that fits the lens, or keep the work in "
+                    "the middle of the image."
+                ),
+                mahalanobis_sq=field,
+                up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
+            )
+        percents = [100.0 * lens.noise_px * share for share in (levels.breathing, levels.jitter)]
+        when = ("where the distance doubles", "from view to view")
+        how = [
+            f"by {figure(percent)} % {words}"
+            for percent, words, gain in zip(percents, when, changes, strict=True)
+            if gain > SIGNIFICANT
+        ]
+        if how:
+            yield Finding(
+                "focus",
+                f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
+                Remedy("Fix the focus (no autofocus), or work at one distance."),
+                mahalanobis_sq=max(changes),
+                up_to_mm=10.0 * max(percents) * lens.distance_m,
+            )
+
+
+def _named(camera: str, count: int) -> str:
+    return "The lens" if count == 1 else f"The lens of {camera}"
+
+
+def _changed(run: RunState) -> Iterator[Finding]:
+    """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
+    seen, optics = run.cell_fit.linearised_corners, run.cell_fit.camera_parameters
+    if seen is None or optics is None:
+        return
+    cell = run.cell_fit.cell
+    stations = {row.view: row.station for row in cell.rows}
+    for which, (name, problem) in enumerate(optics.problems.items()):
+        # Images for the intrinsics alone have no time.
+        timed = np.array([view in stations for view in problem.stack.views])
+        points = optics.points[problem.stack.ids]
+        stack = replace(problem.stack, points=points, zooms=None)
+        stack = stack.keep(timed[stack.view_of])
+        order = np.argsort([stations[view] for view in stack.views], kind="stable")
+        compressed, camera = seen.compressed[which], optics.camera(name)
+        poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
+        if compressed.coefficients is not None and problem.levels is not None:
+            far = distances(stack, poses)[stack.view_of]
+            columns = displacements(stack.px, camera, far, replace(problem.levels, breathing=0.0))
+            beyond = columns @ compressed.coefficients.mean[: columns.shape[2]]
+        step = lens_step(stack, camera, poses, beyond, order)
+        if step is None:
+            continue
+        at, change, sigmas, gain = step
+        first, (zoom, x, y) = stations[stack.views[int(order[at])]], change.tolist()
+        yield Finding(
+            "lens_changed",
+            f"{_named(name, len(optics.problems))} changed: {cell.start_words(first)}, "
+            f"its focal length is {figure(100.0 * abs(zoom))} % "
+            f"{'longer' if zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * float(sigmas[0]))} "
+            f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
+            f"{figure(float(sigmas[1:].max()))} px), by the corners alone; the result is between "
+            "both lenses.",
+            cell.or_separately(
+                "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
+            ),
+            mahalanobis_sq=gain,
+        )
+
+
+# A held lens that the corners contradict looks like a board of another size or shape, and, by the
+# views' postures, like arm errors; the lens is tested beside all three.
+LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ERRORS))
+FIELD = Suspect("lens_field", _beyond, 1e-4, True)
+FOCUS = Suspect("focus", None, 1e-4, True)
+CHANGED = Suspect("lens_changed", _changed, 1e-4, True, (CHAIN,), INFLATED)

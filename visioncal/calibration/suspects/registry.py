@@ -1,0 +1,127 @@
+"""All suspects. To add one: a file with its `Suspect` in this folder, and an entry here."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+from visioncal.calibration.pipeline.connectivity import connection_advice
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.priors import components
+from visioncal.calibration.suspects import arm, board, growing, lens, steps
+from visioncal.calibration.suspects.outliers import moved_finding
+from visioncal.calibration.suspects.suspect import (
+    ARM_ERRORS,
+    EXCHANGED,
+    FACT,
+    REMARK,
+    UNEXPLAINED,
+    Suspect,
+)
+from visioncal.core.verdict import AGREEMENT, NOTE, Finding, Remedy, without
+from visioncal.results.views import left_out_rms
+
+
+def _outliers(run: RunState) -> Iterator[Finding]:
+    """Wrong poses and images that explain outliers, and frames of a cell that moved."""
+    held_out = left_out_rms(run.assessment.views)
+    for fault in run.assessment.faults:
+        yield replace(fault.found, without_it=without(fault.found.views, held_out.words))
+    if run.mount is None:
+        yield from map(moved_finding, run.assessment.moved)
+
+
+def _contradicted(run: RunState) -> Iterator[Finding]:
+    answer, priors = run.assessment, run.cell_fit.cell.priors
+    for component in components(answer.problem, answer.state, answer.covariance, priors):
+        yield component.finding
+
+
+def _unconnected(run: RunState) -> Iterator[Finding]:
+    for frame in run.cell_fit.unconnected:
+        if run.mount is not None and frame.startswith("target"):
+            words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
+            step = Remedy("Add views that show it, or delete it from session.toml.")
+            yield Finding("unseen_target", words, step)
+        else:
+            step = Remedy(connection_advice(run.cell, frame))
+            yield Finding("untied", f"{frame} is tied to nothing.", step)
+
+
+# Sources of the errors of picks, whose probability is their share.
+SOURCES = (
+    "calibration",
+    "unmeasured_board",
+    "robot_noise",
+    "robot_noise_of_pick",
+    "uncorrected_targets",
+)
+_STEPS = ("moved_at_once", "joint_slipped", "board_changed")
+# Findings measured through the robot, which mean nothing where its poses are misread.
+_BY_CHAIN = (
+    *("good_for", *SOURCES, *_STEPS, ARM_ERRORS, "prior"),
+    *("board_size", "board_shape", "lens", "lens_field", "corner_noise"),
+)
+
+_ENTRIES: tuple[Suspect, ...] = (
+    # Views.
+    Suspect(EXCHANGED, _outliers, 1e-6, order=-1),
+    Suspect("wrong_pose", chance=1e-3),
+    Suspect("something_moved", chance=1e-4),
+    Suspect("moved_frame", chance=1e-4),
+    Suspect("wrong_views", chance=1e-3),
+    Suspect("holdout", chance=1e-3),
+    # Arms, steps, lenses and boards.
+    arm.ERRORS,
+    steps.MOVED_AT_ONCE,
+    steps.JOINT_SLIPPED,
+    steps.BOARD_CHANGED,
+    steps.MOVED_SLOWLY,
+    lens.FIELD,
+    lens.FOCUS,
+    lens.CHANGED,
+    Suspect("prior", _contradicted, 2.7e-3),
+    lens.LENS,
+    board.SIZE,
+    board.SHAPE,
+    *growing.GROWING,
+    Suspect("untied", _unconnected, FACT),
+    Suspect("unseen_target"),
+    # What was seen and read.
+    Suspect("missing_images", is_doubt=False),
+    Suspect("repeated_readings", is_doubt=False),
+    Suspect("repeated_views", chance=FACT),
+    Suspect("corner_numbers", chance=FACT),
+    Suspect("rig_points", chance=FACT),
+    Suspect("other_board", chance=FACT, hides=("lost_views",)),
+    Suspect("other_lens", chance=FACT),
+    Suspect("lost_views", chance=REMARK),
+    *map(Suspect, ("left_out", "remark", "unused")),
+    Suspect("weak_lens", chance=REMARK),
+    Suspect("corner_noise", chance=1e-4),
+    # Conventions, clocks, joints.
+    Suspect("misread_poses", None, 1e-3, True, hides=_BY_CHAIN),
+    Suspect("misread_joints", None, 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
+    # The frames are by the poses, which a wrong model does not change.
+    Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
+    *map(Suspect, ("contradicting_joints", "base_link", "tool_frame", "level", "load", "clock")),
+    # The remainder of a clock's jump looks like motion.
+    Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *_STEPS, ARM_ERRORS)),
+    # The size of errors.
+    Suspect(UNEXPLAINED, None, REMARK, True, size=3, order=1),
+    Suspect("too_few_stops", chance=FACT),
+    Suspect("few_stops"),
+    Suspect("weak_motion", hides=("weak_lens",), size=5, is_sigma=True),
+    Suspect("place", size=6, is_sigma=True),
+    Suspect("workspace", size=7, is_sigma=True),
+    *map(Suspect, SOURCES),
+    Suspect("need", is_doubt=False, size=1),
+    Suspect("good_for", is_doubt=False, size=2),
+    *(Suspect(kind, is_doubt=False) for kind in (AGREEMENT, NOTE, "calibrated_arm")),
+)
+SUSPECTS: Mapping[str, Suspect] = {suspect.kind: suspect for suspect in _ENTRIES}
+
+
+def found_in(run: RunState) -> Iterator[Finding]:
+    """What all suspects find in a finished run."""
+    for suspect in _ENTRIES:
+        if suspect.finds is not None:
+            yield from suspect.finds(run)

@@ -1,0 +1,80 @@
+"""What moved, slipped or was exchanged at some stop, or drifted over the session."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
+from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.transforms import exp, pose_difference
+from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.identifiability import joint_words
+from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step
+
+_THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    """The likeliest step or drift, and another that may be the cause instead."""
+    steps, cell = run.assessment.steps, run.cell_fit.cell
+    if not steps:
+        return
+    step, instead = steps[0], ""
+    if steps[1:]:
+        instead = f" Or else, as these views leave it open: {_words(steps[1], run)}."
+    thing = _THINGS.get(step.of, step.of)
+    kind, do = {
+        FRAME: ("moved_at_once", f"Fasten {thing[0].lower()}{thing[1:]}"),
+        JOINT: ("joint_slipped", "Look whether the joint keeps its zero"),
+        SIZE: ("board_changed", "Measure both prints, take one of them for all views"),
+        DRIFT: ("moved_slowly", "Fasten base and target, let the arm warm up, and record again."),
+    }[step.kind]
+    is_drift = step.kind == DRIFT
+    yield Finding(
+        kind,
+        f"{_words(step, run)}; the result is between before and after.{instead}",
+        Remedy(do) if is_drift else cell.or_separately(do, step.stop),
+        mahalanobis_sq=0.0 if is_drift else step.gain,
+    )
+
+
+def _words(step: Step, run: RunState) -> str:
+    first, sigma = float(step.value[0]), float(np.sqrt(step.covariance[0, 0]))
+    when, thing = run.cell_fit.cell.start_words(step.stop), _THINGS.get(step.of, step.of)
+    if step.kind == JOINT:
+        arms, index = run.cell_fit.arms, step.candidate.joint
+        matched = arms[step.of].matched
+        joint = f"joint {index + 1}" if matched is None else joint_words(index, matched.robot)
+        joint += f" of robot {step.of}" * (len(arms) > 1)
+        # The reading's change is opposite to the correction that gives the joint's angle.
+        changed_deg, sigma_deg = np.rad2deg([abs(first), sigma]).tolist()
+        return (
+            f"The offset of {joint} steps: {when}, it reads {'+' if first < 0.0 else '-'}"
+            f"{figure(changed_deg)} deg (sigma {figure(sigma_deg)}) from what it read before, as "
+            "where an encoder slipped or a zero was lost"
+        )
+    if step.kind == SIZE:
+        return (
+            f"{thing} is another one: {when}, it is {figure(100.0 * abs(first))} % "
+            f"{'larger' if first > 0.0 else 'smaller'} (sigma {figure(100.0 * sigma)} %) than "
+            "before, by the robot's motion"
+        )
+    moved = mm_and_deg(*pose_difference(np.eye(4), exp(step.value)))
+    if step.kind == DRIFT:
+        return (
+            "Residuals drift with time: from the first stop to the last, base or target moved by "
+            f"{moved}"
+        )
+    return f"{thing} moved at once: {when}, it is {moved} from where it was"
+
+
+# Motion along a camera's axis looks like changes of its focus, which are random in the fit; a
+# changing focus does not follow time, and looks like motion in one session of ten thousand.
+_EFFECTS = (ARM_ERRORS, "focus")
+MOVED_AT_ONCE = Suspect("moved_at_once", _found, 1e-4, True, _EFFECTS, INFLATED)
+JOINT_SLIPPED = Suspect("joint_slipped", None, 1e-4, True, _EFFECTS, INFLATED)
+BOARD_CHANGED = Suspect(
+    "board_changed", None, 1e-4, True, (*_EFFECTS, "board_size", "board_shape"), INFLATED
+)
+MOVED_SLOWLY = Suspect("moved_slowly", None, 1e-4, True, ("focus",), (ARM_ERRORS,))

@@ -1,0 +1,42 @@
+"""What may be wrong with a session, a cell or a result; see `registry`."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from visioncal.core.verdict import Finding
+
+if TYPE_CHECKING:
+    from visioncal.calibration.pipeline.run_state import RunState
+
+# Kinds that several modules name.
+ARM_ERRORS, EXCHANGED, UNEXPLAINED = "arm_errors", "exchanged_views", "unexplained"
+# All that explains that views disagree, or that the flange is off.
+CHAIN = "chain"
+# False-alarm probabilities of remarks, which no test is behind, and of facts.
+REMARK, FACT = 0.36787944117144233, 1e-12
+# What a change during the session inflates: errors by posture and time correlate before and after
+# it, and are tested beside it.
+INFLATED = (ARM_ERRORS, "calibration")
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A kind of findings: what finds it, and what a verdict makes of it."""
+
+    kind: str  # A short permanent name.
+    # Finds it in a finished run; None where a stage or a limit does.
+    finds: "Callable[[RunState], Iterable[Finding]] | None" = None
+    # False-alarm probability of its test in a sound session; zero for no cause by itself.
+    chance: float = 0.0
+    of_chain: bool = False  # Whether it explains that views disagree: such causes compete.
+    # Kinds of findings, or `CHAIN`, that are mere effects of it, with remedies that do not help.
+    hides: tuple[str, ...] = ()
+    inflates: tuple[str, ...] = ()  # Sources of errors that it inflates.
+    is_doubt: bool = True  # Whether it is a doubt about the result.
+    is_sigma: bool = False  # Whether it is a sigma beyond a limit of its own.
+    # Rank among findings on the size of errors, the most important first; 0 for none.
+    size: int = 0
+    # Rank among causes that are as good as certain: exchanged rows come first, since they mislead
+    # all other tests; errors of the arm, which always exist, and unexplained errors come last.
+    order: int = 0
