@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import expit, log_ndtr, logit
 
 from visioncal.calibration.stages.need import CONTROLLER, Picks
 from visioncal.calibration.suspects.arm import NO_JOINTS
@@ -33,6 +33,8 @@ from visioncal.core.types import Need
 from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy, Verdict
 from visioncal.results import NeedMet
 
+# Least logarithm of a false-alarm probability.
+_LEAST_LOG = -1e6
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
@@ -101,17 +103,17 @@ def explained_by(verdict: Verdict, found: Finding) -> Verdict:
     if verdict.causes and verdict.causes[0].kind == EXCHANGED:
         # The views themselves show the exchange; the finding's command undoes it.
         return verdict
-    kind = SUSPECTS[found.kind]
-    odds = _odds(kind.chance)
-    rest = [finding for finding in verdict.findings if finding.kind not in kind.hides]
-    if kind.chance > FACT:
+    suspect = SUSPECTS[found.kind]
+    log_odds = _log_odds(Finding(found.kind, ""))
+    rest = [finding for finding in verdict.findings if finding.kind not in suspect.hides]
+    if suspect.chance > FACT:
         # What the views show otherwise may be due to it, too.
         rest = [
-            replace(finding, probability=finding.probability / (1.0 + odds), do=None)
+            replace(finding, probability=finding.probability * expit(-log_odds), do=None)
             for finding in rest
             if finding.words not in found.words
         ]
-    cause = replace(found, probability=odds / (1.0 + odds), by_limit=True)
+    cause = replace(found, probability=float(expit(log_odds)), by_limit=True)
     return replace(verdict, findings=(cause, *rest))
 
 
@@ -179,8 +181,8 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
             first.setdefault(finding.kind, finding)
     hidden = {*_hidden({doubt.kind: doubt for doubt in reversed(doubts)})}
     misfit_mm = left_out_mm if UNEXPLAINED in first else 0.0
-    odds = {
-        name: 1.0 if name in hidden else _explaining_odds(finding, misfit_mm)
+    log_odds = {
+        name: 0.0 if name in hidden else _log_odds(finding, misfit_mm)
         for name, finding in first.items()
     }
 
@@ -189,11 +191,12 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
         found = replace(finding, do=None) if name in hidden else finding
         if first.get(name) is not finding:
             return found
-        among = (rival for rival in odds if rival != name and SUSPECTS[rival].of_chain)
-        rivals = sum(odds[rival] for rival in among) if of_chain else 0.0
+        rivals = [rival for rival in log_odds if of_chain and SUSPECTS[rival].of_chain] or [name]
+        among = [log_odds[rival] for rival in rivals]
         # "None of these" has odds one, unless `unexplained` stands for it as a finding.
-        none = float(name != UNEXPLAINED and not (rivals and UNEXPLAINED in odds))
-        probability = odds[name] / (none + odds[name] + rivals)
+        if UNEXPLAINED not in rivals:
+            among.append(0.0)
+        probability = float(np.exp(log_odds[name] - np.logaddexp.reduce(among)))
         return replace(found, probability=probability, by_limit=not finding.mahalanobis_sq)
 
     return [weighed(doubt) for doubt in doubts]
@@ -219,22 +222,17 @@ def _hidden(first: Mapping[str, Finding]) -> Iterator[str]:
                 yield kind
 
 
-def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
-    """Odds of a finding, bounded by the share of the misfit that it can explain."""
+def _log_odds(doubt: Finding, misfit_mm: float = 0.0) -> float:
+    """Lower bound of a fault's log odds, and of its share of the misfit that it can explain."""
     # By its chi-square, or the limit of its test.
-    chance = SUSPECTS[doubt.kind].chance
+    log_chance = float(np.log(SUSPECTS[doubt.kind].chance))
     if doubt.mahalanobis_sq:
-        chance = min(max(float(chdtrc(1.0, doubt.mahalanobis_sq)), FACT), chance)
-    odds = _odds(chance)
+        log_chance = min(np.log(2.0) + float(log_ndtr(-np.sqrt(doubt.mahalanobis_sq))), log_chance)
+    log_chance = max(log_chance, _LEAST_LOG)
+    log_odds = float(-1.0 - log_chance - np.log(-log_chance))
     if doubt.up_to_mm >= misfit_mm:
-        return odds
-    most = (doubt.up_to_mm / misfit_mm) ** 2 * odds / (1.0 + odds)
-    return most / (1.0 - most)
-
-
-def _odds(chance: float) -> float:
-    """Lower bound of the odds of a fault by a false-alarm probability (under 1 / e)."""
-    return float(-1.0 / (np.e * chance * np.log(chance)))
+        return log_odds
+    return float(logit((doubt.up_to_mm / misfit_mm) ** 2 * expit(log_odds)))
 
 
 def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
