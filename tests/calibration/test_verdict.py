@@ -256,6 +256,20 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named(mount, wh
     assert (away < [1.3, 0.55]).all()
 
 
+@pytest.mark.parametrize(("digits", "is_found"), [(3, True), (4, False)])
+def test_poses_with_too_few_digits_are_the_cause(digits: int, is_found: bool) -> None:
+    cell = simulate(CellOptions(views=20))
+    session = session_of(cell, cell.robot.base_from_flange)
+
+    def written(view):
+        rounded = {name: round(value, digits) for name, value in view.numbers.items()}
+        return replace(view, numbers={**view.numbers, **rounded})
+
+    verdict = calibrate(replace(session, views=tuple(map(written, session.views)))).verdict
+    assert (ids(verdict)[:1] == ["rounded_poses"]) == is_found
+    assert not is_found or "positions to 1 mm and their quaternions to 0.001" in verdict.top[0]
+
+
 @pytest.mark.parametrize("freedom", [np.inf, 15.0])
 @pytest.mark.parametrize("places", [1, 7])
 @pytest.mark.parametrize("flat", [1.0, 0.03])

@@ -6,7 +6,7 @@ from dataclasses import replace
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.priors import components
-from visioncal.calibration.suspects import arm, board, growing, lens, steps
+from visioncal.calibration.suspects import arm, board, growing, lens, rounded_poses, steps
 from visioncal.calibration.suspects.outliers import moved_finding
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
@@ -83,6 +83,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.SIZE,
     board.SHAPE,
     *growing.GROWING,
+    rounded_poses.ROUNDED_POSES,
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
     # What was seen and read.
