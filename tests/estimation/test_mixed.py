@@ -32,9 +32,10 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.gating import gate
 from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
+from visioncal.estimation.lens_field import LensLevels, displacements, distances
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.mixed import (
     CommonRows,
@@ -256,7 +257,7 @@ def corners():
 def test_a_field_of_size_one_has_it_all_over_the_image():
     px = np.random.default_rng(0).uniform(0, [1280, 1024], (500, 2))
     for length in (0.07, 0.2, 0.35):
-        variances = np.sum(field_modes(px, (1280, 1024), length) ** 2, axis=1)
+        variances = np.sum(field_modes(px, (1280, 1024), length).at(slice(None)) ** 2, axis=1)
         # A hundredth of the variance is left out, most of it at the edges.
         assert np.mean(variances) == pytest.approx(1.0, abs=0.02)
         assert np.min(variances) > 0.8

@@ -19,11 +19,11 @@ from scipy.linalg import block_diag
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
+from visioncal.estimation.field_modes import FieldModes, field_modes
 from visioncal.estimation.lens_field import (
     Coefficients,
     LensLevels,
     breathing_columns,
-    field_modes,
     lens_part,
 )
 from visioncal.estimation.linalg import covariance_from
@@ -260,9 +260,10 @@ def compress_points(
     poses, unscaled, coefficients = fit.cam_from_target, projected.residuals, None
     by_field = np.zeros((len(poses), 6, 0))
     if levels is not None and levels.field + levels.breathing > 0.0:
-        modes, by_lens = np.zeros((len(stack.px), 0)), np.zeros((0, 0))
+        modes, by_lens = FieldModes.none(len(stack.px)), np.zeros((0, 0))
         if levels.field > 0.0:
-            modes = levels.field * field_modes(projected.px, camera.resolution, levels.length)
+            size = levels.field * stack.given_weights
+            modes = field_modes(projected.px, camera.resolution, levels.length, size)
             by_lens = levels.field * lens_part(camera, levels.length)
         following, products = without.with_modes(modes, by_lens)
         # Columns: shared values, breathing, residuals, field. Coefficients: field, then breathing.
@@ -281,13 +282,11 @@ def compress_points(
         answer = answer + by_field @ coefficients.slope
         moved_poses = by_field @ coefficients.mean
         poses = poses @ exp(moved_poses)
-        of_modes = coefficients.mean[: 2 * modes.shape[1]].reshape(2, -1)
-        shift = modes @ of_modes.T
-        stack.weigh(shift)
-        shift -= projected.by_intrinsics[:, :, : len(by_lens)] @ (
-            by_lens @ coefficients.mean[: 2 * modes.shape[1]]
-        )
-        shift += all_columns[:, :, shared:last] @ coefficients.mean[2 * modes.shape[1] :]
+        of_modes, of_breath = np.split(coefficients.mean, [2 * modes.count])
+        shift = modes.displaced(of_modes)
+        stack.refocus(shift)
+        shift -= projected.by_intrinsics[:, :, : len(by_lens)] @ (by_lens @ of_modes)
+        shift += all_columns[:, :, shared:last] @ of_breath
         shift += stack.products_with_views(projected.by_pose, moved_poses[:, :, None])[:, :, 0]
         residuals, unscaled = residuals + roots * shift, unscaled + shift
         by_field = by_field @ coefficients.moving_roots

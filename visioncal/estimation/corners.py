@@ -4,7 +4,7 @@ The model: px = camera(cam_from_target * p_target) + noise. All views are proces
 corners of a view are a contiguous segment of the stack.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,12 +14,15 @@ import numpy as np
 
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.estimation.field_modes import FieldModes
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.vision.camera import project_with_jacobian
 
 # Least ratio of noise to what is stated that counts: the rounding of a statement of one digit.
 _ROUNDED = 1.3
+# Corners whose modes of a field are held at once.
+_BLOCK = 2048
 # Exact corners have no noise; a millionth of a pixel keeps their covariance positive definite.
 _LEAST_SIGMA_PX = 1e-6
 
@@ -99,8 +102,7 @@ class CornerStack:
         by_view = weights_by_view(squares, np.asarray(2 * self.counts - 6, float))
         if by_view is None or self.stated_px is not None:
             return self
-        old_weights = 1.0 if self.weights is None else self.weights
-        return replace(self, weights=old_weights * by_view[self.view_of])
+        return replace(self, weights=self.given_weights * by_view[self.view_of])
 
     def weigh(self, *rows: FloatArray) -> None:
         """Whitens (n, 2, ...) rows by the corner noise, in place.
@@ -111,21 +113,26 @@ class CornerStack:
         if self.weights is not None:
             for array in kept:
                 np.multiply(array, self.weights.reshape(-1, *[1] * (array.ndim - 1)), out=array)
-        if self.zooms is None:
-            return
         for array in kept:
-            self._refocus(array)
+            self.refocus(array)
+
+    @property
+    def given_weights(self) -> FloatArray:
+        """(n,) the `weights`."""
+        return np.ones(len(self.px)) if self.weights is None else self.weights
 
     @cached_property
     def weighed_zooms(self) -> tuple[FloatArray, FloatArray]:
         """(n, 2) weighted `zooms`, and (v,) the sums of their squares."""
         if self.zooms is None:
             return np.zeros((len(self.px), 2)), np.zeros(len(self.starts))
-        weighted = self.zooms if self.weights is None else self.weights[:, None] * self.zooms
+        weighted = self.given_weights[:, None] * self.zooms
         return weighted, self.sum_by_view(np.sum(weighted**2, axis=1))
 
-    def _refocus(self, array: FloatArray) -> None:
+    def refocus(self, array: FloatArray) -> None:
         """Multiplies (n, 2, ...) rows by each view's (1 + z z^T)^(-1/2), z of `zooms`, in place."""
+        if self.zooms is None:
+            return
         zooms, squares = self.weighed_zooms
         share = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / np.maximum(squares, np.finfo(float).tiny)
         flat = array.reshape(len(array), 2, -1)
@@ -186,12 +193,24 @@ class CornerStack:
             ]
         )
 
-    def products_with_modes(self, left: FloatArray, modes: FloatArray) -> FloatArray:
-        """Products by view of (n, 2, j) with (n, e) modes along x, then along y: (v, j, 2 e)."""
-        size, ends = left.shape[2], np.append(self.starts, len(left))
-        flat = left.reshape(len(left), -1)
-        products = np.empty((len(self.starts), 2 * size, modes.shape[1]))
-        for (start, end), value in zip(pairwise(ends.tolist()), products, strict=True):
+    def blocks(self) -> Iterator[tuple[slice, slice]]:
+        """Slices of some thousand corners each, and of their views."""
+        count = len(self.starts)
+        step = max(_BLOCK * count // max(len(self.px), 1), 1)
+        ends = np.append(self.starts, len(self.px)).tolist()
+        for first in range(0, count, step):
+            last = min(first + step, count)
+            yield slice(ends[first], ends[last]), slice(first, last)
+
+    def products_with_modes(self, left: FloatArray, modes: FloatArray, views: slice) -> FloatArray:
+        """Products by view of (n, 2, j) with (m, e) modes along x, then along y: (v, j, 2 e).
+
+        The modes are those of the m corners of v `views`.
+        """
+        size, ends = left.shape[2], np.append(self.starts, len(left))[views.start : views.stop + 1]
+        flat = left.reshape(len(left), -1)[ends[0] : ends[-1]]
+        products = np.empty((len(ends) - 1, 2 * size, modes.shape[1]))
+        for (start, end), value in zip(pairwise((ends - ends[0]).tolist()), products, strict=True):
             np.matmul(flat[start:end].T, modes[start:end], out=value)
         both = products.reshape(len(products), 2, size, -1)
         return np.concatenate([both[:, 0], both[:, 1]], axis=2)
@@ -253,61 +272,68 @@ class WithoutPoses:
         """(c, c) products of the projected columns."""
         return gram(self.left, self.left)
 
-    def with_modes(self, modes: FloatArray, lens_part: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def with_modes(self, modes: FieldModes, lens_part: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Appends the modes of a distortion field to the columns.
 
         Each mode moves corners along one axis only, and poses absorb little of it: a difference of
         products is accurate enough, and takes a fifth of the time.
 
         Args:
-            modes: (n, e) along one axis of the image, unweighted.
+            modes: The e modes, times the corners' weights.
             lens_part: (k, 2 e) multiples of the first k columns that are subtracted from the modes.
 
         Returns:
             (v, 6, c + 2 e) response of the poses, and (c + 2 e, c + 2 e) products of all projected
             columns.
         """
-        if not modes.size:
+        if not modes.count:
             return self.answer, self.products
         stack, count = self.stack, self.left.shape[2]
         zooms, squares = stack.weighed_zooms
-        roots = self.roots[stack.view_of]
-        if stack.weights is not None:
-            modes = modes * stack.weights[:, None]
-        by_pose, left = self.by_pose, roots[:, None, None] * self.left
-        if stack.zooms is not None:
-            by_pose = by_pose.copy()
-            stack._refocus(by_pose)
-            stack._refocus(left)
-        between = stack.products_with_modes(by_pose, modes)
-        answer = -self.inverse @ between
-        size = count + 2 * modes.shape[1]
-        all_products = np.empty((size, size))
-        all_products[:count, :count] = self.products
-        crossed = left.reshape(len(left), -1).T @ modes
-        all_products[:count, count:] = np.concatenate([crossed[:count], crossed[count:]], axis=1)
-        all_products[count:, :count] = all_products[:count, count:].T
-        weighted = modes * roots[:, None]
-        products = gram(self.roots[:, None, None] ** 2 * between, answer)
-        products += np.kron(np.eye(2), weighted.T @ weighted)
-        if stack.zooms is not None:
-            along = stack.products_with_modes(zooms[:, :, None], modes)[:, 0]
-            along *= (self.roots / np.sqrt(1.0 + squares))[:, None]
-            products -= along.T @ along
-        all_products[count:, count:] = products
-        lens = len(lens_part)
-        answer -= self.answer[:, :, :lens] @ lens_part
-        all_products[:, count:] -= all_products[:, :lens] @ lens_part
-        all_products[count:] -= lens_part.T @ all_products[:lens]
-        return np.concatenate([self.answer, answer], axis=2), all_products
+        rows, left = (
+            np.concatenate([self.by_pose, zooms[:, :, None]], axis=2),
+            self.left * self.roots[stack.view_of, None, None],
+        )
+        stack.refocus(rows[:, :, :6])
+        stack.refocus(left)
+        size, lens = count + 2 * modes.count, len(lens_part)
+        by_view = np.empty((len(self.roots), 7, 2 * modes.count))
+        crossed = np.zeros((2 * count, modes.count))
+        inner = np.zeros((modes.count, modes.count))
+        for corners, views in stack.blocks():
+            at = modes.at(corners)
+            by_view[views] = stack.products_with_modes(rows, at, views)
+            crossed += left[corners].reshape(len(at), -1).T @ at
+            at *= self.roots[stack.view_of[corners], None]
+            inner += at.T @ at
+        del rows, left
+        answer = np.empty((len(self.roots), 6, size))
+        answer[:, :, :count], following = self.answer, answer[:, :, count:]
+        np.matmul(-self.inverse, by_view[:, :6], out=following)
+        by_view *= self.roots[:, None, None] ** 2
+        along = by_view[:, 6] / (self.roots * np.sqrt(1.0 + squares))[:, None]
+        products = np.empty((size, size))
+        products[:count, :count] = self.products
+        products[:count, count:] = np.concatenate([crossed[:count], crossed[count:]], axis=1)
+        products[count:, :count] = products[:count, count:].T
+        products[count:, count:] = gram(by_view[:, :6], following)
+        products[count:, count:] += np.kron(np.eye(2), inner) - along.T @ along
+        following -= self.answer[:, :, :lens] @ lens_part
+        products[:, count:] -= products[:, :lens] @ lens_part
+        products[count:] -= lens_part.T @ products[:lens]
+        return answer, products
 
-    def by_view(self, column: int, modes: FloatArray, lens_part: FloatArray) -> FloatArray:
+    def by_view(self, column: int, modes: FieldModes, lens_part: FloatArray) -> FloatArray:
         """(v, c + 2 e) products of one column with all, by view; for stacks without `zooms`."""
         stack, own = self.stack, self.left[:, :, column : column + 1]
-        if stack.weights is not None:
-            modes = modes * stack.weights[:, None]
-        by_modes = stack.products_with_modes(self.roots[stack.view_of, None, None] * own, modes)
         by_columns = stack.products_by_view(own, self.left)
+        own = self.roots[stack.view_of, None, None] * own
+        by_modes = np.concatenate(
+            [
+                stack.products_with_modes(own, modes.at(corners), views)
+                for corners, views in stack.blocks()
+            ]
+        )
         by_modes -= by_columns[:, :, : len(lens_part)] @ lens_part
         return np.concatenate([by_columns, by_modes], axis=2)[:, 0]
 

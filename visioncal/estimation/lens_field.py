@@ -9,17 +9,15 @@ corners' noise: corners with these effects still have 1 px noise.
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.linalg import gram
 from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
 
-# Grid points per axis for the field's modes, and the share of its variance they keep.
-_POINTS, _KEPT = 64, 0.999
 # Grid points per axis of the image over which the intrinsics' part is removed, and the relative
 # singular value below which a combination of intrinsics is undetermined there.
 _IMAGE_GRID, _DETERMINED = 20, 1e-8
@@ -76,28 +74,6 @@ def lens_modes(camera: Camera) -> FloatArray:
     return np.asarray(order / scale @ np.linalg.inv(root))
 
 
-def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> FloatArray:
-    """Modes of a unit field along one axis of the image; those along the other are equal.
-
-    Args:
-        px: (n, 2) corners, as predicted; see `breathing_columns` [px].
-        resolution: (width, height) of the image [px].
-        length: The field's length, as a share of the width.
-
-    Returns:
-        (n, e) displacements for coefficients of variance one.
-    """
-    scale = length * resolution[0]
-    (by_x, size_x), (by_y, size_y) = (
-        _modes(at, extent / scale) for at, extent in zip(px.T / scale, resolution, strict=True)
-    )
-    sizes = np.outer(size_x, size_y)
-    order = np.argsort(-sizes, axis=None, kind="stable")
-    enough = int(np.searchsorted(np.cumsum(sizes.ravel()[order]), _KEPT * sizes.sum())) + 1
-    at_x, at_y = np.unravel_index(order[:enough], sizes.shape)
-    return np.asarray(by_x[:, at_x] * by_y[:, at_y])
-
-
 def lens_part(camera: Camera, length: float) -> FloatArray:
     """(k, 2 e) intrinsics that explain most of each mode over the image (least squares).
 
@@ -110,7 +86,7 @@ def lens_part(camera: Camera, length: float) -> FloatArray:
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.pinv(flat / scale, rcond=_DETERMINED) / scale[:, None]
     by_axis = inverse.reshape(len(scale), -1, 2)
-    modes = field_modes(px, camera.resolution, length)
+    modes = field_modes(px, camera.resolution, length).at(slice(None))
     return np.concatenate([by_axis[:, :, 0] @ modes, by_axis[:, :, 1] @ modes], axis=1)
 
 
@@ -122,22 +98,6 @@ def _over_image(camera: Camera) -> tuple[FloatArray, FloatArray]:
     seen = np.isfinite(rays).all(axis=1)
     points = np.column_stack([rays[seen], np.ones(int(seen.sum()))])
     return px[seen], project_with_jacobian(camera, points).jacobian_intrinsics
-
-
-def _modes(at: FloatArray, extent: float) -> tuple[FloatArray, FloatArray]:
-    """Modes along one axis at (n,) positions in units of the length, and their variances."""
-    grid, vectors, values = _grid_modes(extent)
-    kernel = np.exp(-0.5 * (at[:, None] - grid) ** 2)
-    return kernel @ (vectors / np.sqrt(values)), values / len(grid)
-
-
-@cache
-def _grid_modes(extent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    grid = np.linspace(0.0, extent, _POINTS)
-    values, vectors = np.linalg.eigh(np.exp(-0.5 * (grid[:, None] - grid) ** 2))
-    kept = values > (1.0 - _KEPT) ** 2 * values[-1]
-    # Fixed signs: stored coefficients are of the same modes on any machine.
-    return grid, vectors[:, kept] * np.sign(vectors[0, kept]), values[kept]
 
 
 def zooms(px: FloatArray, camera: Camera) -> FloatArray:
@@ -192,7 +152,7 @@ def displacements(
     """
     columns = np.zeros((len(px), 2, 0))
     if levels.field > 0.0:
-        modes = levels.field * field_modes(px, camera.resolution, levels.length)
+        modes = field_modes(px, camera.resolution, levels.length, levels.field).at(slice(None))
         columns = np.einsum("ij,ne->nije", np.eye(2), modes).reshape(len(px), 2, -1)
         rays = normalise(camera, px)
         points = np.column_stack([np.nan_to_num(rays), np.ones(len(px))])

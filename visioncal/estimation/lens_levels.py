@@ -18,11 +18,11 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
+from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.lens_field import (
     LensLevels,
     LensSizes,
     distances,
-    field_modes,
     lens_modes,
     lens_part,
     zooms,
@@ -306,7 +306,7 @@ def _rows(
     kept = problem.moving & jacobian.any(axis=(0, 1))
     kept[places] = alone
     # The fit's coefficients of this lens's errors are left out: they are estimated again here.
-    sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
+    sizes = seen.field_sizes
     first = problem.effect_columns[LENSES].start + len(seen.free) + sum(sizes[:which])
     kept[first : first + sizes[which]] = False
     out = problem.moving & ~kept
@@ -380,7 +380,7 @@ def _assembled(rows: _Rows, length: float, robots: int) -> _Likelihood:
     field's modes.
     """
     stack, without, chained = rows.stack, rows.without, rows.chained
-    modes = field_modes(rows.px, rows.camera.resolution, length)
+    modes = field_modes(rows.px, rows.camera.resolution, length, stack.given_weights)
     by_lens = lens_part(rows.camera, length)
     answer, products = without.with_modes(modes, by_lens)
     # Columns: lens, board, breathing, a change of focus, residuals, and the modes.

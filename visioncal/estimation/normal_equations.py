@@ -109,7 +109,7 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
     own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
-    cross, solved = np.zeros((2, len(members), width, size + 1))
+    cross, solved = (np.zeros((len(members), width, size + 1)) for _ in range(2))
     for block in linear.blocks:
         # Residuals are the last column.
         columns = np.append(block.columns, size)

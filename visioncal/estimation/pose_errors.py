@@ -270,7 +270,7 @@ class _Likelihood:
         likelihood = robot_likelihood(problem, state, noise)
         (every,), (rest,) = likelihood.model.units, likelihood.model.common
         mine = (likelihood.members == index).any(axis=1)
-        levels, own = noise.robots.copy(), likelihood.reduced.covariance
+        levels, own = noise.robots.copy(), every.known
         levels[index] = 0.0
         known = own + problem.error_covariance(replace(noise, robots=levels))
         total = own + problem.error_covariance(noise)

@@ -297,7 +297,8 @@ class Problem:
             np.zeros((*rows, len(effect))) if effect.by_sensor is None else effect.by_sensor
             for effect in self.effects
         ]
-        return np.concatenate([np.zeros((*rows, 0)), *parts], axis=2)
+        # A copy of a single one would be the largest array of a long session.
+        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((*rows, 0)), *parts], 2)
 
     @cached_property
     def flange_jacobian(self) -> Mapping[str, FloatArray]:
@@ -401,7 +402,7 @@ class Problem:
         """Effect Jacobians of each group."""
         moved_groups = []
         for group in self.groups:
-            by_sensor = self.by_sensor[group.rows]
+            by_sensor = _rows_of(self.by_sensor, group.rows)
             flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
             by_steps = [
                 None if flange is None else _rows_of(flange, group.rows) for flange in flanges
@@ -413,8 +414,11 @@ class Problem:
                 by_step if by_step is None or every else by_step[:, :, values]
                 for by_step in by_steps
             )
-            places = np.flatnonzero(by_sensor[:, :, values].any(axis=(0, 1)))
-            moved_groups.append(_MovedGroup(values, places, by_sensor[:, :, values[places]], steps))
+            moves_sensor = np.asarray(by_sensor.any(axis=(0, 1)))
+            places = np.flatnonzero(moves_sensor[values])
+            if not moves_sensor.all():
+                by_sensor = by_sensor[:, :, values[places]]
+            moved_groups.append(_MovedGroup(values, places, by_sensor, steps))
         return tuple(moved_groups)
 
     def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:

@@ -1,7 +1,7 @@
 """Restricted likelihood (REML) of the robots' noise levels at a fit."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -15,12 +15,11 @@ from visioncal.estimation.mixed import (
     LITTLE,
     MOST_SIGMA,
     CommonRows,
-    MixedEstimate,
     MixedModel,
     SizePrior,
     Units,
 )
-from visioncal.estimation.normal_equations import Reduced, reduce
+from visioncal.estimation.normal_equations import reduce
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 
@@ -47,7 +46,8 @@ _LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
 class RobotLikelihood:
     """Restricted likelihood of the robots' noise levels."""
 
-    reduced: Reduced  # The estimates of each unit's flange errors.
+    by_flanges: FloatArray  # See `Reduced`.
+    cost: float  # Likewise.
     # Their likelihood by the free unknowns. The first sizes are the robots' levels of rotation and
     # translation, robot by robot.
     model: MixedModel
@@ -55,9 +55,6 @@ class RobotLikelihood:
     members: IntArray  # (u, w) the robots of each unit; see `Problem.units`.
     stops: IntArray  # (u,) the stop of each unit that has observations.
     before: FloatArray  # (r, 2) the robots' previous levels.
-    _weighed: dict[int, tuple[tuple[FloatArray, MixedEstimate], ...]] = field(
-        default_factory=dict, init=False, repr=False
-    )
 
     @cached_property
     def seen(self) -> Mask:
@@ -72,7 +69,7 @@ class RobotLikelihood:
     @property
     def rms(self) -> FloatArray:
         """(2,) RMS of the flange errors' rotation [rad] and translation [m]."""
-        squares = self.reduced.errors.reshape(-1, 2, 3) ** 2
+        squares = self.model.units[0].residuals.reshape(-1, 2, 3) ** 2
         return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
 
     def most_likely(
@@ -123,27 +120,20 @@ class RobotLikelihood:
         """
         mine, moved = (self.members == robot).any(axis=1), self.moved(robot, moves)
         start, least = (self.white[0], 0.0), np.inf
-        for levels, weighed in self._weighed_about(robot):
+        for lower in _LOWER:
+            levels = self.white[0].copy()
+            levels[robot] *= lower
+            levels = np.maximum(levels, LEAST_SIGMA)
+            weighed = self.model.at(np.log(levels.ravel()), is_sloped=False)
             size, gain = weighed.likely_size(moved, mine)
             if weighed.value - gain < least and (gain > 0.0 or least == np.inf):
                 start, least = (levels, size), weighed.value - gain
         return start
 
-    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, MixedEstimate], ...]:
-        """Fits at the levels `white`, and at lower levels of one robot."""
-        if robot not in self._weighed:
-            lower = np.ones((len(_LOWER), *self.before.shape))
-            lower[:, robot] = _LOWER
-            self._weighed[robot] = tuple(
-                (levels, self.model.at(np.log(levels.ravel()), is_sloped=False))
-                for levels in np.maximum(self.white[0] * lower, LEAST_SIGMA)
-            )
-        return self._weighed[robot]
-
     @property
     def negative_log_likelihood(self) -> float:
         """Negative log-likelihood at the levels `white`, including the cost no level affects."""
-        return self.white[1] + 0.5 * self.reduced.cost
+        return self.white[1] + 0.5 * self.cost
 
     def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
         if not len(self.members):
@@ -193,7 +183,7 @@ class RobotLikelihood:
         """Jacobian (m, 6 w, k) of the estimates of a robot's m units, for `moves` (s, 6, k)."""
         units, slots = np.nonzero(self.members == robot)
         places = 6 * slots[:, None, None] + np.arange(6)
-        by_flange = np.take_along_axis(self.reduced.by_flanges[units], places, axis=2)
+        by_flange = np.take_along_axis(self.by_flanges[units], places, axis=2)
         return np.asarray(by_flange @ moves[self.stops[units]])
 
     def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
@@ -270,4 +260,6 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
         np.zeros((jacobian.shape[2], len(levels))),
         ratio_prior(seen.tolist(), len(levels)),
     )
-    return RobotLikelihood(reduced, model, moving, members, stops, noise.robots)
+    return RobotLikelihood(
+        reduced.by_flanges, reduced.cost, model, moving, members, stops, noise.robots
+    )

@@ -76,7 +76,7 @@ def lens_field_of(
     if (coefficients := seen.compressed[which].coefficients) is not None:
         # Coefficients depend on lens and boards, and on those directions of themselves that also
         # move the poses, which are unknowns of the fit.
-        sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
+        sizes = seen.field_sizes
         first, is_free = sum(sizes[:which]), np.isin(places, seen.free)
         beyond = cell_fit.field_columns[first : first + sizes[which]]
         jacobian = np.zeros((len(coefficients.mean), len(covariance)))

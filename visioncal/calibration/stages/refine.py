@@ -193,7 +193,7 @@ def _estimated(
     values = {
         effect.name: fitted.problem.values_of(effect.name, fitted.fit.state)
         for effect in problem.effects[1:]
-    } | {LENSES: np.append(optics.values, np.zeros(seen.by_field.shape[2]))}
+    } | {LENSES: np.append(optics.values, np.zeros(sum(seen.field_sizes)))}
     for robot, errors in posture.items():
         effect = errors.effect(robot)
         others = [other for other in problem.effects if other.name != effect.name]

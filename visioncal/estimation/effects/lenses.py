@@ -278,15 +278,19 @@ class LinearisedCorners:
             moves[self.camera_parameters.rows(name), :, own] = compressed.by_shared[:, :, columns]
         return moves
 
-    @cached_property
+    @property
+    def field_sizes(self) -> list[int]:
+        """Number of coefficients of each camera's lens errors beyond its model."""
+        return [compressed.by_field.shape[2] for compressed in self.compressed]
+
+    @property
     def by_field(self) -> FloatArray:
         """Jacobian (v, 6, m) of all views' poses by the coefficients of lens errors."""
-        sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
-        moves = np.zeros((len(self.views), 6, sum(sizes)))
-        view = at = 0
-        for compressed, size in zip(self.compressed, sizes, strict=True):
-            moves[view : view + len(compressed.by_field), :, at : at + size] = compressed.by_field
-            view, at = view + len(compressed.by_field), at + size
+        moves, at = np.zeros((len(self.views), 6, sum(self.field_sizes))), 0
+        for name, compressed in zip(self.camera_parameters.problems, self.compressed, strict=True):
+            size = compressed.by_field.shape[2]
+            moves[self.camera_parameters.rows(name), :, at : at + size] = compressed.by_field
+            at += size
         return moves
 
     def effect(self, rows: IntArray) -> Effect:
@@ -295,10 +299,10 @@ class LinearisedCorners:
         Args:
             rows: (n,) the view of each observation; -1 for none.
         """
-        is_view, fields = rows >= 0, self.by_field.shape[2]
+        is_view, sizes = rows >= 0, self.field_sizes
+        fields = sum(sizes)
         by_sensor = np.zeros((len(rows), 6, len(self.free) + fields))
         by_sensor[is_view] = np.concatenate([self.by_free, self.by_field], axis=2)[rows[is_view]]
-        sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
         variances = np.repeat([floored_sigma_px(sigma) ** 2 for sigma in self.sigmas_px], sizes)
         # Coefficients are independent of the free values: no information between them.
         prior = PriorInformation(
