@@ -280,7 +280,7 @@ def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand")
     planned = tuple(
         Stop(at + 1, value, none, f"words of stop {at + 1}") for at, value in enumerate(q)
     )
-    return PlanFile(cell, purpose_of("hand-eye"), planned, q[0] + 0.002, "0" * 64)
+    return PlanFile(cell, purpose_of("hand-eye"), planned, "0" * 64, q[0] + 0.002)
 
 
 def _thin(robot: Robot) -> Robot:

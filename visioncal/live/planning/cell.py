@@ -1,18 +1,28 @@
 """A cell to plan for: guesses of what is unknown, limits of the stops, and obstacles."""
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
+from visioncal.core.codec import Array, Vector, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
 from visioncal.results import Calibration
+from visioncal.results.lens import CameraForm
 from visioncal.robot import Robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body, capsule
-from visioncal.vision.targets import corner_positions, extent_m
+from visioncal.vision.targets import (
+    corner_positions,
+    extent_m,
+    load_target,
+    target_document,
+    target_from_document,
+    target_names,
+)
 
 # Greatest angle between the line of sight and a board's normal [rad].
 _STEEPEST_RAD = 1.4
@@ -30,13 +40,31 @@ _HOLDER_RADIUS_M = 0.02
 _KEEP_OFF_SIGMAS = 2.0
 
 
+Pose: TypeAlias = Annotated[FloatArray, Array((4, 4))]
+# Forms in plan.json. A board that comes with visioncal gets its name.
+_ROBOT = WrittenForm(
+    lambda robot: dict(robot.document), lambda content, _: Robot.from_document(content)
+)
+_TARGET = WrittenForm(target_document, lambda content, _: _named(content))
+_CAMERA = WrittenForm(lambda lens: lens, lambda form, _: Camera(**vars(form)), CameraForm)
+_NOISE = WrittenForm(
+    lambda noise: noise.robots[0].tolist(), lambda sigmas, _: Noise.of_robot(*sigmas)
+)
+
+
+def _named(content: dict[str, Any]) -> Target:
+    target = target_from_document(content, "board")
+    shipped = (load_target(name) for name in target_names())
+    return next((one for one in shipped if target_document(one) == content), target)
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """A box-shaped obstacle."""
 
     name: str
-    base_from_box: FloatArray  # (4, 4) frame at its centre [m].
-    size_m: FloatArray  # (3,) full lengths along that frame's axes [m].
+    base_from_box: Pose  # (4, 4) frame at its centre [m].
+    size_m: Vector  # (3,) full lengths along that frame's axes [m].
 
     def __post_init__(self) -> None:
         _check_pose(f"box {self.name}", self.base_from_box)
@@ -91,23 +119,23 @@ class PlanCell:
     """A cell to plan for: its parts, rough guesses of the unknown edges, and limits."""
 
     mount: Mount
-    robot: Robot
-    camera: Camera
-    target: Target
+    robot: Annotated[Robot, _ROBOT]
+    camera: Annotated[Camera, _CAMERA]
+    target: Annotated[Target, _TARGET]
     # (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
-    x: FloatArray
+    x: Pose
     # (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
-    z: FloatArray
+    z: Pose
     sigma_rad: float  # Standard deviation of both rotations, per axis [rad].
     sigma_m: float  # The same for their translations [m].
-    noise: Noise  # Noise of the robot's poses.
+    noise: Annotated[Noise, _NOISE]  # Noise of the robot's poses.
     pixel_px: float  # Noise of a corner, per axis [px].
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
     # (12, 12) joint covariance of both edges (rotation, translation; right perturbations), where
     # recorded stops determine it; both sigmas are then typical of it. None where the sigmas are all
     # that is known.
-    covariance: FloatArray | None = None
+    covariance: Annotated[FloatArray, Array((12, 12))] | None = None
     # Least and greatest distance at which the board has been observed [m], allowed whether it fills
     # the image there or not; None where it has not been.
     observed_distances_m: tuple[float, float] | None = None

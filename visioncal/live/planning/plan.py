@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.codec import Key, Matrix, Vector, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, percent, some_of
@@ -48,27 +50,38 @@ class PlanRequest:
     need: Need | None = None  # Tolerance of picks at which fewer are enough; None for none.
 
 
+# An accuracy in plan.json; open where a direction is not determined.
+ACCURACY = WrittenForm(
+    lambda known: (
+        {"open": True} if known.is_open else {"sigma_mm": known.mm, "sigma_deg": known.deg}
+    ),
+    lambda document, _: Accuracy(document["sigma_mm"], document["sigma_deg"]),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Stop:
     """A stop to drive to."""
 
     view: int  # Number of the view to be taken there.
-    q: FloatArray  # (n,) joint angles [rad].
+    q: Vector  # (n,) joint angles [rad].
     # (j, n) via postures after the previous stop, connected straight in joint space [rad].
-    via: FloatArray
-    words: str  # What the stop contributes.
+    via: Annotated[Matrix, Key("via_q")]
+    words: Annotated[str, Key("why")]  # What the stop contributes.
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedStop(Stop):
     """A stop with what is predicted of it."""
 
-    base_from_flange: FloatArray  # (4, 4) flange, by the robot's model [m].
-    cam_from_target: FloatArray  # (4, 4) board in the camera if the guesses are right [m].
-    seen: float  # Share of the uncertain cell's draws in which the whole board is in the image.
+    base_from_flange: Matrix  # (4, 4) flange, by the robot's model [m].
+    cam_from_target: Matrix  # (4, 4) board in the camera if the guesses are right [m].
+    # Share of the uncertain cell's draws in which the whole board is in the image.
+    seen: Annotated[float, Key("seen_share")]
     rank: int  # 1 for the most informative stop, 2 for the next, ...
-    before: Accuracy  # Accuracy predicted with the recorded stops and those of lower rank number.
-    after: Accuracy  # The same with this one.
+    # Accuracy predicted with the recorded stops and those of lower rank number.
+    before: Annotated[Accuracy, ACCURACY]
+    after: Annotated[Accuracy, ACCURACY]  # The same with this one.
 
 
 @dataclass(frozen=True, eq=False)
