@@ -1,14 +1,14 @@
 """Candidate stops: reachable, free of collisions, with the whole board in view."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask, Progress
+from visioncal.core.types import FloatArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collision_model
 from visioncal.live.planning.visibility import BoardViews, Occlusion
 from visioncal.robot.collision import Collisions
@@ -32,10 +32,11 @@ _FULL_JOINTS = 6
 # A joint cannot pass a range of angles at least this wide [rad] in which no stop has it and this
 # share of postures collides.
 _WIDE_RAD, _BARRED, _TURN = np.pi / 3.0, 0.5, 2.0 * np.pi
+# Limits of stops, with the advice where one keeps out too many.
 IMAGE = "the whole board in the image"
 GUESS = "the whole board in the image although the guesses are off"
 FOCUS, TILT, DISTANCE = "the range of focus", "the tilt", "the distance"
-HIDDEN, BEHIND_ARM = "a free line of sight", "a line of sight past the arm"
+HIDDEN, BEHIND_ARM = "a line of sight past the boxes", "a line of sight past the arm"
 AWAY, REACH = "the arm's length", "the arm's reach"
 LIMITS, CLEARANCE = "the joints' limits", "the clearance"
 _ADVICE = {
@@ -43,20 +44,14 @@ _ADVICE = {
     GUESS: "Measure more closely where camera and board are, or allow a greater distance.",
     FOCUS: "Widen --focus-mm, or set --distance-mm to where the image is sharp.",
     HIDDEN: "Look whether the boxes are where they stand, or put the board elsewhere.",
-    BEHIND_ARM: "Put the camera where the arm comes less between it and the board, or hold the "
-    "board farther away from the arm.",
+    BEHIND_ARM: "Put the camera where the arm comes less between it and the board.",
     TILT: "Widen --tilt-deg, or turn the board towards the camera.",
     DISTANCE: "Widen --distance-mm, or put the board elsewhere.",
-    AWAY: "Put the board nearer to the arm, allow smaller distances, or look whether the guesses "
-    "are right.",
-    REACH: "Put the board where the arm can look at it from all sides, or look whether the guesses "
-    "are right.",
+    AWAY: "Put the board nearer to the arm, or look whether the guesses are right.",
+    REACH: "Put the board where the arm can look at it from all sides.",
     LIMITS: "Put the board elsewhere, or look whether the limits are the robot's.",
-    CLEARANCE: "Move one of the two, lower --clearance-mm, or look whether --box, --floor and "
-    "guesses are right.",
+    CLEARANCE: "Lower --clearance-mm, or look whether --box, --floor and guesses are right.",
 }
-# Number of limits that a message names, the most frequent first.
-_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +102,7 @@ def candidates(
         raise search.error()
     q = _unwind(cell, search.collisions, np.array([posture for posture, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
-    return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
+    return Candidates(q, cell.cam_from_target(q), shares, dict((+search.lost).most_common()))
 
 
 class _CandidateSearch:
@@ -115,7 +110,9 @@ class _CandidateSearch:
 
     def __init__(self, cell: PlanCell, count: int, seed: int) -> None:
         self.kept: list[tuple[FloatArray, float]] = []
-        self.losses = Losses()
+        # Number of tries that reached each limit, and that it rejected.
+        self.tried: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
         self._least_share = _SHARES[0]
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
@@ -142,36 +139,38 @@ class _CandidateSearch:
                     narrowed = True
                 if progress is not None:
                     progress("candidates", min(len(self.kept), self._count), self._count)
-            doubted = self.losses.lost[GUESS] >= _DOUBTED * self.losses.tried[GUESS]
+            doubted = self.lost[GUESS] >= _DOUBTED * self.tried[GUESS]
             if not doubted or len(self.kept) >= _ENOUGH * self._count:
                 break
         del self.kept[self._count :]
 
     def error(self) -> DataError:
         """Error of a search with too few stops."""
-        losses = self.losses
-        worst, counts = losses.worst(), losses.counts()
-        named = {name: count for name, count in counts.items() if name.startswith(f"{worst} (")}
-        culprit = max(named, key=lambda name: named[name], default=worst)
-        words = some_of([f"{times} to {what}" for what, times in counts.items()], _NAMED)
-        share = 100.0 * losses.lost[worst] / losses.tried[worst]
-        advice = _ADVICE[worst]
+        shares = {limit: self.lost[limit] / tries for limit, tries in self.tried.items() if tries}
+        worst = max(shares, key=lambda limit: shares[limit])
+        words = some_of([f"{times} to {limit}" for limit, times in (+self.lost).most_common()], 6)
         return DataError(
             f"plan: {len(self.kept)} of {self._count} possible stops were found in "
-            f"{max(losses.tried.values())} tries. Lost were {words}. Most in the way is {culprit}: "
-            f"{worst} kept out {share:.1f} % of the {losses.tried[worst]} that came so far.",
-            culprits=[culprit],
-            next_step=advice,
+            f"{max(self.tried.values())} tries. Lost were {words}. Most in the way is {worst}, "
+            f"which kept out {100.0 * shares[worst]:.1f} % of those that came so far.",
+            culprits=[worst],
+            next_step=_ADVICE[worst],
         )
+
+    def _passed(self, limit: str, good: Mask) -> Mask:
+        """Counts the tries that a limit lets through, and returns their mask."""
+        self.tried[limit] += len(good)
+        self.lost[limit] += int(np.sum(~good))
+        return good
 
     def _from_views(self) -> tuple[FloatArray, FloatArray]:
         """Postures (k, n) that reach drawn views, and their shares (k,)."""
-        sight, robot, passed = self._sight, self._cell.robot, self.losses.passed
+        sight, robot, passed = self._sight, self._cell.robot, self._passed
         views = sight.draw(_BATCH, self._rng)
         views = views[passed(IMAGE, sight.shows(views))]
         views = views[passed(FOCUS, sight.sharp(views))]
         flange = self._cell.flange_at(views)
-        flange = flange[self._not_behind_boxes(self._shade.behind_boxes(flange))]
+        flange = flange[passed(HIDDEN, ~self._shade.behind_boxes(flange))]
         if not robot.chain.prismatic.any():
             # No farther than the outstretched arm.
             places = robot.chain.placements
@@ -204,38 +203,24 @@ class _CandidateSearch:
             (DISTANCE, (distance >= near) & (distance <= far)),
             (FOCUS, sight.sharp(views)),
         ):
-            self.losses.passed(limit, good[kept])
+            self._passed(limit, good[kept])
             kept &= good
         q, flange = q[kept], flange[kept]
-        kept = self._not_behind_boxes(self._shade.behind_boxes(flange))
+        kept = self._passed(HIDDEN, ~self._shade.behind_boxes(flange))
         q, share = q[kept], sight.share(flange[kept], self._least_share)
-        likely = self.losses.passed(GUESS, share >= self._least_share)
+        likely = self._passed(GUESS, share >= self._least_share)
         return q[likely], share[likely]
-
-    def _not_behind_boxes(self, behind: IntArray) -> Mask:
-        """Mask of lines of sight that no box (k,) blocks; counts and names those that do."""
-        free = self.losses.passed(HIDDEN, behind < 0)
-        self.losses.blame(HIDDEN, [self._cell.boxes[place].name for place in behind[~free]])
-        return free
 
     def _keep(self, q: FloatArray, share: FloatArray) -> None:
         """Keeps postures (k, n) within limits, with a free line of sight and no collision."""
         robot, margin = self._cell.robot, self._cell.limits.joint_margin_rad
-        over = np.maximum(robot.lower_rad + margin - q, q - robot.upper_rad + margin)
-        within = self.losses.passed(LIMITS, np.asarray(np.all(over <= 0.0, axis=1)))
-        self.losses.blame(
-            LIMITS, [robot.joint_names[index] for index in over[~within].argmax(axis=1)]
-        )
-        q, share = q[within], share[within]
-        behind = self._shade.behind_arm(q)
-        free = self.losses.passed(BEHIND_ARM, behind < 0)
-        self.losses.blame(BEHIND_ARM, [self._shade.parts[index].name for index in behind[~free]])
-        q, share = q[free], share[free]
-        contact = self.collisions.first_contact(q)
-        clear = self.losses.passed(CLEARANCE, contact < 0)
-        pairs = [self.collisions.names[place] for place in contact[~clear]]
-        self.losses.blame(CLEARANCE, [f"{first} and {second}" for first, second in pairs])
-        self.kept += zip(q[clear], share[clear].tolist(), strict=True)
+        within = (q >= robot.lower_rad + margin) & (q <= robot.upper_rad - margin)
+        kept = self._passed(LIMITS, np.asarray(within.all(axis=1)))
+        q, share = q[kept], share[kept]
+        kept = self._passed(BEHIND_ARM, ~self._shade.behind_arm(q))
+        q, share = q[kept], share[kept]
+        kept = self._passed(CLEARANCE, self.collisions.first_contact(q) < 0)
+        self.kept += zip(q[kept], share[kept].tolist(), strict=True)
 
 
 def _unwind(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray:
@@ -262,37 +247,3 @@ def _unwind(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray
     turned = chain.encoded(positions)
     low, high = cell.robot.lower_rad + margin, cell.robot.upper_rad - margin
     return np.where((turned >= low) & (turned <= high), turned, q)
-
-
-@dataclass
-class Losses:
-    """Number of tries that each limit let through, in the order in which they are checked."""
-
-    tried: Counter[str] = field(default_factory=Counter)  # Number of tries that reached each limit.
-    lost: Counter[str] = field(default_factory=Counter)  # Number that it rejected.
-    # The same by joint, body or pair of bodies, where it is known.
-    named: Counter[str] = field(default_factory=Counter)
-
-    def passed(self, limit: str, good: Mask) -> Mask:
-        """Counts the tries that a limit lets through, and returns their mask."""
-        self.tried[limit] += len(good)
-        self.lost[limit] += int(np.sum(~good))
-        return good
-
-    def blame(self, limit: str, names: Sequence[str]) -> None:
-        """Adds the joints, bodies or pairs for which a limit rejected tries."""
-        self.named.update(f"{limit} ({name})" for name in names)
-
-    def counts(self) -> Mapping[str, int]:
-        """Number of tries that were rejected, by limit, the most frequent first."""
-        counts = Counter(self.named)
-        for limit, times in self.lost.items():
-            start = f"{limit} ("
-            named = sum(self.named[name] for name in self.named if name.startswith(start))
-            counts[limit] += times - named
-        return {limit: times for limit, times in counts.most_common() if times > 0}
-
-    def worst(self) -> str:
-        """The limit that lets the smallest share through."""
-        tried = {limit: times for limit, times in self.tried.items() if times}
-        return min(tried, key=lambda limit: 1.0 - self.lost[limit] / tried[limit])

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, compose, invert
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.robot.collision import arm_bodies
 from visioncal.robot.inverse import chain_frames
@@ -227,27 +227,27 @@ class Occlusion:
         hand = cell.robot.joint_count
         self.parts = tuple(body for body in arm_bodies(cell.robot) if body.link < hand)
 
-    def behind_boxes(self, base_from_flange: FloatArray) -> IntArray:
-        """Index (k,) of a box that hides part of the print at flange poses (k, 4, 4); else -1."""
+    def behind_boxes(self, base_from_flange: FloatArray) -> Mask:
+        """Whether a box hides part of the print (k,) at flange poses (k, 4, 4)."""
         starts, ends = self._sight_lines(base_from_flange)
-        blocking = np.full(len(base_from_flange), -1, dtype=np.int64)
-        for index, box in enumerate(self.cell.boxes):
-            blocking[_box_blocks(starts, ends, box.base_from_box[None], box.size_m)] = index
-        return blocking
+        hidden = np.zeros(len(base_from_flange), dtype=bool)
+        for box in self.cell.boxes:
+            hidden |= _box_blocks(starts, ends, box.base_from_box[None], box.size_m)
+        return hidden
 
-    def behind_arm(self, q: FloatArray) -> IntArray:
-        """Index (k,) in `parts` that hides part of the print at joints (k, n) [rad]; else -1."""
+    def behind_arm(self, q: FloatArray) -> Mask:
+        """Whether the arm hides part of the print (k,) at joints (k, n) [rad]."""
         chain = self.cell.robot.chain
         frames = chain_frames(chain, chain.effective(q))
         starts, ends = self._sight_lines(frames[:, -1])
-        blocking = np.full(len(q), -1, dtype=np.int64)
-        for index, part in enumerate(self.parts):
+        hidden = np.zeros(len(q), dtype=bool)
+        for part in self.parts:
             body = part.link_from_body[None]
             if part.link:
                 body = frames[:, part.link - 1] @ body
             blocks = _box_blocks if part.shape == "box" else _capsule_blocks
-            blocking[blocks(starts, ends, body, part.size_m)] = index
-        return blocking
+            hidden |= blocks(starts, ends, body, part.size_m)
+        return hidden
 
     def _sight_lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Starts (k or 1, 1, 3) and ends (k or 1, p, 3) of the lines of sight, in the base [m]."""
