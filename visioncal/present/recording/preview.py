@@ -13,11 +13,12 @@ from visioncal.core.files import replacing_file
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
+from visioncal.present.cell_poses import states_of
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import Obstacle, log_obstacles
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder, send_rows
-from visioncal.present.recording.scene import Scene, Seen, states_of
+from visioncal.present.recording.scene import Scene, Seen
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions

@@ -1,6 +1,6 @@
 """A picture of the cell: its arms, and where cameras and boards stood in the views."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,14 +8,11 @@ from markupsafe import Markup
 
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import FloatArray
-from visioncal.present import result_parts
+from visioncal.present.cell_poses import CellPoses
 from visioncal.present.report.plots import LINE_HEIGHT, WIDTH, Drawing
-from visioncal.present.result_parts import FrameHierarchy
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session, View
-from visioncal.session.frames import CELL
-from visioncal.session.observations import robot_rows_at_stops
+from visioncal.session import Session
 from visioncal.vision.camera import matrix_3x3
 from visioncal.vision.targets import extent_m
 
@@ -55,17 +52,17 @@ def cell_picture(
         session: Its session, for boards and joint angles; without it there is no picture.
         evidence: Poses of the views, for one camera and robot.
     """
-    frames = result_parts.frames(calibration)
-    if session is None or calibration.mount == "instrument" or not frames.robots:
+    if session is None or calibration.mount == "instrument":
         return Markup("")
-    rows = robot_rows_at_stops(session.declaration, session.views)
-    by_view = {view.view: view for view in evidence}
-    cell = _Cell(calibration, session, by_view, frames, rows)
+    cell = CellPoses.of(session, calibration, {view.view: view for view in evidence})
+    frames = cell.frames
+    if not frames.robots:
+        return Markup("")
     used = [view for view in calibration.views if view.used]
     used = used[:: max(1, -(-len(used) // _MOST_VIEWS))]
-    arms = [*cell.arms(used)]
+    arms = [*_arms(cell, used)]
     reach_m = max((float(np.ptp(arm.points, axis=0).max()) for arm in arms), default=1.0)
-    lines = [*arms, *cell.seen(used, _FRUSTUM * reach_m)]
+    lines = [*arms, *_seen(cell, used, _FRUSTUM * reach_m)]
     if len(lines) == len(arms):
         return Markup("")
     # The first robot's base is upright, which the cell's frame may not be.
@@ -111,74 +108,38 @@ def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray],
     return lambda of: np.asarray(scale * (of @ best.T) + middle)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cell:
-    """A cell in its views."""
+def _arms(cell: CellPoses, views: Sequence[ViewResult]) -> Iterator[_Line]:
+    """Each arm in the middle one of its views; a straight line without joint angles."""
+    for flange, name in cell.frames.robots.items():
+        states = [cell.states[flange].get(view.view) for view in views]
+        known = [state for state in states if state is not None and not state.is_past]
+        if not known:
+            continue
+        state = known[len(known) // 2]
+        links = state.link_frames(cell.models.get(name))
+        places = state.pose[None, :3, 3] if links is None else links[:, :3, 3]
+        base, arm = cell.frames.parents[flange], np.vstack([np.zeros(3), places])
+        yield _Line(base, "muted", 6.0, apply(cell.frames.matrices[base], arm))
 
-    calibration: Calibration  # The result.
-    session: Session  # Its session.
-    evidence: Mapping[int, ViewEvidence]  # Poses of the views, for one camera and robot.
-    frames: FrameHierarchy  # Tree of frames.
-    rows: Mapping[int, Mapping[str, View]]  # Rows with the robots' poses, by view and robot.
 
-    def flange_pose(self, flange: str, view: int) -> FloatArray | None:
-        """(4, 4) `base_from_flange` in a view; None where it is unknown."""
-        if self.calibration.cell is None:
-            return self.evidence[view].base_from_flange if view in self.evidence else None
-        row = self.rows.get(view, {}).get(self.frames.robots[flange])
-        pose = None if row is None else row.base_from_flange()
-        return None if pose is None else np.asarray(pose.as_matrix())
-
-    def pose(self, frame: str, view: int) -> FloatArray | None:
-        """(4, 4) pose of a frame in the cell in a view; None where it is unknown."""
-        matrix = np.eye(4)
-        while frame != CELL:
-            edge = self.frames.matrices.get(frame)
-            if frame in self.frames.robots:
-                edge = self.flange_pose(frame, view)
-            if edge is None:
-                return None
-            matrix, frame = edge @ matrix, self.frames.parents[frame]
-        return matrix
-
-    def arms(self, views: Sequence[ViewResult]) -> Iterator[_Line]:
-        """Each arm in the middle one of its views; a straight line without joint angles."""
-        models = result_parts.calibrated_robots(self.calibration)
-        for flange, name in self.frames.robots.items():
-            poses = {view.view: self.flange_pose(flange, view.view) for view in views}
-            known = [(view, pose) for view, pose in poses.items() if pose is not None]
-            if not known:
+def _seen(cell: CellPoses, views: Sequence[ViewResult], size_m: float) -> Iterator[_Line]:
+    """Boards and cameras in the views, each place once."""
+    drawn = set[tuple[str, bytes]]()
+    for view in views:
+        for frame in (view.seen or "target", view.seer or "cam"):
+            pose = cell.in_cell(frame, view.view, past=False)
+            if pose is None or (frame, pose.round(4).tobytes()) in drawn:
                 continue
-            view, pose = known[len(known) // 2]
-            row, robot = self.rows.get(view, {}).get(name), models.get(name)
-            joints_rad = None if row is None else row.joints_rad
-            places = pose[None, :3, 3]
-            if robot is not None and joints_rad is not None:
-                places = robot.link_frames(joints_rad)[:, :3, 3]
-            base, arm = self.frames.parents[flange], np.vstack([np.zeros(3), places])
-            yield _Line(base, "muted", 6.0, apply(self.frames.matrices[base], arm))
-
-    def seen(self, views: Sequence[ViewResult], size_m: float) -> Iterator[_Line]:
-        """Boards and cameras in the views, each place once."""
-        cameras = result_parts.cameras(self.calibration)
-        boards = result_parts.stated_boards(self.session)
-        drawn = set[tuple[str, bytes]]()
-        for view in views:
-            for frame in (view.seen or "target", view.seer or "cam"):
-                pose = self.pose(frame, view.view)
-                if pose is None or (frame, pose.round(4).tobytes()) in drawn:
-                    continue
-                drawn.add((frame, pose.round(4).tobytes()))
-                camera = cameras.get(frame, cameras.get(""))
-                board = boards.get(frame) or boards.get(frame.partition("_")[2])
-                if frame.startswith("cam") and camera is not None:
-                    corners = _rectangle(np.zeros(2), np.array(camera.camera.resolution), 1.0)
-                    rays = size_m * corners @ np.linalg.inv(matrix_3x3(camera.camera)).T
-                    ends = np.vstack([np.zeros(3), rays])[[*_PYRAMID]]
-                    yield _Line(frame, "accent", 1.0, apply(pose, ends))
-                elif board is not None:
-                    ends = _rectangle(*extent_m(board), 0.0)[[0, 1, 2, 3, 0]]
-                    yield _Line(frame, "good", 1.0, apply(pose, ends))
+            drawn.add((frame, pose.round(4).tobytes()))
+            camera, board = cell.cameras.get(frame), cell.boards.get(frame)
+            if camera is not None:
+                corners = _rectangle(np.zeros(2), np.array(camera.resolution), 1.0)
+                rays = size_m * corners @ np.linalg.inv(matrix_3x3(camera)).T
+                ends = np.vstack([np.zeros(3), rays])[[*_PYRAMID]]
+                yield _Line(frame, "accent", 1.0, apply(pose, ends))
+            elif board is not None:
+                ends = _rectangle(*extent_m(board), 0.0)[[0, 1, 2, 3, 0]]
+                yield _Line(frame, "good", 1.0, apply(pose, ends))
 
 
 def _rectangle(low: FloatArray, high: FloatArray, depth: float) -> FloatArray:
