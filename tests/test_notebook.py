@@ -137,7 +137,6 @@ def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
         ([POSES[0], 0.0 * POSES[0], POSES[0]], r"\[1\] .* entries are zero", "never filled"),
         ([POSES[0], POSES[0] * np.nan, POSES[0]], r"\[1\] .* not finite", "reported"),
         ([POSES[0], POSES[0] + 0.1 * np.eye(4, k=1), POSES[0]], r"\[1\] .* right angles", "3 x 3"),
-        (POSES[:, :3], r"\[0\] has the shape \(3, 4\)", ""),
     ],
 )
 def test_poses_that_are_no_rigid_transforms_are_refused_with_the_likely_cause(spoilt, words, step):

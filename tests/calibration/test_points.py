@@ -504,8 +504,8 @@ def test_numbers_that_do_not_lie_as_drawn_are_refused_or_left_out_by_name(tmp_pa
 def test_targets_of_rows_are_those_of_their_views(tmp_path):
     folder = write_two_targets(tmp_path / "cell")
     cases = {
-        "wall": "'wall' is not declared; session.toml declares board, rig",
-        "": "it is empty, and so is view 0's",
+        "wall": "'wall'; one of board, rig is needed",
+        "": "''; one of board, rig is needed",
     }
     for name, said in cases.items():
         with pytest.raises(DataError) as error:
@@ -929,11 +929,11 @@ def without_sigma(folder):
         ),
         (Rig(stated=1.0), without_sigma, "it is empty; all rows state it, or none"),
         # Of a board, whose corners count from 0, and of a rig whose table counts from 1.
-        (Rig("checkerboard"), counted_from({"corners.csv": (1, 1)}), "Write point - 1 in the pl"),
+        (Rig("checkerboard"), counted_from({"corners.csv": (1, 1)}), "numbers 0 to 39"),
         (
             Rig(),
             counted_from({"corners.csv": (1, 0), "target.csv": (0, 1)}),
-            "rite point + 1 in the place of point",
+            "numbers 1 to 37",
         ),
         # Views are numbered otherwise.
         (Rig(), views_renumbered(lambda view: 77 if view == 2 else view), "csv has no view 2"),

@@ -356,7 +356,11 @@ def test_all_wrong_fields_are_named_at_once(folder):
 
 
 CSV_REFUSALS = [
-    (",x_m,y_m,z_m,qx,qy,qz,qw,", ",x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,w,", "in rx_deg,ry_deg,rz"),
+    (
+        ",x_m,y_m,z_m,qx,qy,qz,qw,",
+        ",x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,w,",
+        "in x_mm,y_mm,z_mm,rx_deg",
+    ),
     ("0.6,0,0.3", "0.6,0,0,3", "line 3: it has 14 fields, .*; decimal commas may be the cause"),
     (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
     (",qw,", ",w,", "the columns x_m, .* lack qw"),
@@ -421,10 +425,10 @@ def test_the_separators_and_commas_of_spreadsheets_are_read(folder, separator):
 
 
 def test_what_is_no_session_is_refused(tmp_path):
-    raised(DataError, "nowhere does not exist", Session.load, tmp_path / "nowhere")
+    raised(DataError, "nowhere.session.toml does not exist", Session.load, tmp_path / "nowhere")
     for name in ("notes.txt", "calibration.json", "recording.rrd"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
-    raised(DataError, "is no session: a folder", Session.load, tmp_path / "notes.txt")
+    raised(DataError, "notes.txt.session.toml does not exist", Session.load, tmp_path / "notes.txt")
     for path in (tmp_path, tmp_path / "calibration.json"):
         caught = raised(DataError, "but a result", Session.load, path)
         assert f"name {tmp_path / 'recording.rrd'}" in caught.next_step

@@ -49,7 +49,8 @@ def select_matching(
     # A part that the session's rows determine needs no name, if the calibration has it.
     parents = calibration.tree.parents
     named = {
-        part: choice.of(part) or (frame if (frame := of_session.get(part)) in parents else None)
+        part: getattr(choice, part)
+        or (frame if (frame := of_session.get(part)) in parents else None)
         for part in needs
     }
     return session, calibration.chosen(Choice(**named), needs)

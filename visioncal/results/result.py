@@ -209,7 +209,7 @@ class Calibration(CalibrationSections):
             raise DataError(
                 f"calibration {self.session_name!r} is of one camera and one robot, which have no "
                 "names.",
-                culprits=[f"--{part}" for part in PARTS if choice.of(part)],
+                culprits=[f"--{part}" for part in PARTS if getattr(choice, part)],
                 next_step="Leave their names out.",
             )
         return self

@@ -118,7 +118,7 @@ def targets_fixed_to_base(
 def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Chosen:
     """The chosen parts in the last poses; parts neither needed nor named are empty."""
     chosen = choose(whole.tree.last, choice, needs, label=f"the cell {whole.session_name!r}")
-    kept = {*needs, *(part for part in PARTS if choice.of(part))}
+    kept = {*needs, *(part for part in PARTS if getattr(choice, part))}
     return replace(
         chosen,
         camera=chosen.camera if "camera" in kept else "",

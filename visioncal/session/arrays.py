@@ -96,17 +96,12 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
         np.array(value.as_matrix() if isinstance(value, RigidTransform) else value, float)
         for value in given
     ]
-    for at, matrix in enumerate(matrices):
-        if matrix.shape != (4, 4):
-            raise DataError(
-                f"base_from_flange[{at}] has the shape {matrix.shape}; (4, 4) is needed, one pose "
-                "for each view.",
-                culprits=[f"base_from_flange[{at}]"],
-            )
-    if len(matrices) != count:
+    shapes = dict.fromkeys(matrix.shape for matrix in matrices)
+    if len(matrices) != count or {*shapes} - {(4, 4)}:
         raise DataError(
-            f"{count} {what} and {len(matrices)} poses in base_from_flange: each view has one of "
-            "each, in the same order.",
+            f"{count} {what} and {len(matrices)} poses in base_from_flange, of the shapes "
+            f"{', '.join(map(str, shapes))}: each view has one of each, in the same order; poses "
+            "are (4, 4).",
             culprits=[what, "base_from_flange"],
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
@@ -132,13 +127,12 @@ def _content(
     resolution: tuple[int, int] | None = None,
 ) -> dict[str, Any]:
     count, known = len(matrices), [*CellArguments.__annotations__]
-    for name in cell:
-        if name not in known:
-            raise DataError(
-                f"{name} is nothing that is known of a cell; that is {', '.join(known)}.",
-                culprits=[name],
-                next_step=did_you_mean(name, known),
-            )
+    for name in cell.keys() - known:
+        raise DataError(
+            f"{name} is nothing that is known of a cell; that is {', '.join(known)}.",
+            culprits=[name],
+            next_step=did_you_mean(name, known),
+        )
     if not count:
         raise DataError("There are no views.", culprits=["base_from_flange"])
     q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float)

@@ -28,19 +28,12 @@ LOAD = (
     *(f"payload_{axis}_m" for axis in "xyz"),
     *(f"force_{axis}_n" for axis in "xyz"),
 )
-# Columns of rotations other than quaternions, and their usual forms.
-ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
-    ("rx", "ry", "rz"): ("rotation-vector", "euler-xyz-deg"),
-    ("a", "b", "c"): ("euler-ZYX-deg",),
-    ("w", "p", "r"): ("euler-xyz-deg",),
-    ("roll", "pitch", "yaw"): ("euler-xyz-rad", "euler-xyz-deg"),
-    ("rx_deg", "ry_deg", "rz_deg"): ("euler-xyz-deg", "rotation-vector-deg"),
-    ("rx_rad", "ry_rad", "rz_rad"): ("rotation-vector", "euler-xyz-rad"),
-    ("a_deg", "b_deg", "c_deg"): ("euler-ZYX-deg",),
-    ("w_deg", "p_deg", "r_deg"): ("euler-xyz-deg",),
-    ("roll_deg", "pitch_deg", "yaw_deg"): ("euler-xyz-deg",),
-    ("roll_rad", "pitch_rad", "yaw_rad"): ("euler-xyz-rad",),
-}
+# Columns of rotations other than quaternions.
+ROTATIONS = tuple(
+    tuple(f"{name}{unit}" for name in names)
+    for names in (("rx", "ry", "rz"), ("a", "b", "c"), ("w", "p", "r"), ("roll", "pitch", "yaw"))
+    for unit in ("", "_deg", "_rad")
+)
 # Names of position columns other than in metres.
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
 _PLAIN_NUMBERS = frozenset({"stamp_s", "ambient_c", *LOAD}.union(*WHOLE_GROUPS))
@@ -132,30 +125,21 @@ def check_header(columns: Sequence[str], where: str) -> None:
         )
     problems = list(_header_problems(columns))
     lower = {name.lower(): name for name in columns}
-    positions = position_columns(columns)
-    rotation_names = next(
-        (rotation for rotation in ROTATIONS if lower.keys() >= set(rotation)), None
-    )
+    others = [*(position_columns(columns) or ())]
+    if not set(QUATERNION) & set(columns):
+        rotations = (names for names in ROTATIONS if lower.keys() >= set(names))
+        others += [lower[name] for name in next(rotations, ())]
     # Additional columns beside complete poses or joints are not meant as poses.
     has_state = bool(set(POSE) & set(columns) or joint_columns(columns))
-    if not problems and (has_state or positions is None or rotation_names is None):
-        return
-    if rotation_names is not None and not set(QUATERNION) & set(columns):
-        names = ",".join(lower[word] for word in rotation_names)
+    if others and (problems or (not has_state and len(others) > len(POSITION))):
         raise DataError(
-            f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
+            f"{where}: poses are in {','.join(others)}, and {', '.join(POSE)} are needed, in "
+            "metres and as quaternions.",
             culprits=[where],
-            next_step=f"They may be {' or '.join(ROTATIONS[rotation_names])}, which the images "
-            f"show. {READ_AGAIN}",
+            next_step=f"The images show their unit and form. {READ_AGAIN}",
         )
-    if positions is not None:
-        raise DataError(
-            f"{where}: the positions are in {','.join(positions)}, and {', '.join(POSITION)} [m] "
-            "are needed.",
-            culprits=[where],
-            next_step=f"The images show their unit. {READ_AGAIN}",
-        )
-    raise DataError(f"{where}: {'; '.join(problems)}.", culprits=[where])
+    if problems:
+        raise DataError(f"{where}: {'; '.join(problems)}.", culprits=[where])
 
 
 def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:

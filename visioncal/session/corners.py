@@ -1,6 +1,6 @@
 """corners.csv: image points of the targets' known points, found by another detector."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -243,29 +243,23 @@ def _target_problems(
     """Problems of the rows' views and targets."""
     first = next((target for target in table.targets if target), "")
     for view in dict.fromkeys(view for view in table.views.tolist() if view not in rows):
-        own_rows = np.flatnonzero(table.views == view)
-        more = f" and {len(own_rows) - 1} more" if len(own_rows) > 1 else ""
-        place = f"{table.place(int(own_rows[0]))}{more}, column view"
-        yield TableProblem(place, f"views.csv has no view {view}")
+        place = table.place(int(np.argmax(table.views == view)))
+        yield TableProblem(f"{place}, column view", f"views.csv has no view {view}")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
-        place = table.place(at)
+        words = ""
         if view not in rows:
             continue
         if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
-            yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and not (target or named[at]):
-            words = f"it is empty, and so is view {view}'s; one of {', '.join(names)} is needed"
-            yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and target and target not in names:
-            words = f"{target!r} is not declared; session.toml declares {', '.join(names)}"
-            yield TableProblem(f"{place}, column {COLUMN}", words)
+        elif names and (target or named[at]) not in names:
+            words = f"{target!r}; one of {', '.join(names)} is needed, here or in views.csv"
         elif names and target and named[at] not in ("", target):
             words = (
                 f"{target!r}, but views.csv says that view {view} shows {named[at]!r}; a "
                 "view that shows both has a row for each there, or names none"
             )
-            yield TableProblem(f"{place}, column {COLUMN}", words)
+        if words:
+            yield TableProblem(f"{table.place(at)}, column {COLUMN}", words)
 
 
 def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str, Target]) -> None:
@@ -274,20 +268,18 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     Raises:
         DataError: A point is unknown or duplicate.
     """
-    file = FILE if table.is_file else "corners"
-    by_name: dict[str, set[int]] = {}
-    for name, point in zip(names, table.points.tolist(), strict=True):
-        by_name.setdefault(name, set()).add(point)
-    numbers = {name: frozenset(point_numbers(targets[name])) for name in by_name}
-    for name, used in by_name.items():
-        _check_first_number(used, numbers[name], targets[name], file)
+    numbers = {name: point_numbers(targets[name]) for name in dict.fromkeys(names)}
+    known = {name: frozenset(points) for name, points in numbers.items()}
     problems: list[TableProblem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
         earlier = seen.setdefault(key, at)
-        if key[1] not in numbers[names[at]]:
-            target = targets[names[at]]
-            words = f"target {target.name} has no point {key[1]}; {_range(target)}"
+        if key[1] not in known[names[at]]:
+            points = numbers[names[at]]
+            words = (
+                f"target {targets[names[at]].name} has no point {key[1]}; its {len(points)} points "
+                f"have the numbers {min(points)} to {max(points)}"
+            )
         elif earlier != at:
             words = (
                 f"point {key[1]} of view {key[0]} is there twice, first in {table.place(earlier)}"
@@ -298,26 +290,6 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
         problems.append(TableProblem(place, words))
     if problems:
         raise problems_error(problems)
-
-
-def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: str) -> None:
-    """Checks that corners are not numbered from one higher or lower than the target's points."""
-    for more, sign in ((-1, "-"), (1, "+")):
-        if not seen <= known and {index + more for index in seen} <= known:
-            first = min(known) - more
-            rig = f", or in the table of {target.name} count its points from {first}"
-            raise DataError(
-                f"{file} counts the points of target {target.name} from {first}: it has "
-                f"{min(seen)} to {max(seen)}, and {_range(target)}.",
-                culprits=[f"{file}: point"],
-                next_step=f"In {file}, write point {sign} 1 in the place of point"
-                f"{rig * bool(target.points_m)}.",
-            )
-
-
-def _range(target: Target) -> str:
-    numbers = point_numbers(target)
-    return f"its {len(numbers)} points have the numbers {min(numbers)} to {max(numbers)}"
 
 
 def corners_by_view(

@@ -38,10 +38,6 @@ class Choice:
     def __bool__(self) -> bool:
         return any(name is not None for name in (self.camera, self.robot, self.target))
 
-    def of(self, part: Part) -> str | None:
-        """The given name of a part."""
-        return {"camera": self.camera, "robot": self.robot, "target": self.target}[part]
-
 
 # The choice without names.
 ANY = Choice()
@@ -98,27 +94,38 @@ def choose(
     by_part = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
     named = {}
     for part in PARTS:
-        if name := choice.of(part):
-            names = [object_name(frame, part) for frame in by_part[part]]
-            pairs = zip(by_part[part], names, strict=True)
-            same = [frame for frame, short in pairs if name in (frame, short)]
-            if not same:
+        if name := getattr(choice, part):
+            names = {object_name(frame, part): frame for frame in by_part[part]}
+            named[part] = name if name in by_part[part] else names.get(name, "")
+            if not named[part]:
                 raise DataError(
-                    f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
+                    f"{label} has no {part} {name!r}: its {part}s are "
+                    f"{some_of([*names]) or 'none'}.",
                     culprits=[f"--{part}"],
                     next_step=did_you_mean(name, names),
                 )
-            named[part] = same[0]
-    options = [
-        option
-        for option in _combinations(frames, by_part, parted=robot_between)
-        if all(map(option.frame_of, needs))
-    ]
+    options = [*_combinations(frames, by_part, parted=robot_between)]
     fitting = [
-        option for option in options if all(option.frame_of(p) == at for p, at in named.items())
+        option
+        for option in options
+        if all(map(option.frame_of, needs))
+        and all(option.frame_of(part) == frame for part, frame in named.items())
     ]
     if not fitting:
-        raise _none_fits(frames, by_part, named, needs, label)
+        missing = [part for part in needs if not by_part[part]]
+        pairs = [
+            f"{object_name(option.camera, 'camera')} and {object_name(option.target, 'target')} "
+            f"by robot {object_name(option.flange, 'robot')}"
+            for option in options
+            if option.camera and option.target
+        ]
+        raise DataError(
+            f"{label} has no {missing[0]}."
+            if missing
+            else f"{label}: no one robot parts a camera from a target as they are named.",
+            culprits=[f"--{name}" for name in missing or named],
+            next_step=f"These go together: {some_of(pairs)}." if pairs and not missing else "",
+        )
     if "target" in needs:
         observed = [option for option in fitting if (option.camera, option.target) in seen]
         fitting = observed or fitting
@@ -153,33 +160,6 @@ def _combinations(
                 both = camera and target and parted
                 if not both or robots_between(frames, camera, target) == (robot,):
                     yield Chosen(mount if camera else "instrument", camera, robot, target)
-
-
-def _none_fits(
-    frames: Mapping[str, str],
-    by_part: Mapping[Part, Collection[str]],
-    named: Mapping[Part, str],
-    needs: Collection[Part],
-    label: str,
-) -> DataError:
-    """Error that no combination fits the names."""
-    for part in needs:
-        if not by_part[part]:
-            return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
-    pairs = [
-        f"{object_name(option.camera, 'camera')} and {object_name(option.target, 'target')} "
-        f"by robot {object_name(option.flange, 'robot')}"
-        for option in _combinations(frames, by_part, parted=True)
-        if option.camera and option.target
-    ]
-    between = [frame for part, frame in named.items() if part != "robot"]
-    robots = robots_between(frames, *between) if len(between) == 2 else ()
-    parting = f" ({' and '.join(robots)} part them)" if robots else ""
-    return DataError(
-        f"{label}: no one robot parts a camera from a target as they are named{parting}.",
-        culprits=[f"--{name}" for name in named],
-        next_step=f"These go together: {some_of(pairs)}." if pairs else "",
-    )
 
 
 if TYPE_CHECKING:
@@ -230,7 +210,7 @@ def select(
     robot_rows = robot_rows_at_stops(session.declaration, session.views)
     seen = {one.view.number: (one.seer, one.seen) for one in session.observations}
     # The selected rows, each with the robot's numbers at its stop.
-    rows: dict[int, tuple[View, Mapping[str, float]]] = {}
+    rows: dict[int, View] = {}
     for view in session.views:
         sees = is_camera_observation(view)
         if chosen.camera:
@@ -239,18 +219,18 @@ def select(
             robot = name_of(session.declaration, "robot", view)
             is_selected = has_robot_state(view) and not sees and robot == chosen.robot
         if is_selected:
-            robot_row = robot_rows[view.number].get(chosen.robot)
-            rows[view.number] = view, {} if robot_row is None else robot_row.numbers
+            robot_row = robot_rows[view.number].get(chosen.robot, View(0))
+            numbers = {k: v for k, v in view.numbers.items() if not _is_of_robots(k)}
+            numbers |= {k: v for k, v in robot_row.numbers.items() if _is_of_robots(k)}
+            rows[view.number] = replace(view, numbers=numbers)
     # Columns that only other robots fill, as joints of one with more axes, are dropped.
-    filled = {name for _, numbers in rows.values() for name in numbers}
+    filled = {name for view in rows.values() for name in view.numbers}
     columns = tuple(
         column
         for column in session.columns
         if column not in (*SELECTORS, TARGET) and (column in filled or not _is_of_robots(column))
     )
-    cells = [
-        [_cell(row, robot_row, column) for column in columns] for row, robot_row in rows.values()
-    ]
+    cells = [[view.cell(column) for column in columns] for view in rows.values()]
     table, target = session.corner_table, chosen.target.partition("_")[2]
     models, boards = session.robot_documents, session.target_document
     selected = session.assemble(
@@ -312,12 +292,6 @@ def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
         if max(fitting, key=len, default=None) in (None, robot or "robot"):
             streams[stream] = series
     return streams
-
-
-def _cell(view: View, robot_row: Mapping[str, float], column: str) -> str:
-    if _is_of_robots(column):
-        return repr(float(robot_row[column])) if column in robot_row else ""
-    return view.cell(column)
 
 
 def _is_of_robots(column: str) -> bool:

@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Unpack
 
-import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.arguments import typed
@@ -114,12 +113,6 @@ class Session:
             from visioncal.present.recording import read_session
 
             return read_session(path)
-        if not path.exists():
-            raise DataError(
-                f"{path} does not exist; a session's folder, or an .rrd recording, is needed.",
-                culprits=[str(path)],
-                next_step="Check the path and its spelling.",
-            )
         # calibration.json stands for the output folder that contains it.
         folder = path.parent if path.name == "calibration.json" else path
         recording = folder / "recording.rrd"
@@ -128,15 +121,6 @@ class Session:
                 f"{path} is no session, but a result.",
                 culprits=[str(path)],
                 next_step=f"Its recording is the session: name {recording}.",
-            )
-        if not path.is_dir():
-            raise DataError(
-                f"{path} is no session: a folder with session.toml and views.csv, or an .rrd "
-                "recording, is needed.",
-                culprits=[str(path)],
-                next_step=f"Name its folder: {path.parent}."
-                if (path.parent / "session.toml").is_file()
-                else "",
             )
         document = parse_toml(
             read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
@@ -330,23 +314,16 @@ class Session:
         Raises:
             DataError: One is not a number above 0.
         """
-        given = {"mm": mm, "deg": deg}
-        asked: dict[str, float | bool] = {
-            name: float(value) for name, value in given.items() if value is not None
-        }
-        for name, value in asked.items():
-            if not 0.0 < value < np.inf:
-                raise DataError(
-                    f"the need in {name} is {value!r}; a number above 0 is needed.",
-                    culprits=[f"--need-{name}"],
-                    next_step=f"Give how near picks have to come, as --need-{name} 0.5.",
-                )
-        if corrected:
-            asked["corrected"] = True
+        asked: dict[str, float | bool] = {"corrected": True} if corrected else {}
+        for name, value in (("mm", mm), ("deg", deg)):
+            if value is not None:
+                asked[name] = float(value)
         if not asked:
             return self
         table = {**self.document.get("need", {}), **asked}
-        return replace(self, document={**self.document, "need": table})
+        session = replace(self, document={**self.document, "need": table})
+        _ = session.declaration  # checks it
+        return session
 
     @property
     def need(self) -> Need | None:

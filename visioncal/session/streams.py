@@ -14,6 +14,7 @@ from visioncal.core.documents.columns import Column, NumberChecks, TableReader
 from visioncal.core.documents.tables import parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, write_atomically
+from visioncal.core.number_format import counted
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import columns as cols
 
@@ -21,8 +22,6 @@ FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
 # Samples are missing where steps exceed this multiple of the median, and this time [s].
 _GAP_RATIO, _GAP_S = 2.5, 0.02
-# Cells that stand for missing numbers in other programs' tables.
-_NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
 # Largest size of all streams together: half an hour of twenty columns at 500 Hz.
 _MOST_BYTES = 300_000_000
 
@@ -129,11 +128,9 @@ def parse_stream(text: str, label: str) -> Stream:
         table = parse_table(text, label)
         columns, reader = table.columns, TableReader(table)
         values, lines = reader.numbers(*map(Column, columns)), np.array(table.lines, np.int64)
-        missing = reader.unread and {cell.lower() for cell in reader.unread} <= _NONE
         reader.check(
-            "Leave a cell empty where there is no number; its row then does not count."
-            if missing
-            else "A stream holds numbers alone; leave other columns out."
+            "A stream holds numbers alone: leave a cell empty where there is none, and other "
+            "columns out."
         )
     values.setflags(write=False)
     return Stream(columns, values, lines)
@@ -168,20 +165,14 @@ def check_stream(name: str, stream: Stream) -> None:
             missing or do not ascend, a pose is incomplete, or a quaternion is not of unit length.
     """
     label = f"{FOLDER}/{name}.csv"
-    if not _NAME.fullmatch(name):
-        raise DataError(
-            f"{label}: a stream's name has letters, digits, - and _ only.", culprits=[label]
-        )
     # A stream needs no `view`, and may have it.
     header = stream.columns if "view" in stream else ("view", *stream.columns)
     cols.check_header(header, f"{label}, header")
-    if STAMP not in stream:
-        raise DataError(
-            f"{label}, header: the column {STAMP}, the time of each row, is missing.",
-            culprits=[label],
-        )
-    if not len(stream):
-        raise DataError(f"{label} has a header row and no samples.", culprits=[label])
+    fault = "it has a header row and no samples" if not len(stream) else ""
+    fault = fault if STAMP in stream else f"the column {STAMP}, the time of each row, is missing"
+    fault = fault if _NAME.fullmatch(name) else "its name has other than letters, digits, - and _"
+    if fault:
+        raise DataError(f"{label}: {fault}.", culprits=[label])
     checks = _checks(stream, label)
     for row in np.flatnonzero(~np.isfinite(stream.stamps_s)).tolist():
         checks.report(row, STAMP, "it is empty; each row needs its time")
@@ -222,8 +213,8 @@ def gap_warnings(streams: Mapping[str, Stream]) -> Iterator[str]:
             steps = np.diff(stamps_s)
             worst = int(behind[np.argmax(steps[behind])])
             yield (
-                f"{FOLDER}/{name}.csv: samples are missing in {len(behind)} "
-                f"place{'s' if len(behind) > 1 else ''}; the widest gap is {steps[worst]:.3g} s, "
-                f"{stamps_s[worst] - stamps_s[0]:.6g} s from the start, where samples are usually "
-                f"{np.median(steps):.3g} s apart. Nothing is interpolated across them."
+                f"{FOLDER}/{name}.csv: samples are missing in {counted(len(behind), 'place')}; the "
+                f"widest gap is {steps[worst]:.3g} s, {stamps_s[worst] - stamps_s[0]:.6g} s from "
+                f"the start, where samples are usually {np.median(steps):.3g} s apart. Nothing is "
+                "interpolated across them."
             )

@@ -130,16 +130,11 @@ def parse_csv(text: str, label: str) -> TextTable:
             next_step="A row is one observation at a stop. Samples of a running motion belong into "
             "streams/NAME.csv; write the stops alone here.",
         )
-    if not table.columns:
-        raise DataError(
-            f"{label} is empty; a header row (view,image,...) and a row for each view are needed.",
-            culprits=[label],
-        )
     if not table.rows:
         raise DataError(
-            f"{label} has a header row and no views.",
+            f"{label} has no views; a header row (view,image,...) and a row for each view are "
+            "needed.",
             culprits=[label],
-            next_step="Add one row for each view.",
         )
     return table
 
@@ -218,11 +213,8 @@ def _observation_problem(
     state = [name for name in ("x_m", "q1_rad", *_OBSERVED) if name in view.numbers]
     pictured = bool(view.image) or with_corners
     if view.is_of_lens and (state or not pictured):
-        words = (
-            "intrinsics is for an image that serves the camera's lens alone, but the row has "
-            f"{f'{state[0]}; leave that empty' if state else 'no image'}"
-        )
-        return "role", words, ""
+        has = f"{state[0]}, to be left empty" if state else "no image"
+        return "role", f"intrinsics is for an image of the lens alone, and the row has {has}", ""
     # A row of a stop may have only the pose of one of several robots.
     is_of_robot = state and view.stop is not None and "robot" in view.text
     if pictured or {*state} & {*_OBSERVED} or "point" in view.text or is_of_robot:
@@ -272,11 +264,7 @@ def _load_problems(view: View) -> Iterator[tuple[str, str]]:
 
 
 def check_times(views: Sequence[View]) -> None:
-    """Checks that times are plausible, so that their stamps resolve microseconds.
-
-    Raises:
-        DataError: One is not; it names the view.
-    """
+    """Checks that stamps resolve microseconds; raises DataError."""
     for view in views:
         wrong = "" if view.stamp_s is None else cols.column_of("stamp_s").fault(view.stamp_s)
         if wrong:
@@ -291,18 +279,15 @@ def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
         for view in views
         if names[0] in view.numbers
     ]
-    far = [norm for norm in norms if norm > _FAR_M]
-    if 2 * len(far) <= len(norms):
+    median = float(np.median(norms)) if norms else 0.0
+    if median <= _FAR_M:
         return ""
     unit = (
         "It looks like millimetres: multiply these columns by 0.001."
-        if np.median(far) > _SURELY_MM
+        if median > _SURELY_MM
         else "Metres are needed, and these are inches, centimetres or millimetres."
     )
-    return (
-        f"views.csv: the median length of ({', '.join(names)}) is {np.median(far):.4g} m in "
-        f"{len(far)} of {len(norms)} rows. {unit}"
-    )
+    return f"views.csv: the median length of ({', '.join(names)}) is {median:.4g} m. {unit}"
 
 
 def view_warnings(views: Sequence[View]) -> Iterator[str]:

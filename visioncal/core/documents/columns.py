@@ -17,9 +17,8 @@ from visioncal.core.verdict import READ_AGAIN
 
 # Tolerance of a quaternion's norm, for four digits.
 _NORM_TOLERANCE = 1e-3
-# Smallest number of rows with wrong norms, and largest norm of them, from which they are taken for
-# another form of rotation.
-_FEWEST_ALIKE, _FAR_FROM_UNIT = 3, 1.5
+# From this norm on they are taken for another form of rotation.
+_FAR_FROM_UNIT = 1.5
 _SHOWN_PROBLEMS = 10
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 
@@ -47,8 +46,7 @@ class TableProblem:
 
     place: str
     words: str
-    norm: float | None = None  # of a quaternion
-    step: str = ""  # remedy other than correcting the table
+    step: str = ""  # Remedy other than correcting the table.
 
 
 class NumberChecks:
@@ -61,12 +59,10 @@ class NumberChecks:
         self._problems: list[tuple[int, TableProblem]] = []
         self._wrong: set[int] = set()
 
-    def report(
-        self, row: int, column: str, words: str, step: str = "", norm: float | None = None
-    ) -> None:
+    def report(self, row: int, column: str, words: str, step: str = "") -> None:
         """Adds a problem of a row, by its index, and of a column; empty for the whole row."""
         place = self.place(row) + (f", column {column}" if column else "")
-        self._problems.append((row, TableProblem(place, words, norm, step)))
+        self._problems.append((row, TableProblem(place, words, step)))
         self._wrong.add(row)
 
     def is_sound(self, row: int) -> bool:
@@ -113,12 +109,13 @@ class NumberChecks:
         # hypot does not overflow.
         norms = np.hypot.reduce([self.values[name] for name in names])
         for row in np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist():
-            norm = float(norms[row])
+            other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
             self.report(
                 row,
                 f"{names[0]} ... {names[-1]}",
-                f"the quaternion's norm is {norm:.6g}, but must be 1 to within {_NORM_TOLERANCE:g}",
-                norm=norm,
+                f"the quaternion's norm is {norms[row]:.6g}, but must be 1 to within "
+                f"{_NORM_TOLERANCE:g}",
+                other if norms.max(initial=0.0, where=np.isfinite(norms)) > _FAR_FROM_UNIT else "",
             )
 
     def check(self, next_step: str = "") -> None:
@@ -135,7 +132,7 @@ class TableReader(NumberChecks):
     """Reader of a table's columns.
 
     Rows with another number of cells than the header are problems, and are left out: row indices
-    and arrays are of the `count` others. `unread` has the cells that could not be converted.
+    and arrays are of the `count` others.
     """
 
     def __init__(self, table: TextTable) -> None:
@@ -144,7 +141,6 @@ class TableReader(NumberChecks):
         super().__init__(len(self._rows), lambda row: table.place(self._rows[row]), {})
         cells = list(zip(*(table.rows[at] for at in self._rows), strict=True)) or [()] * width
         self.cells: Mapping[str, tuple[str, ...]] = dict(zip(table.columns, cells, strict=True))
-        self.unread: set[str] = set()
         following = 0
         for at, row in enumerate(table.rows):
             following += len(row) == width
@@ -160,7 +156,7 @@ class TableReader(NumberChecks):
                         "and decimal commas are read, too."
                     )
                 # Before the problems of the next row that is read.
-                problem = TableProblem(table.place(at), words, step=step)
+                problem = TableProblem(table.place(at), words, step)
                 self._problems.append((following, problem))
 
     def texts(self, name: str) -> list[str]:
@@ -180,7 +176,6 @@ class TableReader(NumberChecks):
                 value = convert(cell) if cell else None
             except DataError as error:
                 self.report(row, name, error.message.rstrip("."), error.next_step)
-                self.unread.add(cell)
             if not cell and needed:
                 self.report(row, name, f"it is empty; {needed} is needed")
             values.append(value)
@@ -230,34 +225,22 @@ def as_whole(cell: str) -> int:
 
 
 def problems_error(problems: Sequence[TableProblem], next_step: str = "") -> DataError:
-    """Error that lists ten problems of a table, or more by their columns."""
-    norms = [problem.norm for problem in problems if problem.norm is not None]
-    if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
-        return DataError(
-            f"{problems[0].place} and {len(norms) - 1} more: these are no quaternions but, as it "
-            "seems, rotation vectors or Euler angles: their norms are "
-            f"{min(norms):.3g} to {max(norms):.3g}, and 1 is needed.",
-            culprits=[problems[0].place],
-            next_step=f"The images show which. {READ_AGAIN}",
-        )
-    by_column: dict[str, list[TableProblem]] = defaultdict(list)
-    for problem in problems:
-        by_column[problem.place.partition(", column ")[2]].append(problem)
-    where = problems[0].place.partition(", column ")[0]
-    step = f"Correct it, or delete {where}."
-    if len(problems) > 1:
-        name = next(iter(by_column)) if len(by_column) == 1 else ""
-        step = f"Correct column {name} of {where.partition(',')[0]}." if name else ""
+    """Error that lists the problems of a table, of many the first of each column."""
     steps = {problem.step for problem in problems}
-    if len(steps) == 1:
-        step = steps.pop() or next_step or step
-    groups = [[problem] for problem in problems]
-    if len(problems) > _SHOWN_PROBLEMS:
-        groups = list(by_column.values())[:_SHOWN_PROBLEMS]
+    each = len(problems) <= _SHOWN_PROBLEMS and steps == {""}
+    groups: dict[str, list[TableProblem]] = defaultdict(list)
+    for problem in problems:
+        groups[problem.place if each else problem.place.partition(", column ")[2]].append(problem)
+    shown = list(groups.values())[:_SHOWN_PROBLEMS]
+    where = problems[0].place.partition(", column ")[0]
+    step = "" if len(problems) > 1 else f"Correct it, or delete {where}."
     lines = [
         f"{alike[0].place}: {alike[0].words}."
         + (f" And {len(alike) - 1} more, up to {alike[-1].place}." if len(alike) > 1 else "")
-        for alike in groups
+        for alike in shown
     ]
-    culprits = [alike[0].place for alike in groups]
-    return DataError("\n".join(lines), culprits=culprits, next_step=step)
+    return DataError(
+        "\n".join(lines),
+        culprits=[alike[0].place for alike in shown],
+        next_step=(steps.pop() if len(steps) == 1 else "") or next_step or step,
+    )

@@ -7,7 +7,7 @@ manufacturers), qx to qw. Bare numbers are classified by their count alone.
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,8 +63,8 @@ class _PendantNumbers:
 
     numbers: tuple[float, ...]
     forms: tuple[str, ...]
-    length: str | None = None
-    angle: str | None = None
+    length: str = ""
+    angle: str = ""
 
 
 def is_marked_pose(line: str) -> bool:
@@ -99,32 +99,25 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
             "C ..}, [[x, y, z], [q1, q2, q3, q4]], X .. Y .. Z .. W .. P .. R .., or x_m y_m z_m "
             "qx qy qz qw.",
         )
-    name = _form(written, form, where)
-    chosen = POSE_FORMS[name]
-    length = written.length if written.length in UNITS_M else chosen.unit
+    chosen = POSE_FORMS[_form(written, form, where)]
     rotation = chosen.rotation
     if written.angle == "deg" and rotation == "rotation-vector":
         rotation = "rotation-vector-deg"
-    if written.angle == "rad" and rotation.endswith("-deg"):
-        rotation = f"{rotation.removesuffix('-deg')}-rad"
-    reading = Reading(rotation, length or "m")
-    values = np.array([written.numbers])
-    poses = PoseNumbers(values[:, :3], values[:, 3:], reading, (where,)).poses()
-    numbers = values[0]
-    distance_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
-    if distance_m > _FAR_M:
+    if written.angle == "rad":
+        rotation = rotation.replace("-deg", "-rad")
+    reading = Reading(rotation, written.length or chosen.unit)
+    numbers = np.array(written.numbers)
+    poses = PoseNumbers(numbers[None, :3], numbers[None, 3:], reading, (where,)).poses()
+    distance_m, angle = UNITS_M[reading.unit] * np.abs(numbers[:3]).max(), np.abs(numbers[3:]).max()
+    is_radian = rotation == "rotation-vector" or rotation.endswith("-rad")
+    if distance_m > _FAR_M or (is_radian and angle > _TURNED_RAD):
+        what = f"it is {distance_m:.4g} m from the base"
+        what = what if distance_m > _FAR_M else f"an angle of {angle:.4g} is too large for radians"
         raise DataError(
-            f"{where}: read in {reading.unit}, it is {distance_m:.4g} m from the base.",
+            f"{where}: read in {reading.words}, {what}.",
             culprits=[where],
-            next_step="Write the unit behind the numbers, as X 400 mm, or name another form.",
-        )
-    is_radian = reading.rotation == "rotation-vector" or reading.rotation.endswith("-rad")
-    angle = float(np.abs(numbers[3:]).max())
-    if is_radian and angle > _TURNED_RAD:
-        raise DataError(
-            f"{where}: an angle of {angle:.4g} is too large for radians.",
-            culprits=[where],
-            next_step="Write the unit behind the numbers, as RX 12.5 deg, or name another form.",
+            next_step="Write the units behind the numbers, as X 400 mm or RX 12.5 deg, or name "
+            "another form.",
         )
     return PendantPose(poses[0], chosen, reading)
 
@@ -143,58 +136,55 @@ def _marked(line: str) -> _PendantNumbers | None:
         matches = pattern.findall(line)
         # Two poses in a line are ambiguous.
         if len(matches) == 1:
-            words = re.split(r"[\s,\[\]]+", matches[0].strip())
-            if all(re.fullmatch(_NUMBER, word) for word in words):
-                return _PendantNumbers(tuple(map(float, words)), (form,))
+            return _numbers(matches[0].strip(), (form,))
     return None
+
+
+def _numbers(text: str, forms: tuple[str, ...]) -> _PendantNumbers | None:
+    words = [part for part in _BETWEEN.split(text) if part]
+    if not all(re.fullmatch(_NUMBER, word) for word in words):
+        return None
+    return _PendantNumbers(tuple(map(float, words)), forms)
 
 
 def _named(line: str) -> _PendantNumbers | None:
     entries = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
-    values = {name: float(number) for name, number, _ in entries}
-    units = {name: unit for name, _, unit in entries if unit}
+    there = [name for name, _, _ in entries]
     for names, forms in _NAMED_ROTATIONS.items():
-        needed = {"x", "y", "z", *names}
-        if needed <= values.keys():
-            if sum(name in needed for name, _, _ in entries) > len(needed):
-                return None  # two poses in a line
-            numbers = tuple(values[name] for name in ("x", "y", "z", *names))
-            lengths = {units[name] for name in "xyz" if name in units}
-            angles = {units[name] for name in names if name in units}
-            # One unit for each, and of the right kind.
-            if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
-                return None
-            # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
-            likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
-            return _PendantNumbers(
-                numbers, likely, next(iter(lengths), None), next(iter(angles), None)
-            )
+        needed = ("x", "y", "z", *names)
+        # Two poses in a line are ambiguous.
+        if any(there.count(name) != 1 for name in needed):
+            continue
+        cells = {name: (float(number), unit) for name, number, unit in entries}
+        lengths = {cells[name][1] for name in "xyz"} - {None}
+        angles = {cells[name][1] for name in names} - {None}
+        # One unit for each, and of the right kind.
+        if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
+            return None
+        # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
+        likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
+        units = ("".join(map(str, units)) for units in (lengths, angles))
+        return _PendantNumbers(tuple(cells[name][0] for name in needed), likely, *units)
     return None
 
 
 def _bare(line: str) -> _PendantNumbers | None:
-    words = [part for part in _BETWEEN.split(line) if part]
-    if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, word) for word in words):
-        return None
-    return _PendantNumbers(tuple(map(float, words)), _BARE_FORMS[len(words)])
+    found = _numbers(line, ())
+    forms = _BARE_FORMS.get(0 if found is None else len(found.numbers))
+    return None if found is None or forms is None else replace(found, forms=forms)
 
 
 def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
     if stated is None and len(written.forms) == 1:
         return written.forms[0]
-    makers = ", ".join(written.forms)
-    if stated is None:
-        raise DataError(
-            f"{where}: these numbers may be a pose of {makers}.",
-            culprits=[where],
-            next_step="Say which of them it is.",
-        )
     # Bare numbers may be of any form that the user states.
     is_bare = written.forms in _BARE_FORMS.values()
-    if stated not in POSE_FORMS or not (is_bare or stated in written.forms):
-        raise DataError(
-            f"{where}: it is written as a pose of {makers}, not of {stated!r}.",
-            culprits=[where],
-            next_step=f"The forms are {', '.join(POSE_FORMS)}.",
-        )
-    return stated
+    if stated in POSE_FORMS and (is_bare or stated in written.forms):
+        return stated
+    makers = ", ".join(written.forms)
+    said = "" if stated is None else f", not of {stated!r}"
+    raise DataError(
+        f"{where}: it is written as a pose of {makers}{said}; one form is needed.",
+        culprits=[where],
+        next_step=f"Say which of them it is; the forms are {', '.join(POSE_FORMS)}.",
+    )
