@@ -204,14 +204,14 @@ def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
 @pytest.mark.parametrize("kind", ["temperatures", "currents"])
 def test_links_follow_the_differential_equation(kind):
     heating, heat = Heating(kind, np.full(6, 900.0), np.full(6, 2.0)), inputs(kind)
-    rest = heating.rest(heat.signal, heat.ambient_c)
+    rest = heat.signal if kind == "temperatures" else heat.ambient_c[:, None] + 2.0 * heat.signal
     held = 0.5 * (rest[:-1] + rest[1:])
 
     def slope(t, s):
         at = min(int(t // 40.0), len(held) - 1)
         return (held[at] - s) / 900.0
 
-    start = heating.cold(heat.signal, heat.ambient_c)
+    start = heating.links_c(heat, heat.stamps_s[:1])[0]
     end_s = heat.stamps_s[-1]
     exact = solve_ivp(slope, (0.0, end_s), start, max_step=10.0, rtol=1e-8).y[:, -1]
     # The integration steps across the jumps of the input; its own error is about a millikelvin.

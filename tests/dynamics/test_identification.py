@@ -108,7 +108,7 @@ def test_encoders_may_be_eccentric():
         still = np.zeros_like(q)
         momentum = joint_torques(robot, robot.inertias, q, still, dq)
         momentum -= joint_torques(robot, robot.inertias, q, still, still)
-        frames = robot.link_frames(q[0])[:-1]
+        frames = robot.link_frames(q)[0, :-1]
         masses = robot.masses
         centres = np.einsum("nij,nj->ni", frames[:, :3, :3], masses.centres_m) + frames[:, :3, 3]
         return 0.5 * speeds[0] @ momentum[0] - masses.kg @ centres @ robot.gravity

@@ -575,8 +575,7 @@ def test_links_base_and_flange_move_the_flange_as_their_bases_say():
     q = np.random.default_rng(0).uniform(-1.5, 1.5, (3, 6))
     of_links, of_poses = link_basis(robot, q), pose_basis(robot.base_from_flange(q))
     twists = step * np.diag(np.repeat([1.0, LEVER_M], 3))
-    for row, angles in enumerate(q):
-        links = robot.link_frames(angles)
+    for row, links in enumerate(robot.link_frames(q)):
         for at, twist in enumerate(twists):
             frames = [*links[:6], np.eye(4), links[-1]]
             moved = [link @ exp(twist) @ invert(link) @ links[-1] for link in frames]

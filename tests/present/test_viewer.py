@@ -194,7 +194,7 @@ def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
     calibration = with_arm(sample, calibrated())
     write_recording(path, sample.session, calibration, sample.evidence, None)
     q = sample.session.views[4].joints_rad
-    ours = calibration.calibrated_robot.link_frames(q)[:, :3, 3]
+    ours = calibration.calibrated_robot.link_frames(q[None])[0, :, :3, 3]
     drawn = column(path, f"{paths.ROBOT}/links", "Capsules3D:translations")[4]
     np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
 

@@ -108,8 +108,8 @@ def test_offsets_and_flange_row_enter_in_both_conventions(convention):
     expected = [dh_product(document, row) for row in q]
     # Entries are of the order of 10 m here.
     np.testing.assert_allclose(robot.base_from_flange(q), expected, atol=1e-12)
-    np.testing.assert_allclose(robot.link_frames(q[0])[-1], expected[0], atol=1e-12)
-    assert robot.link_frames(q[0]).shape == (6, 4, 4)
+    np.testing.assert_allclose(robot.link_frames(q)[:, -1], expected, atol=1e-12)
+    assert robot.link_frames(q).shape == (4, 6, 4, 4)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ class RobotState:
         """(n, 4, 4) link frames in the base; None if the model or the joint angles are unknown."""
         if robot is None or self.q is None or len(self.q) != robot.joint_count:
             return None
-        return robot.link_frames(self.q)
+        return np.asarray(robot.link_frames(self.q[None])[0])
 
 
 def states_of(robot: Robot, q: FloatArray) -> dict[int, RobotState]:

@@ -1,25 +1,20 @@
 """Inverse kinematics.
 
 Poses are solved one at a time: Pinocchio evaluates a posture in a microsecond, less than numpy's
-overhead, and the posture of the target before is the best start. Only many poses with a near
-posture each are solved in a batch.
+overhead, and the posture of the target before is the best start.
 
 Joint positions are effective ones here (`Chain.effective`, `Chain.encoded`): in these a turn is
 exactly two pi, whatever the gear ratio.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.lapack import dposv
-from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.robot.chain import Chain
 from visioncal.robot.model import Robot
 
 if TYPE_CHECKING:
@@ -39,8 +34,6 @@ _ROTATION_WEIGHT = 1e-4
 # sixteen solutions, and half of the starts find one.
 _STARTS = 40
 _STEPS = 80
-# Newton steps of a batch: of poses in reach half converge, most of them within twenty.
-_BATCH_STEPS = 40
 # Relative gain in the sum of squares at which a search ends, and the final search from the nearest
 # posture.
 _SEARCH, _POLISH = 1e-3, 1e-9
@@ -110,7 +103,6 @@ class Inverse:
     def __init__(self, robot: Robot) -> None:
         """Prepares the search for an arm."""
         chain = robot.chain
-        self._chain, self._names = chain, chain.joint_names
         self._model = robot.pinocchio_model
         self._data: pin.Data = self._model.createData()
         self._frame: int = self._model.getFrameId(robot.tip)
@@ -136,69 +128,64 @@ class Inverse:
         import pinocchio as pin
 
         goal, bounds = pin.SE3(base_from_flange), self._bounds
-        first = self._descend(goal, wanted, bounds, wanted)
+        first = self._descend(goal, wanted, wanted)
         turns = np.abs(first.positions - wanted)[bounds.turning]
         if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
-        candidates = [first, *self._from_random_starts(goal, bounds, wanted)]
+        # The same random postures every time.
+        centre, half = bounds.middle_and_half(wanted)
+        shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_STARTS, len(wanted)))
+        starts = centre + shares * half
+        candidates = [first, *(self._descend(goal, start, wanted) for start in starts)]
         reached = [posture for posture in candidates if posture.reached]
         if reached:
             return min(reached, key=lambda value: bounds.apart(value.positions - wanted))
         nearest = min(candidates, key=lambda value: value.off_m**2 + value.off_rad**2)
-        return self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
+        return self._descend(goal, nearest.positions, wanted, settle=_POLISH)
 
     def from_starts(
         self, base_from_flange: FloatArray, starts: FloatArray
     ) -> tuple[FloatArray, Mask]:
-        """Solves many poses (m, 4, 4) [m] from given starts, for six joints or more; some may fail.
+        """Solves many poses (m, 4, 4) [m], each from one given start; some may fail.
 
         Returns:
             (m, n) effective positions, by whole turns nearest to zero, and (m,) whether reached.
         """
-        bounds = self._bounds
-        positions, reached = reached_from(
-            self._chain, base_from_flange, starts, (bounds.lower, bounds.upper), _REACHED
-        )
-        return bounds.nearest(positions, np.zeros(len(self._names))), reached
+        import pinocchio as pin
+
+        zero = np.zeros(starts.shape[1])
+        pairs = zip(base_from_flange, starts, strict=True)
+        found = [self._descend(pin.SE3(pose), start, zero) for pose, start in pairs]
+        positions = np.array([posture.positions for posture in found]).reshape(starts.shape)
+        return positions, np.array([posture.reached for posture in found], dtype=bool)
 
     def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws (count, n) effective positions over the joints' ranges [rad or m]."""
-        centre, half = self._bounds.middle_and_half(np.zeros(len(self._names)))
+        centre, half = self._bounds.middle_and_half(np.zeros(self._model.nq))
         return np.asarray(centre + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
-
-    def _from_random_starts(
-        self, goal: "pin.SE3", bounds: _Bounds, wanted: FloatArray
-    ) -> Iterator[Posture]:
-        """Results of searches from random postures, the same ones every time."""
-        rng = np.random.default_rng(0)
-        centre, half = self._bounds.middle_and_half(wanted)
-        for share in rng.uniform(-1.0, 1.0, (_STARTS, len(wanted))):
-            start = centre + share * half
-            yield self._descend(goal, start, bounds, wanted)
 
     def _descend(
         self,
         goal: "pin.SE3",
         start: FloatArray,
-        bounds: _Bounds,
         wanted: FloatArray,
         *,
         settle: float = _SEARCH,
     ) -> Posture:
         """Searches from a start; the result is turned by whole turns towards `wanted`."""
-        underactuated = len(start) < 6
+        bounds, underactuated = self._bounds, len(start) < 6
         begin = np.minimum(np.maximum(start, bounds.lower), bounds.upper)
-        positions, error = self._downhill(goal, begin, bounds, 1.0, settle)
+        positions, error = self._downhill(goal, begin, 1.0, settle)
         if underactuated:
             settle = _POLISH * _ROTATION_WEIGHT**2
-            positions, error = self._downhill(goal, positions, bounds, _ROTATION_WEIGHT, settle)
+            positions, error = self._downhill(goal, positions, _ROTATION_WEIGHT, settle)
             error[3:] /= _ROTATION_WEIGHT
         off_m, off_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
         reached = off_m < _REACHED and off_rad < (_TURN_LEFT_RAD if underactuated else _REACHED)
         return Posture(bounds.nearest(positions, wanted), off_m, off_rad, reached)
 
     def _downhill(
-        self, goal: "pin.SE3", positions: FloatArray, bounds: _Bounds, weight: float, settle: float
+        self, goal: "pin.SE3", positions: FloatArray, weight: float, settle: float
     ) -> tuple[FloatArray, FloatArray]:
         """Levenberg-Marquardt iteration: positions, and the error there."""
         damping = 1.0
@@ -209,7 +196,7 @@ class Inverse:
                 break
             jacobian = self._jacobian(rotation, weight)
             while damping <= _MOST_DAMPING:
-                moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
+                moved = _moved(positions, error, jacobian, damping * size + _FLOOR, self._bounds)
                 next_error, rotation = self._error(goal, moved, weight)
                 next_size = float(next_error @ next_error)
                 if next_size < size:
@@ -275,84 +262,3 @@ def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray
     gram.flat[:: len(gram) + 1] += damping
     solved = dposv(gram, error if long else error @ jacobian)[1]
     return np.asarray(solved @ jacobian if long else solved)
-
-
-def chain_frames(chain: Chain, positions: FloatArray) -> FloatArray:
-    """Frames of the joints, after their motion, and of the tip, in the base.
-
-    Returns:
-        (m, n + 1, 4, 4) at (m, n) effective positions [m].
-    """
-    frames = np.zeros((len(positions), len(chain) + 1, 4, 4))
-    frames[..., 3, 3] = 1.0
-    rotation = np.broadcast_to(np.eye(3), (len(positions), 3, 3))
-    position = np.zeros((len(positions), 3))
-    for joint, placement in enumerate(chain.placements):
-        position = position + rotation @ placement[:3, 3]
-        rotation = rotation @ placement[:3, :3]
-        if joint < len(chain):
-            motion = positions[:, joint, None]
-            if chain.prismatic[joint]:
-                position = position + motion * (rotation @ chain.axes[joint])
-            else:
-                # Rodrigues' formula.
-                crossed = rotation @ skew(chain.axes[joint])
-                crossed_twice = crossed @ skew(chain.axes[joint])
-                motion = motion[:, :, None]
-                rotation = (
-                    rotation + np.sin(motion) * crossed + (1.0 - np.cos(motion)) * crossed_twice
-                )
-        frames[:, joint, :3, :3], frames[:, joint, :3, 3] = rotation, position
-    return frames
-
-
-def reached_from(
-    chain: Chain,
-    base_from_tip: FloatArray,
-    starts: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-    good: float,
-) -> tuple[FloatArray, Mask]:
-    """Inverse kinematics by damped Newton steps from given postures.
-
-    The damping vanishes with the error (Sugihara 2011); an arm with more than six joints takes the
-    shortest step. Postures that do not converge in a few steps are given up.
-
-    Args:
-        chain: The arm, with six joints or more.
-        base_from_tip: (m, 4, 4) the poses [m].
-        starts: (m, n) effective positions to start from [rad or m].
-        bounds: (n,) least and greatest effective positions.
-        good: Greatest error of a reached pose [m and rad].
-
-    Returns:
-        (m, n) positions, and whether the pose was reached there (m,).
-    """
-    positions = np.clip(starts, *bounds)
-    active = np.arange(len(positions))
-    for step in range(_BATCH_STEPS + 1):
-        frames = chain_frames(chain, positions[active])
-        tip, wanted = frames[:, -1], base_from_tip[active]
-        turn = wanted[:, :3, :3] @ np.swapaxes(tip[:, :3, :3], 1, 2)
-        offset = wanted[:, :3, 3] - tip[:, :3, 3]
-        # (m, 6) rotation [rad] and translation [m], along the base's axes.
-        error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), offset], axis=1)
-        unreached = np.linalg.norm(error.reshape(-1, 2, 3), axis=2).max(axis=1) >= good
-        active, frames, error = active[unreached], frames[unreached], error[unreached]
-        if step == _BATCH_STEPS or not len(active):
-            break
-        joints = frames[:, :-1]
-        axes = (joints[..., :3, :3] @ chain.axes[:, :, None])[..., 0]
-        arms = np.cross(axes, frames[:, -1, None, :3, 3] - joints[..., :3, 3])
-        slides = chain.prismatic[:, None]
-        moves = [np.where(slides, 0.0, axes), np.where(slides, axes, arms)]
-        jacobian = np.swapaxes(np.concatenate(moves, axis=2), 1, 2)
-        gram = jacobian @ np.swapaxes(jacobian, 1, 2)
-        damping = np.sum(error**2, axis=1) + _FLOOR
-        gram += damping[:, None, None] * np.eye(6)
-        solved = np.linalg.solve(gram, error[:, :, None])
-        moved = positions[active] + (np.swapaxes(jacobian, 1, 2) @ solved)[:, :, 0]
-        positions[active] = np.clip(moved, *bounds)
-    reached = np.ones(len(positions), dtype=bool)
-    reached[active] = False
-    return positions, reached

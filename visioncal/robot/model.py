@@ -151,13 +151,16 @@ class Robot:
         return poses
 
     def link_frames(self, q: FloatArray) -> FloatArray:
-        """Frames (n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
+        """Frames (m, n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
         import pinocchio as pin
 
-        data = self._model.createData()
-        pin.forwardKinematics(self._model, data, self._effective(np.asarray(q)[None])[0])
-        joints = [joint.homogeneous for joint in data.oMi[1:]]
-        return np.array([*joints, joints[-1] @ self.chain.placements[-1]])
+        positions, data = self._effective(q), self._model.createData()
+        frames = np.empty((len(positions), self.joint_count + 1, 4, 4))
+        for row, configuration in enumerate(positions):
+            pin.forwardKinematics(self._model, data, configuration)
+            frames[row, :-1] = [joint.homogeneous for joint in data.oMi[1:]]
+        frames[:, -1] = frames[:, -2] @ self.chain.placements[-1]
+        return frames
 
     def placement_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian of the flange over the placements of the links.

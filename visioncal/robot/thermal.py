@@ -30,6 +30,15 @@ class Inputs:
     # (t,) air temperature [deg C]; zero where not recorded: others are then relative.
     ambient_c: FloatArray
 
+    def before(self, later: "Inputs") -> "Inputs":
+        """These samples, and later ones after them."""
+        parts = zip(
+            (self.stamps_s, self.signal, self.ambient_c),
+            (later.stamps_s, later.signal, later.ambient_c),
+            strict=True,
+        )
+        return Inputs(self.kind, *(np.concatenate(pair) for pair in parts))
+
 
 @dataclass(frozen=True, eq=False)
 class Heating:
@@ -53,47 +62,9 @@ class Heating:
             gain = gain * np.exp(steps[count:])
         return replace(self, tau_s=self.tau_s * np.exp(steps[:count]), gain_k_per_a2=gain)
 
-    def rest(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
-        """Steady-state temperatures (t, n) of the links [deg C]."""
-        if self.kind == "temperatures":
-            return signal
-        return np.asarray(ambient_c[:, None] + self.gain_k_per_a2 * signal)
-
-    def cold(self, signal: FloatArray, ambient_c: FloatArray) -> FloatArray:
-        """(n,) link temperatures at the first sample, in equilibrium [deg C]."""
-        return signal[0] if self.kind == "temperatures" else np.full_like(signal[0], ambient_c[0])
-
-    def after(
-        self,
-        before: FloatArray,
-        jacobian: FloatArray,
-        rest: FloatArray,
-        driven: FloatArray,
-        seconds: float,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Link temperatures after a time at constant steady state, and their derivatives.
-
-        Args:
-            before: (n,) temperatures before it [deg C].
-            jacobian: (n, s) their derivatives over the parameters, in the order of `jacobian`.
-            rest: (n,) steady state [deg C].
-            driven: (n,) its part by motor currents [K].
-            seconds: Duration [s].
-
-        Returns:
-            (n,) temperatures [deg C], and (n, s) derivatives.
-        """
-        share = seconds / self.tau_s
-        kept = np.exp(-share)
-        after = kept[:, None] * jacobian
-        after[:, 0] += kept * share * (before - rest)
-        if self.kind == "currents":
-            after[:, 1] += (1.0 - kept) * driven
-        return rest + kept * (before - rest), after
-
     def links_c(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """Link temperatures (m, n) at (m,) times [deg C]."""
-        return self._at(inputs, at_s, self._course(inputs)[0])
+        return _interpolated(inputs, at_s, self.course(inputs)[:, :, 0])
 
     def jacobian(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """Derivatives of the link temperatures over the parameters.
@@ -102,27 +73,35 @@ class Heating:
             (m, n, s) over the parameters of the link's own joint: the logarithms of tau and, for
             currents, of the gain.
         """
-        states, rests, kept = self._course(inputs)
+        parts = np.moveaxis(self.course(inputs)[:, :, 1:], 2, 0)
+        return np.stack([_interpolated(inputs, at_s, part) for part in parts], axis=2)
+
+    def course(self, inputs: Inputs, start: FloatArray | None = None) -> FloatArray:
+        """Link temperatures at the samples and their derivatives, (t, n, 1 + s); see `jacobian`.
+
+        `start` (n, 1 + s) are those at the first sample; in equilibrium where None.
+        """
+        has_gains, air_c = self.kind == "currents", inputs.ambient_c[:, None]
+        # Steady-state temperatures (t, n) of the links, and their part by motor currents.
+        driven = self.gain_k_per_a2 * inputs.signal if has_gains else np.zeros_like(inputs.signal)
+        rest = air_c + driven if has_gains else inputs.signal
+        if start is None:
+            start = np.zeros((rest.shape[1], 3 if has_gains else 2))
+            start[:, 0] = air_c[0] if has_gains else inputs.signal[0]
         shares = np.diff(inputs.stamps_s)[:, None] / self.tau_s
-        by_tau = _scanned(np.zeros_like(states[:1]), kept, kept * shares * (states[:-1] - rests))
-        parts = [by_tau]
-        if self.kind == "currents":
-            # The states are linear in the steady state, of which the air's part does not depend on
-            # gains.
-            without_air = replace(inputs, ambient_c=np.zeros_like(inputs.ambient_c))
-            parts.append(self._course(without_air)[0])
-        return np.stack([self._at(inputs, at_s, part) for part in parts], axis=2)
+        kept = np.exp(-shares)
+        rests, drives = (0.5 * (values[:-1] + values[1:]) for values in (rest, driven))
+        first, *by_parameter = start.T[:, None]
+        states = _scanned(first, kept, (1.0 - kept) * rests)
+        columns = [states, _scanned(by_parameter[0], kept, kept * shares * (states[:-1] - rests))]
+        if has_gains:
+            columns.append(_scanned(by_parameter[1], kept, (1.0 - kept) * drives))
+        return np.stack(columns, axis=2)
 
-    def _course(self, inputs: Inputs) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """States (t, n) at the samples; steady states and decay factors (t - 1, n) between them."""
-        rest = self.rest(inputs.signal, inputs.ambient_c)
-        rests = 0.5 * (rest[:-1] + rest[1:])
-        kept = np.exp(-np.diff(inputs.stamps_s)[:, None] / self.tau_s)
-        first = self.cold(inputs.signal, inputs.ambient_c)[None]
-        return _scanned(first, kept, (1.0 - kept) * rests), rests, kept
 
-    def _at(self, inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
-        return np.stack([np.interp(at_s, inputs.stamps_s, column) for column in states.T], axis=1)
+def _interpolated(inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
+    """(m, n) states of (t, n) samples at (m,) times."""
+    return np.stack([np.interp(at_s, inputs.stamps_s, column) for column in states.T], axis=1)
 
 
 def _scanned(first: FloatArray, kept: FloatArray, added: FloatArray) -> FloatArray:
@@ -260,13 +239,9 @@ class OnlineCompensator:
     def __init__(self, model: ThermalModel) -> None:
         """Prepares a compensator without samples."""
         self._model = model
-        self._stamp_s: float | None = None
-        self._links: FloatArray | None = None
-        none = np.zeros(model.joint_count)
-        # Steady state (n,) [deg C] at the last sample, its part by motor currents [K], and the
-        # derivatives (n, s) of the links' temperatures over the heating's parameters.
-        self._rest, self._driven = none, none
-        self._jacobian = np.zeros((len(none), model.heating.size // len(none)))
+        # The last sample, and (n, 1 + s) temperatures of the links with their derivatives there.
+        self._last: Inputs | None = None
+        self._state: FloatArray | None = None
 
     def feed(
         self,
@@ -295,27 +270,16 @@ class OnlineCompensator:
                 f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
                 f"sample, not {signal.tolist()}."
             )
-        if self._stamp_s is not None and stamp_s <= self._stamp_s:
+        if self._last is not None and stamp_s <= self._last.stamps_s[0]:
             raise DataError(
                 f"thermal: a sample at {stamp_s:g} s does not come after the one before, at "
-                f"{self._stamp_s:g} s."
+                f"{self._last.stamps_s[0]:g} s."
             )
         signal = signal if heating.kind == "temperatures" else signal**2
         air = float(self._model.reference_c.mean()) if ambient_c is None else ambient_c
-        ambient = np.array([air])
-        rest = heating.rest(signal[None], ambient)[0]
-        driven = rest - air if heating.kind == "currents" else np.zeros(count)
-        links = heating.cold(signal[None], ambient)
-        if self._links is not None and self._stamp_s is not None:
-            links, self._jacobian = heating.after(
-                self._links,
-                self._jacobian,
-                0.5 * (rest + self._rest),
-                0.5 * (driven + self._driven),
-                stamp_s - self._stamp_s,
-            )
-        self._rest, self._driven = rest, driven
-        self._stamp_s, self._links = stamp_s, links
+        inputs = Inputs(heating.kind, np.array([stamp_s]), signal[None], np.array([air]))
+        samples = inputs if self._last is None else self._last.before(inputs)
+        self._last, self._state = inputs, heating.course(samples, self._state)[-1]
 
     @property
     def links_c(self) -> FloatArray:
@@ -324,9 +288,13 @@ class OnlineCompensator:
         Raises:
             DataError: There is no sample yet.
         """
-        if self._links is None:
+        return self._now[:, 0]
+
+    @property
+    def _now(self) -> FloatArray:
+        if self._state is None:
             raise DataError("thermal: the compensator was fed with no sample yet.")
-        return self._links
+        return self._state
 
     @property
     def robot(self) -> Robot:
@@ -343,5 +311,5 @@ class OnlineCompensator:
         Raises:
             DataError: There is no sample yet.
         """
-        jacobian = np.broadcast_to(self._jacobian, (len(q), *self._jacobian.shape))
+        jacobian = np.broadcast_to(self._now[:, 1:], (len(q), *self._now[:, 1:].shape))
         return self._model.sigma_m(q, self.links_c, jacobian)

@@ -204,7 +204,7 @@ class ThermalFit:
         model = ThermalModel(
             robot,
             heating,
-            heating.cold(inputs.signal, inputs.ambient_c),
+            heating.links_c(inputs, inputs.stamps_s[:1])[0],
             np.full(count, _GROWTH_PER_K),
             np.zeros(count),
             np.zeros((0, 0)),

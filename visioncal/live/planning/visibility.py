@@ -10,7 +10,6 @@ from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.robot.collision import arm_bodies
-from visioncal.robot.inverse import chain_frames
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m
 
@@ -237,8 +236,7 @@ class Occlusion:
 
     def behind_arm(self, q: FloatArray) -> Mask:
         """Whether the arm hides part of the print (k,) at joints (k, n) [rad]."""
-        chain = self.cell.robot.chain
-        frames = chain_frames(chain, chain.effective(q))
+        frames = self.cell.robot.link_frames(q)
         starts, ends = self._sight_lines(frames[:, -1])
         hidden = np.zeros(len(q), dtype=bool)
         for part in self.parts:
