@@ -22,8 +22,6 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import JointMotion, sign
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import covariance_from, damped_step, gram
 
 # Rows of a QR decomposition at a time, so that they stay in the processor's cache.
 _CHUNK = 2000
@@ -35,7 +33,7 @@ _LOST, _FOLLOWED = 3.0, 0.1
 _LEAST_POWER = 0.02
 # Start values and bounds of the Stribeck speed [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
-_HUMP_SETTLED, _NOISE_SETTLED, _HUMP_ROUNDS = 1e-6, 1e-2, 8
+_HUMP_SETTLED, _HUMP_ROUNDS = 1e-3, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,12 +306,21 @@ def fit_stribeck(
         logarithms of speeds, whose values are the remaining steps.
     """
     joints = np.arange(blocks[0].y.shape[1])
-    problem = _Weighted.of(streams, blocks, plain.sigmas)
     while len(joints):
         ones = np.ones(len(joints))
         starts = [Stribeck(joints, ones, start * ones, slow_rad_s) for start in _STARTS]
-        candidates = [_optimised(problem, start) for start in starts]
-        humps, fit = _refined(streams, blocks, min(candidates, key=lambda value: value.cost).humps)
+        humps = min(starts, key=lambda start: _cost(regress(_with_humps(streams, blocks, start))))
+        # Gauss-Newton steps of the logarithms of the speeds.
+        for _ in range(_HUMP_ROUNDS):
+            fit = regress(_with_humps(streams, blocks, replace(humps, hump_nm=ones)))
+            hump_nm, slopes = np.split(fit.values[-2 * len(joints) :], 2)
+            steps = np.clip(slopes / hump_nm, -1.0, 1.0)
+            speeds = np.clip(humps.speed_rad_s * np.exp(steps), _SLOWEST, _FASTEST)
+            humps = replace(humps, hump_nm=hump_nm, speed_rad_s=speeds)
+            if np.abs(steps).max() < _HUMP_SETTLED:
+                break
+        fit = regress(_with_humps(streams, blocks, humps))
+        humps = replace(humps, hump_nm=fit.values[-2 * len(joints) : -len(joints)])
         significant = _significant(humps, fit, fit.values[coulomb_indices[joints]])
         if significant.all():
             return humps, fit
@@ -321,18 +328,10 @@ def fit_stribeck(
     return Stribeck.none(), plain
 
 
-def _refined(
-    streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], humps: Stribeck
-) -> tuple[Stribeck, Regression]:
-    """Repeats the fit with the noise re-estimated with humps, until the noise converges."""
-    fit = regress(_with_humps(streams, blocks, humps))
-    for _ in range(_HUMP_ROUNDS):
-        humps = _optimised(_Weighted.of(streams, blocks, fit.sigmas), humps).humps
-        before, fit = fit, regress(_with_humps(streams, blocks, humps))
-        pairs = zip(before.sigmas, fit.sigmas, strict=True)
-        if all(np.allclose(old, new, rtol=_NOISE_SETTLED) for old, new in pairs):
-            break
-    return humps, fit
+def _cost(fit: Regression) -> float:
+    """Negative log-likelihood of a fit."""
+    pairs = zip(fit.blocks, fit.sigmas, strict=True)
+    return float(sum(block.used.sum(axis=0) @ np.log(sigma) for block, sigma in pairs))
 
 
 def _significant(humps: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
@@ -344,99 +343,6 @@ def _significant(humps: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> Fl
     inside = (humps.speed_rad_s > 1.01 * _SLOWEST) & (humps.speed_rad_s < 0.99 * _FASTEST)
     resists = coulomb_nm + humps.hump_nm > 0.0
     return np.asarray((np.abs(humps.hump_nm) > limit * sigma) & inside & resists)
-
-
-def _optimised(problem: "_Weighted", start: Stribeck) -> "_HumpFit":
-    """Optimises the speeds of humps from a start."""
-
-    def linearise(logs: FloatArray) -> Linearised[FloatArray]:
-        fit = problem.solve(replace(start, speed_rad_s=np.exp(logs)))
-
-        def step(damping: float) -> FloatArray:
-            update = np.clip(damped_step(fit.information, fit.gradient, damping), -1.0, 1.0)
-            return np.clip(logs + update, np.log(_SLOWEST), np.log(_FASTEST))
-
-        return Linearised(logs, fit.cost, step)
-
-    logs, _ = levenberg_marquardt(np.log(start.speed_rad_s), linearise, _HUMP_SETTLED)
-    return problem.solve(replace(start, speed_rad_s=np.exp(logs)))
-
-
-@dataclass(frozen=True, eq=False)
-class _HumpFit:
-    """Best fit at given speeds of the humps."""
-
-    humps: Stribeck  # The fitted humps.
-    cost: float  # Sum of squared residuals, in units of the noise.
-    # (a, a) over the logarithms of the speeds, other parameters eliminated.
-    information: FloatArray
-    gradient: FloatArray  # (a,) of half the cost, likewise.
-
-
-@dataclass(frozen=True, eq=False)
-class _Weighted:
-    """The problem without humps, weighted by given noise."""
-
-    streams: Sequence[Conditioned]  # The samples.
-    blocks: tuple[NoiseBlock, ...]  # Their rows in units of the noise.
-    weights: tuple[FloatArray, ...]  # (k, n) weights of each block [1/(N m)].
-    information: FloatArray  # (p, p) over the parameters without humps.
-    right: FloatArray  # (p,) right-hand side of their normal equations.
-    total: float  # Sum of squared weighted torques.
-
-    @classmethod
-    def of(
-        cls,
-        streams: Sequence[Conditioned],
-        blocks: Sequence[NoiseBlock],
-        sigmas: Sequence[FloatArray],
-    ) -> Self:
-        """Weights blocks by the noise of their joints."""
-        weights = tuple(block.used / sigma for block, sigma in zip(blocks, sigmas, strict=True))
-        weighted = tuple(
-            replace(block, x=block.x * weight[:, :, None], y=block.y * weight)
-            for block, weight in zip(blocks, weights, strict=True)
-        )
-        return cls(
-            streams,
-            weighted,
-            weights,
-            np.asarray(sum(gram(block.x, block.x) for block in weighted)),
-            np.asarray(sum(gram(block.x, block.y) for block in weighted)),
-            float(sum(np.sum(block.y**2) for block in weighted)),
-        )
-
-    def solve(self, at: Stribeck) -> _HumpFit:
-        """Solves for the linear parameters at given speeds."""
-        count, size = len(at.joints), len(self.right)
-        a, b = self._normal(replace(at, hump_nm=np.ones(count)))
-        linear, speeds = slice(size + count), slice(size + count, None)
-        covariance = covariance_from(a[linear, linear])
-        best = covariance @ b[linear]
-        humps = best[size:]
-        cross = humps[:, None] * a[speeds, linear]
-        return _HumpFit(
-            replace(at, hump_nm=humps),
-            self.total - float(best @ b[linear]),
-            np.outer(humps, humps) * a[speeds, speeds] - cross @ covariance @ cross.T,
-            cross @ best - humps * b[speeds],
-        )
-
-    def _normal(self, humps: Stribeck) -> tuple[FloatArray, FloatArray]:
-        """Normal equations; humps and speeds follow the other parameters."""
-        count, size = len(humps.joints), len(self.right)
-        a, b = np.zeros((size + 2 * count, size + 2 * count)), np.zeros(size + 2 * count)
-        a[:size, :size], b[:size] = self.information, self.right
-        for stream, block, weight in zip(self.streams, self.blocks, self.weights, strict=True):
-            jacobian = stream.filtered(humps.jacobian)
-            for at, joint in enumerate(humps.joints):
-                own = [size + at, size + count + at]
-                columns = jacobian[:, [at, count + at]] * weight[:, joint, None]
-                a[:size, own] += block.x[:, joint].T @ columns
-                a[np.ix_(own, own)] += columns.T @ columns
-                b[own] += columns.T @ block.y[:, joint]
-        a[size:, :size] = a[:size, size:].T
-        return a, b
 
 
 def _with_humps(
