@@ -11,21 +11,21 @@ Wensing and Park 2019; Rucker and Wensing 2022).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.linalg import cholesky, qr, solve_triangular
+from scipy.linalg import block_diag, cholesky, qr, solve_triangular
+from scipy.optimize import least_squares
 from scipy.special import logsumexp, softmax
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel, JointMotion
 from visioncal.dynamics.regression import NoiseBlock
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import covariance_from, damped_step
+from visioncal.estimation.linalg import covariance_from
 from visioncal.robot import Inertias, LogCholesky
 
 # Number of random states, and their greatest speeds [rad/s] and accelerations [rad/s^2], at which
@@ -277,105 +277,48 @@ def fit_consistent(
     Raises:
         DataError: The prior inertias are physically inconsistent.
     """
-    joints = len(known.values)
-    names = base.model.names[10 * joints :]
-    held = np.zeros(len(names), dtype=bool)
-    positive = np.array([name.startswith(_POSITIVE) for name in names], dtype=bool)
-    problem = _ConsistentFit(
-        base, values, _Whitened.of(covariance), LogCholesky.around(known), held
-    )
-    for _ in range(len(names) + 1):
-        state, _ = levenberg_marquardt(problem.start(), problem.linearised, _SETTLED)
-        negative = positive & (state.own < 0.0) & ~problem.held
-        if not negative.any():
-            break
-        # Negative ones are held at zero: they are noise, or the model does not fit.
-        problem = replace(problem, held=problem.held | negative)
-    information, _, _ = problem.normal(state)
-    jacobian = problem.jacobian(state)
-    posterior = jacobian @ covariance_from(information) @ jacobian.T
-    residual = problem.whitened.apply(values - base.of(problem.standard(state)))
-    return Consistent(problem.standard(state), posterior, float(residual @ residual))
+    count, coordinates = known.values.size, LogCholesky.around(known)
+    names = base.model.names[count:]
+    scale = np.sqrt(np.diag(covariance))
+    root = cholesky(covariance / np.outer(scale, scale), lower=True)
 
+    def whitened(rows: FloatArray) -> FloatArray:
+        return np.asarray(solve_triangular(root, (rows.T / scale).T, lower=True))
 
-@dataclass(frozen=True, eq=False)
-class _Whitened:
-    """Whitening transform of a covariance."""
+    # The unknowns are the links' coordinates in units of their prior sigma, and the joints' own.
+    def links(unknowns: FloatArray) -> FloatArray:
+        return PRIOR_SIGMA * unknowns[:count].reshape(-1, 10)
 
-    root: FloatArray
-    scale: FloatArray
+    def standard(unknowns: FloatArray) -> FloatArray:
+        bodies = coordinates.values(links(unknowns)).ravel()
+        return np.concatenate([bodies, unknowns[count:]])
 
-    @classmethod
-    def of(cls, covariance: FloatArray) -> "_Whitened":
-        scale = np.sqrt(np.diag(covariance))
-        return cls(cholesky(covariance / np.outer(scale, scale), lower=True), scale)
-
-    def apply(self, residual: FloatArray) -> FloatArray:
-        scaled = residual / self.scale.reshape(-1, *[1] * (residual.ndim - 1))
-        return np.asarray(solve_triangular(self.root, scaled, lower=True))
-
-
-@dataclass(frozen=True, eq=False)
-class _LinkState:
-    """Log-Cholesky coordinates (n, 10) of the links, and the joints' own parameters."""
-
-    links: FloatArray
-    own: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _ConsistentFit:
-    """The least-squares problem; link coordinates in units of their prior sigma."""
-
-    base: BaseModel
-    values: FloatArray
-    whitened: _Whitened
-    coordinates: LogCholesky
-    held: Mask
-
-    def start(self) -> _LinkState:
-        """The prior links, with the joints' own parameters fitted to the rest."""
-        joints = len(self.coordinates.maps)
-        links = np.zeros((joints, 10))
-        known = self.coordinates.values(links).ravel()
-        own = self.whitened.apply(self.base.dependence[:, len(known) :] * ~self.held)
-        rest = self.values - self.base.dependence[:, : len(known)] @ known
-        fitted = np.linalg.lstsq(own, self.whitened.apply(rest), rcond=None)[0]
-        return _LinkState(links, np.where(self.held, 0.0, fitted))
-
-    def standard(self, state: _LinkState) -> FloatArray:
-        return np.concatenate([self.coordinates.values(state.links).ravel(), state.own])
-
-    def jacobian(self, state: _LinkState) -> FloatArray:
+    def jacobian(unknowns: FloatArray) -> FloatArray:
         """(p, p) Jacobian of the standard parameters."""
-        count, own = state.links.size, state.own.size
-        jacobian = np.zeros((count + own, count + own))
-        for joint, block in enumerate(self.coordinates.jacobians(state.links)):
-            rows = slice(10 * joint, 10 * joint + 10)
-            jacobian[rows, rows] = PRIOR_SIGMA * block
-        jacobian[range(count, count + own), range(count, count + own)] = ~self.held
-        return jacobian
+        bodies = PRIOR_SIGMA * coordinates.jacobians(links(unknowns))
+        return np.asarray(block_diag(*bodies, np.eye(len(names))))
 
-    def normal(self, state: _LinkState) -> tuple[FloatArray, FloatArray, float]:
-        """Information, gradient and cost."""
-        prior = np.zeros(state.links.size + state.own.size)
-        prior[: state.links.size] = state.links.ravel() / PRIOR_SIGMA
-        residual = self.whitened.apply(self.base.of(self.standard(state)) - self.values)
-        jacobian = self.whitened.apply(self.base.dependence @ self.jacobian(state))
-        prior_information = np.zeros(prior.size)
-        prior_information[: state.links.size] = 1.0
-        prior_information[state.links.size :][self.held] = 1.0
-        information = jacobian.T @ jacobian + np.diag(prior_information)
-        gradient = jacobian.T @ residual + prior
-        return information, gradient, float(residual @ residual + prior @ prior)
+    def residuals(unknowns: FloatArray) -> FloatArray:
+        torques = whitened(base.of(standard(unknowns)) - values)
+        return np.concatenate([torques, unknowns[:count]])
 
-    def linearised(self, state: _LinkState) -> Linearised[_LinkState]:
-        information, gradient, cost = self.normal(state)
+    def slopes(unknowns: FloatArray) -> FloatArray:
+        prior = np.eye(count, len(unknowns))
+        return np.concatenate([whitened(base.dependence @ jacobian(unknowns)), prior])
 
-        def step(damping: float) -> _LinkState:
-            update = damped_step(information, gradient, damping)
-            links = PRIOR_SIGMA * update[: state.links.size].reshape(state.links.shape)
-            own = update[state.links.size :]
-            return _LinkState(state.links + links, state.own + np.where(self.held, 0.0, own))
-
-        return Linearised(state, cost, step)
+    lower = np.full(count + len(names), -np.inf)
+    # Where they would be negative they are noise, or the model does not fit.
+    lower[count:][[name.startswith(_POSITIVE) for name in names]] = 0.0
+    start = np.zeros(len(lower))
+    own = slopes(start)[: base.rank, count:]
+    start[count:] = np.linalg.lstsq(own, -residuals(start)[: base.rank], rcond=None)[0]
+    fit = least_squares(
+        residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=_SETTLED
+    )
+    free = fit.active_mask == 0
+    solved = np.where(free, fit.x, 0.0)
+    rows = slopes(solved)[:, free]
+    by_unknowns = jacobian(solved)[:, free]
+    posterior = by_unknowns @ covariance_from(rows.T @ rows) @ by_unknowns.T
+    left = residuals(solved)[: base.rank]
+    return Consistent(standard(solved), posterior, float(left @ left))
