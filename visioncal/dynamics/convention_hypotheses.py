@@ -6,7 +6,7 @@ recording is off by far more.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -21,31 +21,16 @@ from visioncal.robot import Inertias, Robot, joint_torques
 
 # Samples of a test, and the least number: sweeps of single joints have fewer.
 _SAMPLES, _LEAST = 250, 100
-# With inertias a mistake is reported where undoing it divides the torques' unexplained power by
-# this factor, and leaves at most this share unexplained in the joints concerned.
-_BETTER, _LEFT = 10.0, 0.5
-# Swapped joints are reported where undoing the swap divides the fit's residual power, over all
-# joints, by this factor, and leaves at most this share: correct recordings of exciting motions get
-# worse by any swap, and slow sweeps, where friction is nearly all, hardly change.
-_FITS_BETTER, _FIT_LEFT = 10.0, 0.01
-# Without inertias a mistake is reported where undoing it divides the fit's residual power by this
-# factor, and leaves at most this share; for correct recordings the factor is at most 1.2.
-_SURELY_BETTER, _EXPLAINED = 100.0, 0.1
+# A mistake is reported where undoing it divides the torques' unexplained power by this factor, and
+# leaves at most this share unexplained in the joints concerned: by known inertias, by the best fit.
+# Best fits of correct recordings improve by a factor of 1.2 at most. Mistakes that are nearly as
+# likely are named, too: slow sweeps hardly separate swapped torques from swapped angles.
+_BETTER, _LEFT = 10.0, {True: 0.5, False: 0.1}
 # Least share of a joint's torque power that counts as unexplained: noise, and wrong inertias.
 _FLOOR = 0.01
 # Torques whose scale to the predicted ones is outside these factors are in other units, such as
 # motor-side torques; only joints of whose torque the links make up at least this share are tested.
 _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
-
-
-@dataclass(frozen=True, eq=False)
-class _Hypothesis:
-    """A recording with some mistake undone."""
-
-    words: str  # The mistake, for the message; empty for the recording as it is.
-    joints: tuple[int, ...]  # The joints concerned.
-    measured: Measured  # The corrected recording.
-    predicted: FloatArray  # (m, n) torques of the links by the robot's inertias [N m].
 
 
 def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
@@ -57,25 +42,14 @@ def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     Raises:
         DataError: Torques or angles are of another joint, of the other sign, or in other units.
     """
-    robot = base.model.robot
     for stream in streams:
         measured = _sampled(stream)
-        if len(measured) < _LEAST:
-            continue
-        joints = tuple(range(measured.torques_nm.shape[1]))
-        as_it_is = _Hypothesis("", joints, measured, _predicted(robot, measured.motion))
-        if robot.inertias is None:
-            mistake = _explained_better(base, as_it_is)
-        else:
-            mistake = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
-        if mistake is not None:
-            raise DataError(
-                f"{stream.label}: {mistake[0].words}: {mistake[1]}.",
-                culprits=[f"joint {joint + 1}" for joint in mistake[0].joints],
-                next_step="Mend the columns of the stream, or name the robot that was recorded.",
-            )
-        if robot.inertias is not None:
-            _check_units(stream.label, robot, as_it_is)
+        if len(measured) >= _LEAST:
+            if base.model.robot.inertias is not None:
+                _check_conventions(base, stream.label, measured, known=True)
+                _check_units(base.model.robot, stream.label, measured)
+            # The prediction hardly shows exchanged joints whose torques are mostly friction.
+            _check_conventions(base, stream.label, measured, known=False)
 
 
 def _sampled(stream: Conditioned) -> Measured:
@@ -85,78 +59,44 @@ def _sampled(stream: Conditioned) -> Measured:
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 
-def _predicted_better(robot: Robot, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """The mistake whose correction makes the prediction fit far better, and why; else None."""
-    before = _unexplained_shares(as_it_is)
-    best, gain = None, np.log(_BETTER)
+def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known: bool) -> None:
+    """Refuses a recording where undoing a mistake makes it explain far more of its torques."""
+    robot = base.model.robot
+    before, tried = _unexplained(base, measured, known=known), []
     for mistake in _mistakes(robot.joint_count):
-        hypothesis = mistake.undone(robot, as_it_is)
-        after = _unexplained_shares(hypothesis)
-        better = float(np.sum(np.log(before / after)))
-        if better > gain and after[list(hypothesis.joints)].max() < _LEFT:
-            best, gain = hypothesis, better
-    if best is None:
-        return None
-    joints = list(best.joints)
-    percent = [
-        100.0 * (1.0 - float(shares[joints].mean()))
-        for shares in (_unexplained_shares(best), before)
-    ]
-    return best, (
-        f"so taken, {percent[0]:.0f} % of the torques of {_named(best.joints)} is explained by "
-        f"the inertias of {robot.name} and by friction, instead of {max(percent[1], 0.0):.0f} %"
+        after = _unexplained(base, mistake.undone(measured), known=known)
+        gain = float(np.sum(np.log(before / after)))
+        if gain > np.log(_BETTER) and after[[*mistake.joints]].max() < _LEFT[known]:
+            tried.append((gain, mistake, after))
+    if not tried:
+        return
+    gain, best, after = max(tried, key=lambda item: item[0])
+    alike = [mistake.words for more, mistake, _ in tried if more > gain - np.log(_BETTER)]
+    joints = [*best.joints]
+    so_taken, as_it_is = (
+        max(100.0 * (1.0 - float(shares[joints].mean())), 0.0) for shares in (after, before)
+    )
+    by = f"the inertias of {robot.name} and by friction" if known else "the best fit"
+    raise DataError(
+        f"{label}: {', or '.join(alike)}: so taken, {so_taken:.3g} % of the torques of "
+        f"{_named(best.joints)} is explained by {by}, instead of {as_it_is:.3g} %.",
+        culprits=[f"joint {joint + 1}" for joint in joints],
+        next_step="Mend the columns of the stream, or name the robot that was recorded.",
     )
 
 
-def _fitted_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """Two swapped joints, if a fit shows such a pair, and why; else None."""
-    # The prediction hardly shows it where their torques are mostly friction; but then no inertias
-    # at all explain the other joints' torques.
-    before, predicted = _residual_power(base, as_it_is.measured), _unexplained_shares(as_it_is)
-    best, gain = None, np.log(_FITS_BETTER)
-    for mistake in _mistakes(len(as_it_is.joints)):
-        if mistake.angles is not mistake.torques:
-            continue
-        hypothesis = mistake.undone(base.model.robot, as_it_is)
-        if np.sum(np.log(predicted / _unexplained_shares(hypothesis))) < -1.0:
-            continue
-        after = _residual_power(base, hypothesis.measured)
-        better = float(np.sum(np.log(before / after)))
-        if better > gain and after.max() < _FIT_LEFT:
-            best, gain = hypothesis, better
-    if best is None:
-        return None
-    times = float(np.exp(gain / len(as_it_is.joints)))
-    return best, f"so taken, the best fit leaves {times:.2g} times less of the torques' power"
+def _unexplained(base: BaseModel, measured: Measured, *, known: bool) -> FloatArray:
+    """(n,) share of the power of each joint's torques that is left.
 
-
-def _explained_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """The mistake whose correction makes the best fit far better, and why; else None.
-
-    Slow sweeps hardly separate swapped torques from swapped angles: both are named.
+    By the robot's own inertias and friction where `known`, else by the best fit.
     """
-    before = _residual_power(base, as_it_is.measured)
-    tried = []
-    for mistake in _mistakes(len(as_it_is.joints)):
-        hypothesis = mistake.undone(base.model.robot, as_it_is)
-        after = _residual_power(base, hypothesis.measured)
-        if after.max() < _EXPLAINED:
-            tried.append((float(np.sum(np.log(before / after))), hypothesis))
-    gain, best = max(tried, key=lambda pair: pair[0], default=(0.0, as_it_is))
-    if gain < np.log(_SURELY_BETTER):
-        return None
-    alike = [hypothesis.words for more, hypothesis in tried if more > gain - np.log(_FITS_BETTER)]
-    times = float(np.exp(gain / len(as_it_is.joints)))
-    why = f"so taken, the best fit leaves {times:.2g} times less of the torques' power a joint"
-    return replace(best, words=", or ".join(alike)), why
-
-
-def _residual_power(base: BaseModel, measured: Measured) -> FloatArray:
-    """(n,) share of the power of each joint's torques that the best fit leaves."""
-    sizes = np.maximum(np.std(measured.torques_nm, axis=0), 1e-12)
-    x = base.regressor(measured.motion) / sizes[:, None]
-    y = measured.torques_nm / sizes
-    rows = x.reshape(-1, base.rank)
+    robot, torques = base.model.robot, measured.torques_nm
+    if known:
+        predicted, joints = _predicted(robot, measured.motion), range(robot.joint_count)
+        return np.array([_joint_fit(measured, predicted, joint)[1] for joint in joints])
+    sizes = np.maximum(np.std(torques, axis=0), 1e-12)
+    y = torques / sizes
+    rows = (base.regressor(measured.motion) / sizes[:, None]).reshape(-1, base.rank)
     rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
     values = np.linalg.lstsq(rows, y.ravel(), rcond=1e-9)[0]
     left = np.mean((y - (rows @ values).reshape(y.shape)) ** 2, axis=0)
@@ -172,13 +112,11 @@ class _Mistake:
     angles: FloatArray
     torques: FloatArray
 
-    def undone(self, robot: Robot, as_it_is: _Hypothesis) -> _Hypothesis:
+    def undone(self, measured: Measured) -> Measured:
         """The recording with the mistake undone."""
-        motion, torques = as_it_is.measured.motion, as_it_is.measured.torques_nm @ self.torques
+        motion = measured.motion
         parts = (array @ self.angles for array in (motion.q, motion.dq, motion.ddq))
-        motion = JointMotion(motion.times_s, *parts)
-        measured = Measured(motion, torques)
-        return _Hypothesis(self.words, self.joints, measured, _predicted(robot, motion))
+        return Measured(JointMotion(motion.times_s, *parts), measured.torques_nm @ self.torques)
 
 
 def _mistakes(joints: int) -> Iterator[_Mistake]:
@@ -207,21 +145,15 @@ def _mistakes(joints: int) -> Iterator[_Mistake]:
 
 
 def _predicted(robot: Robot, motion: JointMotion) -> FloatArray:
+    """(m, n) torques of the links by the robot's inertias [N m]."""
     inertias = robot.inertias or Inertias(np.zeros((robot.joint_count, 10)))
     return joint_torques(robot, inertias, motion.q, motion.dq, motion.ddq)
 
 
-def _unexplained_shares(hypothesis: _Hypothesis) -> FloatArray:
-    """(n,) share of the power of each joint's torques that prediction and friction leave."""
-    return np.array(
-        [_joint_fit(hypothesis, index)[1] for index in range(hypothesis.predicted.shape[1])]
-    )
-
-
-def _joint_fit(hypothesis: _Hypothesis, joint: int) -> tuple[FloatArray, float]:
+def _joint_fit(measured: Measured, predicted: FloatArray, joint: int) -> tuple[FloatArray, float]:
     """Non-negative fit of a joint's torques: factors of prediction and friction, share left."""
-    dq, torques = hypothesis.measured.motion.dq[:, joint], hypothesis.measured.torques_nm[:, joint]
-    columns = np.column_stack([hypothesis.predicted[:, joint], sign(dq), dq])
+    dq, torques = measured.motion.dq[:, joint], measured.torques_nm[:, joint]
+    columns = np.column_stack([predicted[:, joint], sign(dq), dq])
     columns, centred = columns - columns.mean(axis=0), torques - torques.mean()
     sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     factors, left = nnls(columns / sizes, centred)
@@ -235,16 +167,14 @@ def _named(joints: tuple[int, ...]) -> str:
     )
 
 
-def _check_units(label: str, robot: Robot, hypothesis: _Hypothesis) -> None:
+def _check_units(robot: Robot, label: str, measured: Measured) -> None:
     """Refuses torques whose scale to the predicted ones shows another unit."""
-    scales = np.full(len(hypothesis.joints), np.nan)
-    for joint in hypothesis.joints:
-        factors, left = _joint_fit(hypothesis, joint)
-        torques = hypothesis.measured.torques_nm[:, joint]
-        share = (
-            factors[0] ** 2 * np.var(hypothesis.predicted[:, joint]) / max(np.var(torques), 1e-24)
-        )
-        if share > _SHARE and left < _LEFT:
+    predicted, scales = _predicted(robot, measured.motion), np.full(robot.joint_count, np.nan)
+    for joint in range(robot.joint_count):
+        factors, left = _joint_fit(measured, predicted, joint)
+        power = max(float(np.var(measured.torques_nm[:, joint])), 1e-24)
+        share = factors[0] ** 2 * np.var(predicted[:, joint]) / power
+        if share > _SHARE and left < _LEFT[True]:
             scales[joint] = factors[0]
     wrong = np.flatnonzero((scales > _HIGH) | (scales < _LOW))
     if not len(wrong):
