@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
+from scipy.ndimage import binary_opening, uniform_filter1d
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
@@ -16,7 +16,6 @@ from visioncal.dynamics.reading import (
     StampClock,
     clock_notes,
     even_parts,
-    without_frozen,
 )
 
 # Cut-off of the low-pass: a rigid arm's torques, but for the corners of friction, lie within so
@@ -33,9 +32,6 @@ _MOST_AT_LIMIT = 0.2
 # A joint stands still where its mean speed over this time stays below this for as long [rad/s],
 # [s].
 _REST_RAD_S, _REST_S = 1e-3, 0.1
-# Torques that deviate from their neighbours by so many times the usual deviation, and by this share
-# of their range, are spikes (data transmission errors).
-_SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
 # Samples whose regressors are held in memory at a time.
 _SAMPLES_AT_ONCE = 20_000
 # A filter output is not used where more than this share of its weights is on invalid samples.
@@ -344,9 +340,7 @@ def condition(
         DataError: No part without gaps is as long as the filters.
     """
     notes: list[str] = []
-    recorded = without_frozen(recorded, notes)
-    torques, invalid = _cleaned(recorded, limits_nm, notes)
-    recorded = replace(recorded, torques_nm=torques)
+    invalid = _saturated(recorded, limits_nm, notes)
     clock = StampClock.of(recorded.times_s)
     # For the slowest motion, until the bandwidth is known.
     slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
@@ -406,32 +400,20 @@ def _longest_gap(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
     return _BRIDGED * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
 
 
-def _cleaned(
-    recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]
-) -> tuple[FloatArray, Mask]:
-    """Torques with spikes replaced, and the mask of saturated ones."""
-    torques = recorded.torques_nm.copy()
-    flat = np.stack([_flat_tops(column) for column in torques.T], axis=1)
+def _saturated(recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]) -> Mask:
+    """(m, n) mask of saturated torques."""
+    flat = np.stack([_flat_tops(column) for column in recorded.torques_nm.T], axis=1)
     if limits_nm is not None:
-        beyond = np.abs(torques) >= 0.999 * limits_nm
+        beyond = np.abs(recorded.torques_nm) >= 0.999 * limits_nm
         # Torques that are beyond the limits often are not saturated, but in another unit.
         flat |= beyond & (beyond.mean(axis=0) < _MOST_AT_LIMIT)
-    medians = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
-    deviations = np.abs(torques - medians)
-    # Three in four samples of normal noise deviate from the median of five by less than this.
-    usual_deviations = np.quantile(deviations, 0.75, axis=0)
-    range_nm = np.quantile(torques, 0.999, axis=0) - np.quantile(torques, 0.001, axis=0)
-    spikes = (deviations > np.maximum(_SPIKE * usual_deviations, _SPIKE_SHARE * range_nm)) & ~flat
-    spikes &= spikes.mean(axis=0) < _MOST_INVALID
-    torques[spikes] = medians[spikes]
-    for what, wrong, done in (
-        ("at rest on an extreme value (saturated)", flat, "what rests on them is left out"),
-        ("far off from their neighbours", spikes, "the median around is used in their place"),
-    ):
-        if wrong.any():
-            joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(wrong.sum(axis=0)) if n]
-            notes.append(f"{recorded.label}: torques are {what}: {some_of(joints)}; {done}.")
-    return torques, np.asarray(flat)
+    if flat.any():
+        joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(flat.sum(axis=0)) if n]
+        notes.append(
+            f"{recorded.label}: torques are at rest on an extreme value (saturated): "
+            f"{some_of(joints)}; what rests on them is left out."
+        )
+    return np.asarray(flat)
 
 
 def _flat_tops(values: FloatArray) -> Mask:

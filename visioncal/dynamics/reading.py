@@ -26,11 +26,6 @@ _HOW = (
 # share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
 # step of so many times the usual one that is also longer than the last [s].
 _JITTER, _EVEN, _GAP, _GAP_S = 0.02, 0.1, 2.5, 0.02
-# Least duration [s] and number of repeated angles that count as frozen, and number of samples
-# before and after in which the joint moves.
-_FROZEN_S, _FROZEN, _AROUND = 0.05, 5, 5
-# The angle then jumps by at least so many times the steps around it and the angles' resolution.
-_JUMP = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +44,7 @@ class RecordedSamples:
 
     def part(self, begin: float, end: float) -> "RecordedSamples":
         """The samples between two fractions of the stream, 0 to 1."""
-        return self.among(slice(round(begin * len(self)), round(end * len(self))))
-
-    def among(self, rows: slice | Mask) -> "RecordedSamples":
-        """The samples of given rows."""
+        rows = slice(round(begin * len(self)), round(end * len(self)))
         return replace(
             self,
             times_s=self.times_s[rows],
@@ -282,43 +274,3 @@ def _bridged(times_s: FloatArray, values: FloatArray, present: Mask) -> FloatArr
     bridged = values.copy()
     bridged[~present] = CubicSpline(times_s[present], values[present])(times_s[~present])
     return bridged
-
-
-def without_frozen(recorded: RecordedSamples, notes: list[str]) -> RecordedSamples:
-    """The stream without the rows in which a joint's angle is frozen while the joint moves.
-
-    A joint that stops or sets off has short steps just before and after; a frozen angle has steps
-    of the usual length, and then a far longer one.
-    """
-    rows = np.ones(len(recorded), dtype=bool)
-    for angles in recorded.q.T:
-        rows &= ~_frozen(recorded.times_s, angles)
-    if rows.all():
-        return recorded
-    begins = np.flatnonzero(rows[:-1] & ~rows[1:])
-    ends = np.flatnonzero(~rows & np.append(rows[1:], True))
-    gaps_s = recorded.times_s[ends] - recorded.times_s[begins]
-    places = [f"{recorded.times_s[begin] - recorded.times_s[0]:.2f} s" for begin in begins]
-    notes.append(
-        f"{recorded.label}: angles are frozen for up to {figure(float(gaps_s.max()))} s behind "
-        f"{some_of(places, 3)}, though the joints move; these {(~rows).sum()} rows are left out."
-    )
-    return recorded.among(rows)
-
-
-def _frozen(times_s: FloatArray, angles: FloatArray) -> Mask:
-    """(m,) mask of a joint's angles that repeat an earlier sample although the joint moves."""
-    frozen = np.zeros(len(angles), dtype=bool)
-    steps = np.abs(np.diff(angles))
-    if not steps.any():
-        return frozen
-    resolution = float(steps[steps > 0.0].min())
-    edges = np.diff(np.concatenate([[False], steps == 0.0, [False]]).astype(np.int8))
-    for begin, end in np.flatnonzero(edges).reshape(-1, 2):
-        if end - begin < _FROZEN or times_s[end] - times_s[begin] < _FROZEN_S or end == len(steps):
-            continue
-        before, after = steps[max(begin - _AROUND, 0) : begin], steps[end + 1 : end + 1 + _AROUND]
-        around = max(float(np.median(array)) if len(array) else 0.0 for array in (before, after))
-        if steps[end] > _JUMP * max(around, resolution):
-            frozen[begin + 1 : end + 1] = True
-    return frozen
