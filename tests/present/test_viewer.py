@@ -25,7 +25,7 @@ from visioncal.present.recording import (
     read_evidence,
     write_recording,
 )
-from visioncal.present.result_parts import placement
+from visioncal.present.report import plots
 from visioncal.present.viewer import blueprint
 from visioncal.results import Edge, to_document
 from visioncal.results.evidence import ViewEvidence
@@ -100,7 +100,7 @@ def test_placements_are_where_the_views_put_the_target(mount):
         "eye-in-hand": ("flange_from_cam", "base_from_target"),
         "eye-to-hand": ("base_from_cam", "flange_from_target"),
     }[mount]
-    sample = made_up(views=5, images=False)
+    sample = made_up(views=5)
     calibration = replace(
         sample.calibration,
         mount=mount,
@@ -110,7 +110,8 @@ def test_placements_are_where_the_views_put_the_target(mount):
         views=tuple(replace(view, used=True) for view in sample.calibration.views),
     )
     seen = map(ViewEvidence, range(5), [None] * 5, [None] * 5, base_from_flange, cam_from_target)
-    found = [placement(calibration, view)[:3, 3] for view in seen]
+    placed = plots.placements(calibration, sample.session, [*seen], ())
+    found = [pose[:3, 3] for _, pose in placed]
     # Rounding of poses of about 1 m.
     np.testing.assert_allclose(found, moved_m, atol=1e-12)
 

@@ -4,7 +4,7 @@ They are lines, dots and words in the page's colours; matplotlib, whose import t
 else in a report, draws those of arms and boards.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,15 +12,15 @@ from markupsafe import Markup, escape
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
-from visioncal.core.transforms import log
+from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.present.advice import contradicts
+from visioncal.present.cell_poses import CellPoses
 from visioncal.present.coverage import coverage_charts
-from visioncal.present.result_parts import placement, target_frames
 from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
 
 # Width of a drawing, and room for labels to its left and right [px].
 WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 105.0
@@ -247,16 +247,7 @@ def residuals_over_joints(
     """
     if session is None or not evidence:
         return Markup("")
-    joints_rad = {view.number: view.joints_rad for view in session.views}
-    shown = {view.view for view in calibration.views if view.used and view.view not in outlying}
-    frames = target_frames(calibration, session)
-    pairs = [
-        (joints, log(placed))
-        for view in evidence
-        if view.view in shown
-        and (joints := joints_rad.get(view.view)) is not None
-        and (placed := placement(calibration, view, frames.get(view.view))) is not None
-    ]
+    pairs = [*placements(calibration, session, evidence, outlying)]
     if len(pairs) < 3:
         return Markup("")
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
@@ -265,7 +256,7 @@ def residuals_over_joints(
     centres = _places(len(low))
     part = 0.8 * (WIDTH - _LEFT - _RIGHT) / len(low)
     places = centres + part * ((joints_deg - low) / np.maximum(high - low, 1e-9) - 0.5)
-    twists, drawing = np.array([residual for _, residual in pairs]), Drawing()
+    twists, drawing = log(np.array([placed for _, placed in pairs])), Drawing()
     for index, (values, label) in enumerate(
         ((1e3 * twists[:, 3:], "position [mm]"), (np.rad2deg(twists[:, :3]), "rotation [deg]"))
     ):
@@ -282,3 +273,28 @@ def residuals_over_joints(
         x = WIDTH - _RIGHT - 60.0 * (2 - index)
         drawing.text(x, 12.0, f"target {name}", "end", f'fill="var(--{colour})"')
     return drawing.svg("Residuals of the used views over each joint's angle", 2 * _PANEL + 36.0)
+
+
+def placements(
+    calibration: Calibration,
+    session: Session,
+    evidence: Sequence[ViewEvidence],
+    outlying: Collection[int],
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Joint angles (n,) [rad] of each used view, and the target's pose (4, 4) by it.
+
+    The pose is relative to the result's, in the target's frame [m].
+    """
+    rows = {view.number: view for view in session.views}
+    used = {view.view for view in calibration.views if view.used and view.view not in outlying}
+    cell = CellPoses.of(session, calibration, {view.view: view for view in evidence})
+    sensor, *placed = (name.rpartition("_from_")[2] for name in calibration.edges)
+    for seen in evidence:
+        row, pose = rows.get(seen.view), seen.cam_from_target
+        if seen.view not in used or row is None or row.joints_rad is None or pose is None:
+            continue
+        named = frame_name("target", session.board_of(row) if session.targets else "")
+        target = cell.in_cell(named if named in placed else placed[0], seen.view)
+        eye = cell.in_cell(sensor, seen.view)
+        if target is not None and eye is not None:
+            yield row.joints_rad, invert(target) @ eye @ pose
