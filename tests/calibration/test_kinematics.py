@@ -38,7 +38,6 @@ from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, WeightFunctions, convert_table, load_robot, table_of
-from visioncal.robot.jacobians import table_jacobian
 from visioncal.robot.tables import table_from_document
 from visioncal.simulation import CellOptions, Payload, simulate
 from visioncal.simulation.arms import forward, loaded_joints
@@ -592,38 +591,6 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     assert known.robot_arm.model.base_from_flange(q) == pytest.approx(stated, abs=1e-9)
     assert result.arm_is_calibrated
     assert result.standing(q) == pytest.approx(stated, abs=1e-9)
-
-
-def rows_of(table):
-    """(n, 5) theta, d, a, alpha and beta of each Z_i X_i."""
-    n = len(table)
-    names = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
-    return np.stack([getattr(table, name)[-n:] for name in names], axis=1)
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("name", ARMS)
-def test_a_table_moves_as_its_derivatives_say(name, convention):
-    robot, rng = robot_of(name), np.random.default_rng(0)
-    like = convert_table(table_from_document(robot.document), convention)
-    # Every link, and every revolute joint's function, is off by a milliradian.
-    functions = 1e-3 * rng.normal(size=(robot.joint_count, 4)) * [1.0, 0.0, 1.0, 1.0]
-    functions[robot.chain.prismatic, 2:] = 0.0
-    arm = robot.corrected(1e-3 * rng.normal(size=(robot.joint_count + 1, 6)), functions)
-    table = table_of(arm, convention, like=like)
-    twists = rng.normal(size=(3, len(table) + 1, 6))
-    functions = rng.normal(size=(3, len(table), 4)) * [1.0, 0.0, 0.0, 0.0]
-    # Common normals of nearly parallel axes run away with the inverse square of the angle.
-    step = 1e-7 if convention == "hayati" else 1e-9
-    for by, turn, way in zip(
-        table_jacobian(arm, table, twists, functions), twists, functions, strict=True
-    ):
-        ends = [
-            rows_of(table_of(arm.corrected(value * turn, value * way), convention, like=like))
-            for value in (step, -step)
-        ]
-        # Base and flange are tilted by some mrad, whose product with a step is left out.
-        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(by, rel=0.01, abs=0.01)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -96,7 +96,6 @@ class CheckLimits:
 class DynamicsLimits:
     """Limits on identified dynamics."""
 
-    worse: float = 1.5  # Prediction error of other motions over the fit's residual.
     # Prediction error of consistent parameters over that of base parameters.
     bodies_worse: float = 1.3
     # Share of a torque's range below which an error is no reason for doubt.
@@ -106,8 +105,6 @@ class DynamicsLimits:
     known_share: float = 0.5
     # Change of torques by their lag over the range, below which it is only a note.
     lag_share: float = 0.1
-    # Share of undetermined base parameters; those of the wrist matter little.
-    undetermined_share: float = 0.5
 
 
 # Fewest views, or stops, that determine a frame: turns about two axes take three of them.

@@ -14,7 +14,7 @@ from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
 from visioncal.core.limits import DynamicsLimits
-from visioncal.core.number_format import figure, some_of
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
 from visioncal.core.version import __version__
@@ -184,7 +184,6 @@ def judge(identified: Identified) -> Verdict:
         *_of_lag(identified),
         *_of_prediction(identified),
         *_of_range(identified),
-        *_of_parameters(identified),
     ]
     statuses = {status for status, _ in judged}
     worst: VerdictStatus = (
@@ -232,17 +231,6 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
             f"range (joints 1 to {len(shares)}).",
         ),
     )
-    fitted = identified.fitted_rms_nm
-    worse = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
-    worse &= shares > _LIMITS.slight_share
-    if worse.any():
-        yield _check(
-            "optimism",
-            f"{_joints(worse)}: torques are predicted "
-            f"{figure(float((validation.rms_nm / fitted)[worse].max()))} times worse than "
-            "they were fitted: the motion says too little, or something changed.",
-            _plan(identified, _MOTION),
-        )
     yield from _of_known(identified, validation)
 
 
@@ -304,22 +292,6 @@ def _of_range(identified: Identified) -> Iterator[_Judged]:
             f"{np.abs(motion.dq).max():.0f} rad/s and {np.abs(motion.ddq).max():.0f} rad/s^2) "
             f"is known to {figure(100.0 * float(share.max()))} % only: this motion was too "
             "slow, too small or too short.",
-            _plan(identified, _MOTION),
-        )
-
-
-def _of_parameters(identified: Identified) -> Iterator[_Judged]:
-    unknown = np.array([name == UNKNOWN for name in identified.determined])
-    if unknown.mean() > _LIMITS.undetermined_share:
-        names = [
-            name
-            for name, is_unknown in zip(identified.base.names, unknown, strict=True)
-            if is_unknown
-        ]
-        yield _check(
-            "undetermined",
-            f"{unknown.sum()} of {len(unknown)} base parameters are not determined by this motion, "
-            f"among them {some_of(names, 3)}.",
             _plan(identified, _MOTION),
         )
 

@@ -8,11 +8,12 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.robot import FUNCTION_NAMES, DHTable
-from visioncal.robot.jacobians import ROW_NAMES, table_jacobian
+from visioncal.robot import FUNCTION_NAMES, DHTable, table_of
 
 _LENGTHS = ("d", "a")
-_ROW = len(ROW_NAMES)
+# Steps of differences [rad]: common normals of nearly parallel axes, which Hayati's form does
+# without, run away with the inverse square of the angle.
+_STEPS = {"hayati": 1e-7, "standard": 1e-9, "modified": 1e-9}
 
 
 @dataclass(frozen=True)
@@ -40,17 +41,10 @@ class Parameter:
         """Equivalent of a radian."""
         return LEVER_M if self.is_length else 1.0
 
-    @property
-    def place(self) -> int:
-        """Its index among the parameters of a row and its joint's function."""
-        if self.kind in ROW_NAMES:
-            return ROW_NAMES.index(self.kind)
-        return _ROW + FUNCTION_NAMES.index(self.kind)
-
     def value(self, table: DHTable) -> float:
         """Its value [rad, m or 1]."""
-        if self.place >= _ROW:
-            return float(table.functions[self.joint, self.place - _ROW])
+        if self.kind in FUNCTION_NAMES:
+            return float(table.functions[self.joint, FUNCTION_NAMES.index(self.kind)])
         if self.kind in ("theta", "d"):
             return float({"theta": table.theta_rad, "d": table.d_m}[self.kind][self.joint])
         across = {"a": table.a_m, "alpha": table.alpha_rad, "beta": table.beta_rad}
@@ -78,18 +72,20 @@ def free_parameters(model: ArmModel, table: DHTable) -> Iterator[Parameter]:
                 yield Parameter(joint, FUNCTION_NAMES[place], joint + 1)
 
 
-def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parameter]) -> FloatArray:
-    """Jacobian (k, p) of a table's parameters by the arm's errors; `table_of(model.bare, ...)`.
+def parameter_moves(model: ArmModel, like: DHTable, parameters: Sequence[Parameter]) -> FloatArray:
+    """Jacobian (k, p) of parameters of the arm's table by its errors, by central differences.
 
     It is zero where the convention fixes a parameter and the base or the flange changes instead.
+    `like` is the nominal arm's table; see `table_of`.
     """
-    steps = [model.changes(row) for row in np.eye(len(model.values))]
-    placements, functions = (np.array(pair) for pair in zip(*steps, strict=True))
-    rows = table_jacobian(model.bare, table, placements, functions)
-    moves = np.zeros((len(parameters), len(steps)))
-    for row, parameter in enumerate(parameters):
-        if parameter.place >= _ROW:
-            moves[row] = functions[:, parameter.joint, parameter.place - _ROW]
-        elif parameter.link:
-            moves[row] = rows[:, parameter.link - 1, parameter.place]
+    step, moves = _STEPS[like.convention], np.zeros((len(parameters), len(model.values)))
+    for at, row in enumerate(step * np.eye(len(model.values))):
+        if not any(change.any() for change in model.changes(row)):
+            continue
+        ends = []
+        for values in (model.values + row, model.values - row):
+            arm = model.nominal.corrected(*model.changes(values), model.harmonics)
+            table = table_of(arm, like.convention, like=like)
+            ends.append(np.array([parameter.value(table) for parameter in parameters]))
+        moves[:, at] = (ends[0] - ends[1]) / (2.0 * step)
     return moves

@@ -121,7 +121,7 @@ def add_parameters(
         by_stops = Jacobians.of_stops(arm)
         by_errors = _error_jacobians(arm, anywhere, weight)
         counts = Identifiability.of(by_stops, by_errors)
-        jacobian = parameter_moves(model, after, parameters)
+        jacobian = parameter_moves(model, before, parameters)
         not_determined = list[str]()
         if counts.determined < counts.identifiable:
             moves = jacobian[:, model.is_kept]
