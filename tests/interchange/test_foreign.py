@@ -72,6 +72,17 @@ def test_the_samples_of_a_camera_on_the_base_are_inverted(tmp_path):
     np.testing.assert_allclose(poses_of(session, "base_from_flange"), BASE_FROM_FLANGE, atol=1e-14)
 
 
+def test_samples_that_say_where_the_camera_is_need_no_mount(tmp_path):
+    recording = easy_handeye(tmp_path / "in")
+    text = recording.source.read_text()
+    recording.source.write_text("parameters: {calibration_type: eye_on_base}\n" + text)
+    session = convert(recording.source, tmp_path / "out")
+    assert session.mount == "eye-to-hand"
+    np.testing.assert_allclose(
+        poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
+    )
+
+
 def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
     robot, camera = quaternions(BASE_FROM_FLANGE).tolist(), quaternions(CAM_FROM_TARGET).tolist()
     own = ["a", "b", "c", "d", "e", "f", "g"]

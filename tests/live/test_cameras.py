@@ -15,7 +15,7 @@ from support.mjpeg import NetworkCamera, number_of, served
 from support.refusals import raised
 
 from visioncal.core.errors import DriverError
-from visioncal.live.drivers import extras
+from visioncal.core.extras import client_library
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.live.drivers.uvc import UvcCamera
 
@@ -26,9 +26,9 @@ PATIENT_S = 20.0
 def test_the_command_installs_what_the_extra_would():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     declared = project["project"]["optional-dependencies"]
-    for extra in ("ur", "oak"):
+    for extra in ("ur", "oak", "cluster", "ros", "lerobot"):
         with pytest.raises(DriverError) as caught:
-            extras.client_library("no_such_module", extra)
+            client_library("no_such_module", extra)
         assert [caught.value.next_step] == [
             f"Install it: pip install '{value}'" for value in declared[extra]
         ]

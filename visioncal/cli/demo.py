@@ -27,6 +27,7 @@ from visioncal.cli.record import (
 )
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_rows
+from visioncal.core.extras import client_library
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.transforms import invert, log, pose_difference
@@ -34,7 +35,6 @@ from visioncal.interchange.outputs import write_outputs, write_plan
 from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.drivers.extras import client_library
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.messages import summary_of
 from visioncal.live.planning.plan import PlanRequest, make_plan

@@ -116,7 +116,7 @@ def choose(
         pairs = [
             f"{object_name(option.camera, 'camera')} and {object_name(option.target, 'target')} "
             f"by robot {object_name(option.flange, 'robot')}"
-            for option in options
+            for option in _combinations(frames, by_part, parted=True)
             if option.camera and option.target
         ]
         raise DataError(
@@ -132,11 +132,12 @@ def choose(
     for part in PARTS:
         remaining = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
         if part in needs and len(remaining) > 1:
-            names = [object_name(name, part) for name in remaining]
+            several = [object_name(name, part) for name in remaining]
             raise DataError(
-                f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
+                f"{label} has several {part}s ({some_of(several)}), and which is meant is not "
+                "said.",
                 culprits=[f"--{part}"],
-                next_step=f"Name one: --{part} {names[0]}.",
+                next_step=f"Name one: --{part} {several[0]}.",
             )
     return fitting[0]
 

@@ -179,7 +179,7 @@ def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
         return written.forms[0]
     # Bare numbers may be of any form that the user states.
     is_bare = written.forms in _BARE_FORMS.values()
-    if stated in POSE_FORMS and (is_bare or stated in written.forms):
+    if stated is not None and stated in POSE_FORMS and (is_bare or stated in written.forms):
         return stated
     makers = ", ".join(written.forms)
     said = "" if stated is None else f", not of {stated!r}"

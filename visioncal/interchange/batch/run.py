@@ -19,7 +19,6 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
-from importlib.util import find_spec
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from threading import Thread
@@ -27,6 +26,7 @@ from typing import get_args
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.extras import client_library
 from visioncal.core.files import natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
@@ -430,20 +430,13 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _cluster(scheduler: str | None) -> Iterator[Executor]:
-    if find_spec("distributed") is None:
-        raise DataError(
-            "a scheduler needs Dask, which is not installed.",
-            culprits=["--scheduler"],
-            next_step="pip install 'visioncal[cluster]'",
-        )
-    from distributed import Client
-
+    distributed = client_library("distributed", "cluster")
     # It prints tracebacks where a scheduler goes away, which rows say.
     log = logging.getLogger("distributed.client")
     log_level = log.level
     log.setLevel(logging.CRITICAL)
     try:
-        client = Client(scheduler, timeout=_TIMEOUT_S, set_as_default=False)
+        client = distributed.Client(scheduler, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(
             f"no scheduler answers at {scheduler}: {error}", culprits=["--scheduler"]

@@ -8,12 +8,15 @@ memory does not grow with the bag.
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from threading import Lock
+from types import ModuleType
 from typing import Any, TypeAlias
+from weakref import finalize
 
 import cv2
 import numpy as np
@@ -22,6 +25,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.calibration.stages.motion import is_standing_still
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.extras import client_library
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
@@ -109,49 +113,55 @@ class BagImages(ImageStore):
     source: Path
     # The topic, whether it is compressed, and the time of receipt [ns], by path.
     places: Mapping[str, tuple[str, bool, int]]
+    _lock: Lock = field(default_factory=Lock, repr=False)  # A reader is of one thread at a time.
+
+    @cached_property
+    def _reader(self) -> Reader:
+        stack = ExitStack()
+        finalize(self, stack.close)
+        return stack.enter_context(_opened(self.source))
 
     def read(self, path: str) -> bytes:
         """Reads one image: as it was compressed, or as a PNG."""
         if path not in self.places:
             raise DataError(f"The bag has no image {path}.", culprits=[path])
         topic, is_compressed, at_ns = self.places[path]
-        with _opened(self.source) as reader:
+        with self._lock, _bag_errors(self.source):
+            reader = self._reader
             connections = [each for each in reader.connections if each.topic == topic]
             rows = reader.messages(connections=connections, start=at_ns, stop=at_ns + 1)
             connection, _, raw = next(iter(rows))
             message = reader.deserialize(raw, connection.msgtype)
-            return bytes(message.data) if is_compressed else _png(message, topic)
+        return bytes(message.data) if is_compressed else _png(message, topic)
 
     def absence(self, path: str) -> str:
         """Why there is no such image; empty where there is one."""
         return "" if path in self.places else "is missing"
 
 
+def _rosbags(name: str) -> ModuleType:
+    return client_library(f"rosbags.{name}", "ros")
+
+
 @contextmanager
 def _opened(source: Path) -> Iterator[Reader]:
-    """An open reader of a bag of any form.
-
-    Raises:
-        DataError: The extra is not installed, or the bag cannot be read.
-    """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise DataError(
-            f"{source} is a bag of ROS, and rosbags, which reads it, is not installed.",
-            culprits=[str(source)],
-            next_step="Install it (no ROS is needed): pip install 'visioncal[ros]'",
-        ) from error
+    """An open reader of a bag of any form; raises DataError."""
+    highlevel, typesys = map(_rosbags, ("highlevel", "typesys"))
     paths = sorted(source.glob("*.bag")) if source.is_dir() else [source]
-    try:
+    with _bag_errors(source):
         # Bags of old versions of ROS 2 do not hold the definitions of their messages.
-        types = get_typestore(Stores.ROS2_HUMBLE)
-        with AnyReader(paths or [source], default_typestore=types) as reader:
+        types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        with highlevel.AnyReader(paths or [source], default_typestore=types) as reader:
             yield reader
+
+
+@contextmanager
+def _bag_errors(source: Path) -> Iterator[None]:
+    """Turns whatever a damaged bag's reader meets into a DataError."""
+    try:
+        yield
     except VisioncalError:
         raise
-    # A damaged bag raises whatever its reader meets.
     except Exception as error:
         raise DataError(
             f"{source} cannot be read as a bag: {error}.",

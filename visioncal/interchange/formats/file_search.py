@@ -41,17 +41,10 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
     """Images of a folder in natural order."""
     if images := tuple(path for path in files_in(folder) if is_image_name(path.name)):
         return images
-    if folder.is_dir():
-        raise DataError(
-            f"{folder} has no images (png, jpg, tif, bmp, webp).",
-            culprits=[str(folder)],
-            next_step="Name the folder of the images with --images.",
-        )
     raise DataError(
-        f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder of the "
-        "images is needed.",
+        f"{folder} has no images (png, jpg, tif, bmp, webp), or is no folder.",
         culprits=[str(folder)],
-        next_step="Check the path and its spelling.",
+        next_step="Name the folder of the images with --images.",
     )
 
 
@@ -68,15 +61,10 @@ def head(path: Path) -> str:
 def images_named(
     names: Sequence[str | None], base: Path, folder: Path | None
 ) -> tuple[Path | None, ...]:
-    """Finds the images that rows name.
+    """(n,) paths of the images that rows name; of a missing image the one that the source states.
 
-    Args:
-        names: (n,) image names; None or empty in a row without an image.
-        base: What the names are relative to: they are there, or in the folder `images` beside.
-        folder: Where the images are now; matched by name, else by the number in it.
-
-    Returns:
-        (n,) paths; for a missing image the path that the source states.
+    Names are relative to `base`, or to the folder `images` in it; in `folder`, if given, images
+    are matched by their names, else by the numbers in these.
 
     Raises:
         DataError: A name leaves the folder, or is not an image's.
@@ -122,13 +110,10 @@ def images_beside(
     *,
     numbered: bool,
 ) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
-    """Pairs rows by number or in order with the images of `chosen`, else with any in the folder.
+    """Pairs rows with the images of `chosen`, else with any in `folder`, and notes assumptions.
 
-    With `numbered` the rows' numbers are from the source's names; otherwise rows and images are
-    paired in natural order, and their counts must agree.
-
-    Returns:
-        (n,) paths, None in a row whose number no image has; and a note where order decides.
+    With `numbered` the rows' numbers are from the source's names, as are the images'; otherwise
+    both are paired in natural order, and their counts must agree.
 
     Raises:
         DataError: `chosen` has no images, or not as many as there are rows.

@@ -32,6 +32,7 @@ from visioncal.interchange.formats.reading import (
 )
 
 _NONE = PoseImportOptions()
+_EASY_MOUNTS: Mapping[str, Mount] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand"}
 
 
 def _quaternions(*names: str, inverse: bool | None = None) -> PoseImportOptions:
@@ -51,13 +52,15 @@ def _is_easy_handeye(path: Path) -> bool:
 def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform."""
     # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
-    # serves both (easy_handeye2, HandeyeSampler); the file itself does not say which it is.
+    # serves both (easy_handeye2, HandeyeSampler). Newer files say in their parameters which it is.
     document = mapping(read_yaml(path), str(path))
     fields = fields_of_document(document.get("samples"), path)
+    parameters = document.get("parameters")
+    stated = {**document, **(parameters if isinstance(parameters, Mapping) else {})}
+    mount = requested.mount or _EASY_MOUNTS.get(str(stated.get("calibration_type")))
     seen = "tracking" if "tracking.translation" in fields.numbers else "optical"
-    inverse = requested.mount == "eye-to-hand"
     requested = requested.with_poses(
-        _quaternions("robot.translation", "robot.rotation", inverse=inverse),
+        _quaternions("robot.translation", "robot.rotation", inverse=mount == "eye-to-hand"),
         _quaternions(f"{seen}.translation", f"{seen}.rotation"),
     )
     note = (
@@ -66,7 +69,8 @@ def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording
         else "as they stand, as with the camera in the hand"
     )
     foreign = foreign_from(fields, requested)
-    return replace(foreign, notes=(*foreign.notes, f"The robot's poses are read {note}."))
+    notes = (*foreign.notes, f"The robot's poses are read {note}.")
+    return replace(foreign, mount=mount, notes=notes)
 
 
 def _is_moveit(path: Path) -> bool:

@@ -16,6 +16,7 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents.jsons import parse_json
 from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
+from visioncal.core.extras import client_library
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
@@ -78,26 +79,15 @@ def _info(path: Path) -> Path:
 
 
 def _parquet(path: Path, columns: list[str], rows: IntArray | None = None) -> dict[str, list[Any]]:
-    """The columns of a parquet file, of some rows or of all.
-
-    Raises:
-        DataError: The extra is not installed, or the file cannot be read.
-    """
+    """The columns of a parquet file, of some rows or of all."""
+    parquet = client_library("pyarrow.parquet", "lerobot")
     try:
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_table
-    except ImportError as error:
-        raise DataError(
-            f"{path} is parquet, and pyarrow, which reads it, is not installed.",
-            culprits=[str(path)],
-            next_step="Install it: pip install 'visioncal[lerobot]'",
-        ) from error
-    try:
-        table = read_table(path, columns=columns)
+        table = parquet.read_table(path, columns=columns)
         if rows is not None:
             table = table.take(rows)
         columns_read: dict[str, list[Any]] = table.to_pydict()
-    except (ArrowException, OSError, ValueError) as error:
+    # Errors of pyarrow are among these.
+    except (OSError, ValueError, LookupError, RuntimeError, TypeError) as error:
         raise DataError(
             f"{path} cannot be read as parquet: {error}.",
             culprits=[str(path)],

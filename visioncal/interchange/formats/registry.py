@@ -176,17 +176,12 @@ def _is_recording(path: Path) -> bool:
 
 
 def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
-    if not source.exists():
-        raise DataError(
-            f"{source} does not exist.",
-            culprits=[str(source)],
-            next_step="Check the path and its spelling.",
-        )
     if not (source.is_file() or source.is_dir()):
         raise DataError(
-            f"{source} is no regular file; a file or a folder is needed.",
+            f"{source} {'is no regular file' if source.exists() else 'does not exist'}; a file or "
+            "a folder is needed.",
             culprits=[str(source)],
-            next_step="Save what it gives as a file first.",
+            next_step="Check the path and its spelling.",
         )
     names = [foreign_format.name for foreign_format in FOREIGN_FORMATS]
     if form is not None and form not in names:
@@ -198,8 +193,7 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     for candidate in FOREIGN_FORMATS:
         if candidate.name == form or (form is None and candidate.recognises(source)):
             return candidate
-    own_formats = ("a session's folder", "an .rrd recording")
-    words = "; ".join([*own_formats, *(foreign_format.words for foreign_format in FOREIGN_FORMATS)])
+    words = "; ".join(foreign_format.words for foreign_format in FOREIGN_FORMATS)
     contents = ", ".join(path.name for path in files_in(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."

@@ -19,9 +19,9 @@ import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
 from visioncal.core.errors import DriverError
+from visioncal.core.extras import client_library
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
-from visioncal.live.drivers.extras import client_library
 from visioncal.live.drivers.protocols import ArmState, JointSample, Safety, Stopwatch
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,

@@ -1,0 +1,31 @@
+"""Import of optional libraries, with the command that installs a missing one."""
+
+from importlib import import_module
+from types import ModuleType
+
+from visioncal.core.errors import DriverError
+
+# Packages of the extras, by their names in pyproject.toml.
+_PACKAGES = {
+    "ur": "ur-rtde>=1.6.5,<2",
+    "oak": "depthai>=3.12,<4",
+    "cluster": "distributed>=2025.1",
+    "ros": "rosbags>=0.11,<0.12",
+    "lerobot": "pyarrow>=18",
+}
+
+
+def client_library(module: str, extra: str) -> ModuleType:
+    """Imports a library that an extra brings.
+
+    Raises:
+        DriverError: It is not installed, with the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise DriverError(
+            f"{module} cannot be imported: {error}.",
+            culprits=[module],
+            next_step=f"Install it: pip install '{_PACKAGES[extra]}'",
+        ) from error
