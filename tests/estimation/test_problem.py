@@ -29,6 +29,7 @@ from visioncal.estimation.model_evidence import (
     TURN_PER_M,
     CalibrationPosterior,
     ChangeHypothesis,
+    RepeatedStops,
     evidence_of,
     undone,
     with_change,
@@ -460,6 +461,19 @@ def seen_as(problem, measured):
 
 def belief_of(state, freedom=np.inf, sigma=1e-5):
     return CalibrationPosterior(state, sigma**2 * np.eye(12), NOISE, freedom)
+
+
+def test_noise_that_explains_more_than_all_sources_is_no_failure():
+    data, state = stops_of("eye-in-hand", np.random.default_rng(5))
+    belief, count = belief_of(state, sigma=1.0), len(data)
+    repeated = RepeatedStops(
+        np.zeros(1, dtype=np.int64),
+        np.zeros((1, 6)),
+        np.eye(count + 1),
+        np.append(data.observations.stops, count),
+        4.0 * belief.covariance,
+    )
+    assert np.isfinite(evidence_of(data, replace(belief, repeated=repeated)).likelihood)
 
 
 def test_misfit_and_evidence_follow_their_distributions():

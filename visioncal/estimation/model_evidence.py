@@ -209,7 +209,10 @@ def _whitened(
             residuals = residuals - gain @ again.residuals.reshape(-1)
             total = total - gain @ cross
             elsewhere = jacobian * np.repeat(~np.isin(np.arange(count), repeats), 6)[:, None]
-            total += elsewhere @ (belief.covariance - by_noise) @ elsewhere.T
+            # Of other sources nothing may be left, or by rounding and other noise less than that.
+            variances, vectors = np.linalg.eigh(belief.covariance - by_noise)
+            root = elsewhere @ vectors * np.sqrt(np.maximum(variances, 0.0))
+            total += root @ root.T
             jacobian = jacobian - gain @ by_unknowns[repeats].reshape(size - end, -1)
         root = cholesky(total + jacobian @ by_noise @ jacobian.T, lower=True)
         whitened[factor, new_share] = _White(

@@ -17,7 +17,6 @@ from visioncal.calibration.verification.change_hypotheses import (
     VIEW,
 )
 from visioncal.calibration.verification.check import Check, Suspect
-from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
@@ -104,7 +103,9 @@ def verdict_of(check: Check) -> Verdict:
     likeliest, *others = check.named
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
     step = _runnable(check, _KINDS[kind][1])
-    reasons = [Finding(kind, words, step, probability=likeliest.probability)]
+    # Where something else has changed, too, its probability among those compared says little.
+    share, is_alone = likeliest.probability, check.explained
+    reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
     if not check.explained:
@@ -269,14 +270,11 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def to_document(
-    check: Check, triggers: Sequence[Trigger], verdict: Verdict | None = None
-) -> dict[str, Any]:
+def to_document(check: Check, verdict: Verdict | None = None) -> dict[str, Any]:
     """Converts a check to a JSON document; unknown values are absent.
 
     Args:
         check: The check.
-        triggers: Evaluation of the reasons to calibrate again.
         verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
     """
     calibration, observed = check.calibration, check.predicted.observed
@@ -320,8 +318,6 @@ def to_document(
             {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
         ],
         "warnings": list(check.predicted.warnings),
-        "recalibrate": any(trigger.state == "fired" for trigger in triggers),
-        "triggers": [trigger.document for trigger in triggers],
     }
 
 
