@@ -57,6 +57,8 @@ _CHOICE = 4
 # Cosine between the z axes of board and base above which only a camera below would see the board.
 _FACE_DOWN = 0.7
 _SESSION = "session.toml"
+# Options without which a cell is not known.
+_NEEDED = ("target", "camera", "cam", "board")
 # Limits of the arm and the camera, and obstacles.
 Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
 
@@ -120,9 +122,9 @@ def _plan_to_verify(
         )
     count = options.wanted.stops or CheckLimits.stops
     spread = stops_to_repeat(calibration, start.session, count)
-    fit, robot, plan = calibration.joint_fit, calibration.robot, None
+    fit, plan = calibration.joint_fit, None
     targets = {} if fit is None else fit.targets
-    if spread.q is not None and robot is not None and (words.target or "" in targets):
+    if spread.q is not None and calibration.robot and (words.target or "" in targets):
         more = stops_to_repeat(calibration, start.session, _CHOICE * count)
         with shown_progress(quiet=options.as_json) as progress:
             try:
@@ -143,16 +145,10 @@ def _plan_to_verify(
     if options.as_json:
         print_json(document)
     else:
-        views = listed([str(view) for view in spread.views])
-        answer(
-            f"{count} stops at postures of {calibration.session_name}"
-            + (f", of views {views}:" if plan is None else ":")
-        )
-        for command in (
-            f"visioncal record {record} --camera uvc:0 -o monday",
-            f"visioncal verify monday --against {options.source}",
-        ):
-            answer(f"  {command}")
+        of_views = "" if plan else f", of views {listed([*map(str, spread.views)])}"
+        answer(f"{count} stops at postures of {calibration.session_name}{of_views}:")
+        answer(f"  visioncal record {record} --camera uvc:0 -o monday")
+        answer(f"  visioncal verify monday --against {options.source}")
     report_written(written, quiet=options.as_json)
 
 
@@ -333,13 +329,7 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
     if source.calibration is not None:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
-    # Malformed options are reported before missing ones.
-    numbers = _camera_numbers(words.camera)
-    for option, pose in (("--cam", words.cam), ("--board", words.board)):
-        if pose is not None:
-            pose_of(pose, option)
-    needed = ("target", "camera", "cam", "board", *(() if numbers is None else ("resolution",)))
-    missing = [f"--{value}" for value in needed if getattr(words, value) is None]
+    missing = [f"--{name}" for name in _NEEDED if getattr(words, name) is None]
     if missing or source.robot is None:
         raise DataError(
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
@@ -348,11 +338,10 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
             next_step="Give them, or plan from a session or a calibration of the cell.",
         )
     refuse_given(words.options("robot"), f"{source.words} is named already")
-    camera = _camera(str(words.camera), words.resolution)
     cell = PlanCell(
         words.mount or "eye-in-hand",
         source.robot,
-        camera,
+        _camera(str(words.camera), words.resolution),
         target_named(str(words.target)),
         pose_of(str(words.cam), "--cam"),
         pose_of(str(words.board), "--board"),
@@ -426,11 +415,10 @@ def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
 
 
 def _camera(words: str, resolution: tuple[int, int] | None) -> Camera:
-    matrix = _camera_numbers(words)
-    if matrix is not None:
-        return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
-    path = Path(words)
-    if path.is_dir() or path.suffix.lower() == ".rrd" or "transforms" in content_of(path):
+    path, lens = Path(words), dict[str, Any]()
+    if "," in words and not path.exists():
+        lens = {"model": "brown", "matrix": numbers_in(words, "--camera", "fx,fy,cx,cy")}
+    elif path.is_dir() or path.suffix.lower() == ".rrd" or "transforms" in content_of(path):
         calibrated = load_calibration(path, ANY, LENS).camera
         if calibrated is None:
             raise DataError(
@@ -438,23 +426,13 @@ def _camera(words: str, resolution: tuple[int, int] | None) -> Camera:
                 culprits=["--camera"],
             )
         return calibrated.camera
-    lens, _ = read_intrinsics(path)
-    width, height = lens["resolution"] if "resolution" in lens else _size(resolution)
-    distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)
-    return Camera(lens["model"], (int(width), int(height)), np.array(lens["matrix"]), distortion)
-
-
-def _camera_numbers(words: str | None) -> tuple[float, ...] | None:
-    """The numbers of the camera matrix, where they were given."""
-    if words is None or "," not in words or Path(words).exists():
-        return None
-    return numbers_in(words, "--camera", "fx,fy,cx,cy")
-
-
-def _size(resolution: tuple[int, int] | None) -> tuple[int, int]:
-    if resolution is None:
+    else:
+        lens, _ = read_intrinsics(path)
+    size = lens.get("resolution", resolution)
+    if size is None:
         raise DataError(
             "--resolution is needed beside this --camera: width and height of the images [px].",
             culprits=["--resolution"],
         )
-    return resolution
+    distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)
+    return Camera(lens["model"], (int(size[0]), int(size[1])), np.array(lens["matrix"]), distortion)

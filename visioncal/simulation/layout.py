@@ -1,18 +1,20 @@
 """Options of simulated cells: components, faults, and independent sources of randomness."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from visioncal.core.arguments import check_fields
+from visioncal.core.codec import WrittenForm, type_error
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.session import frame_name
 from visioncal.simulation.arms import ArmOptions
-from visioncal.simulation.boards import BOARDS, Sheet
-from visioncal.simulation.optics import fine_camera, wide_camera
+from visioncal.simulation.boards import BOARDS, TARGETS, Sheet
+from visioncal.simulation.optics import CAMERAS, fine_camera, wide_camera
 from visioncal.simulation.poses import Motion, Viewpoints
 
 # Centre of the cell, which robots face [m].
@@ -51,6 +53,17 @@ class RandomStream(IntEnum):
     LENS_VIEWS = 108
     READINGS = 109
     SWEEPS = 111
+
+
+def _named(things: Mapping[str, object]) -> WrittenForm:
+    """A thing that a file of a cell names."""
+
+    def named(name: object, path: str) -> object:
+        if name not in things:
+            raise type_error(name, f"one of {', '.join(things)}", path)
+        return things[str(name)]
+
+    return WrittenForm(str, named)
 
 
 # Sources that another draw of the same cell changes, and those that another recording keeps.
@@ -92,7 +105,7 @@ class DrawOptions:
 class CameraOptions:
     """A camera with its stated intrinsics and the quality of its images."""
 
-    camera: Camera = field(default_factory=wide_camera)  # True optics.
+    camera: Annotated[Camera, _named(CAMERAS)] = field(default_factory=wide_camera)  # True optics.
     state_intrinsics: bool = True  # Whether the session states the intrinsics.
     # Error of the stated intrinsics, as root mean square over the image [px].
     lens_mismatch_px: float = 0.0
@@ -154,7 +167,7 @@ class BoardAt(Sheet):
     # Position of its centre in the cell, if fixed [m].
     place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tilt_rad: float = 0.0  # Tilt towards the centre of the cell [rad].
-    target: Target = field(default=BOARDS["charuco"], kw_only=True)
+    target: Annotated[Target, _named(TARGETS)] = field(default=BOARDS["charuco"], kw_only=True)
 
 
 @dataclass(frozen=True)
