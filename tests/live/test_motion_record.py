@@ -9,7 +9,7 @@ from support.commands import visioncal as run
 from visioncal.cli import dynamics
 from visioncal.core.errors import DriverError
 from visioncal.live.capture.motions import record_motion
-from visioncal.live.drivers.protocols import JointSample
+from visioncal.live.drivers.protocols import ArmState
 from visioncal.live.simulated.controller import ControllerOptions, spawn
 from visioncal.session import Session
 
@@ -19,23 +19,24 @@ RATE_HZ = 100.0
 class Scripted:
     """Joints at rest, in motion from `begin_s` to `end_s`, with a short rest in between."""
 
-    name, rate_hz = "scripted arm", RATE_HZ
+    name = "scripted arm"
 
     def __init__(self, begin_s, end_s):
         self.begin_s, self.end_s, self.at = begin_s, end_s, 0
 
-    def sample(self):
+    def state(self):
         """The next one."""
         now_s = self.at / RATE_HZ
         self.at += 1
         middle = 0.5 * (self.begin_s + self.end_s)
         moves = self.begin_s <= now_s < self.end_s and not middle < now_s < middle + 1.0
         dq = np.array([0.3, -0.1]) * moves
-        return JointSample(now_s, np.array([now_s, 0.0]), dq, np.array([1.0, 2.0]))
+        told = {"q": np.array([now_s, 0.0]), "dq": dq, "currents_a": np.array([1.0, 2.0])}
+        return ArmState(now_s, np.eye(4), controller_s=now_s, **told)
 
 
 def test_a_motion_is_recorded_from_before_its_begin_to_behind_its_end():
-    stream = record_motion(Scripted(5.0, 12.0), rest_s=2.0)
+    stream = record_motion(Scripted(5.0, 12.0), RATE_HZ, rest_s=2.0)
     assert stream.columns == (
         *("stamp_s", "q1_rad", "q2_rad", "dq1_rad_s", "dq2_rad_s", "current1_a", "current2_a"),
     )
@@ -47,7 +48,7 @@ def test_a_motion_is_recorded_from_before_its_begin_to_behind_its_end():
 
 def test_an_arm_that_never_moves_is_named():
     with pytest.raises(DriverError, match="scripted arm has not moved for 3 s"):
-        record_motion(Scripted(50.0, 51.0), patience_s=3.0)
+        record_motion(Scripted(50.0, 51.0), RATE_HZ, patience_s=3.0)
 
 
 def test_other_arms_and_streams_that_are_there_are_refused(tmp_path):
@@ -63,18 +64,18 @@ def test_a_ur_is_recorded_through_its_client_library(tmp_path, monkeypatch):
     with spawn(ControllerOptions(rate_hz=500.0)) as controller:
         home = np.array(ControllerOptions().q)
 
-        def recorded(joints, **options):
+        def recorded(arm, rate_hz, **options):
             """Moves the arm once some states at rest were taken."""
-            sample, rested = joints.sample, itertools.count(1)
+            state, rested = arm.state, itertools.count(1)
 
             def sampled():
-                found = sample()
+                found = state()
                 if next(rested) == 100:
                     controller.guide(home + 0.4, speed=0.4, acceleration=1.0)
                 return found
 
-            monkeypatch.setattr(joints, "sample", sampled)
-            return record_motion(joints, **options)
+            monkeypatch.setattr(arm, "state", sampled)
+            return record_motion(arm, rate_hz, **options)
 
         monkeypatch.setattr(dynamics, "record_motion", recorded)
         arguments = ("--arm", f"ur:{controller.host}", "--rest-s", "1.0")

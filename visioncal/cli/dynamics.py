@@ -67,7 +67,7 @@ from visioncal.dynamics.run import (
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
-from visioncal.live.drivers.ur import UrMotion
+from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.messages import plan_warnings, plan_words
 from visioncal.present.torques import torque_table
 from visioncal.present.words import said
@@ -173,9 +173,9 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
         )
     path = options.out / STREAMS / f"{options.stream}.csv"
     check_free(path, force=False, replaceable=False)
-    with signals_as_interrupts(), closing(UrMotion(host)) as joints:
-        found = record_motion(joints, rest_s=options.rest_s, report=say)
-        model = options.robot or joints.model
+    with signals_as_interrupts(), closing(UrArm(host, watch_only=True, full_rate=True)) as arm:
+        found = record_motion(arm, arm.rate_hz, rest_s=options.rest_s, report=say)
+        model = options.robot or arm.model
     check_stream(options.stream, found)
     out, streams = options.out, {options.stream: found}
     if (out / "session.toml").is_file():

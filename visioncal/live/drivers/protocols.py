@@ -32,6 +32,7 @@ class ArmState:
     currents_a: FloatArray | None = None  # (n,) motor currents [A].
     temperatures_c: FloatArray | None = None  # (n,) joint temperatures [C].
     safety: Safety = "normal"  # Whether it may move.
+    controller_s: float = 0.0  # Time on the controller's own clock, where it has one [s].
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,26 +42,6 @@ class Frame:
     image: Image  # (h, w) grey or (h, w, 3) blue, green, red.
     stamp_s: float  # Middle of the exposure, on the host's monotonic clock [s].
     exposure_s: float | None = None  # Exposure time [s], where the camera reports it.
-
-
-@dataclass(frozen=True, eq=False)
-class JointSample:
-    """Joint states at one moment."""
-
-    stamp_s: float  # Time on the controller's own clock [s].
-    q: FloatArray  # (n,) joint angles [rad].
-    dq: FloatArray  # (n,) joint speeds [rad/s].
-    currents_a: FloatArray  # (n,) motor currents [A].
-
-
-class Joints(Protocol):
-    """Source of joint states at a high rate."""
-
-    name: str  # Name in messages: `UR10e at 192.168.0.10`.
-    rate_hz: float  # Rate of the samples.
-
-    def sample(self) -> JointSample:
-        """Returns the next sample."""
 
 
 class Arm(Protocol):

@@ -22,7 +22,7 @@ from visioncal.core.errors import DriverError
 from visioncal.core.extras import client_library
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
-from visioncal.live.drivers.protocols import ArmState, JointSample, Safety, Stopwatch
+from visioncal.live.drivers.protocols import ArmState, Safety, Stopwatch
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,
     Condition,
@@ -151,11 +151,7 @@ class StateStream:
     """
 
     def __init__(
-        self,
-        library: ModuleType,
-        host: str,
-        version: tuple[int, int, int],
-        rate_hz: float = _RATE_HZ,
+        self, library: ModuleType, host: str, version: tuple[int, int, int], rate_hz: float
     ) -> None:
         self._host = host
         self.reports_payload = version >= _REPORTS_PAYLOAD[version[0]]
@@ -247,19 +243,21 @@ class UrArm:
         host: The controller's address.
         watch_only: Whether only states are read, as while it is guided by hand: it then needs no
             remote control, and cannot be moved from here. The tool offset is read once.
+        full_rate: Whether all states of the controller are asked for, up to 500 a second.
 
     Raises:
         DriverError: The client library is missing; the host is unreachable or no UR; the arm is
             off, stopped or in local control; each with a remedy.
     """
 
-    def __init__(self, host: str, *, watch_only: bool = False) -> None:
+    def __init__(self, host: str, *, watch_only: bool = False, full_rate: bool = False) -> None:
         receive = client_library("rtde_receive", _EXTRA)
         control = None if watch_only else client_library("rtde_control", _EXTRA)
         self._host = host
         condition = check_controller(self._host, moves=not watch_only)
         self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
-        self._states = StateStream(receive, self._host, condition.version)
+        self.rate_hz = _RATES_HZ[condition.version[0]] if full_rate else _RATE_HZ
+        self._states = StateStream(receive, self._host, condition.version, self.rate_hz)
         self._control: Any = None
         self._line: CallThread | None = None
         self._moves_before: int | None = None
@@ -317,6 +315,7 @@ class UrArm:
             currents_a=np.array(currents),
             temperatures_c=np.array(temperatures),
             safety=safety,
+            controller_s=stamp,
         )
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
@@ -517,44 +516,3 @@ def _matrix(pose: list[float]) -> FloatArray:
     numbers = np.array(pose)
     form = ROTATION_FORMS[POSE_FORMS["ur"].rotation]
     return compose(form.read(numbers[None, 3:])[0], numbers[:3])
-
-
-class UrMotion:
-    """Joint states of the UR at a host, which another program moves.
-
-    Raises:
-        DriverError: The client library is missing, or the host is unreachable or no UR.
-    """
-
-    def __init__(self, host: str) -> None:
-        receive = client_library("rtde_receive", _EXTRA)
-        condition = check_controller(host, moves=False)
-        self.name = f"{condition.model} at {host}"
-        self.model = condition.model.lower()
-        self.rate_hz = _RATES_HZ[condition.version[0]]
-        self._states = StateStream(receive, host, condition.version, self.rate_hz)
-
-    def sample(self) -> JointSample:
-        """Waits for the next state that the controller sends.
-
-        Raises:
-            DriverError: None comes for 0.8 s, or the arm was stopped.
-        """
-        client = self._states.client
-        while True:
-            stamp_s = self._states.wait()
-            q, dq, currents = client.getActualQ(), client.getActualQd(), client.getActualCurrent()
-            # Otherwise values of a newer state are among them.
-            if client.getTimestamp() == stamp_s:
-                break
-        if self._states.safety not in ("normal", "reduced"):
-            raise DriverError(
-                f"The {self.name} is stopped: {self._states.safety}.",
-                culprits=[self.name],
-                next_step="See the pendant, and record the motion again from its beginning.",
-            )
-        return JointSample(stamp_s, np.array(q), np.array(dq), np.array(currents))
-
-    def close(self) -> None:
-        """Disconnects."""
-        self._states.disconnect().join(_CLOSE_S)
