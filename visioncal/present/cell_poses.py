@@ -14,7 +14,6 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.frames import CELL
-from visioncal.session.observations import robot_rows_at_stops
 from visioncal.session.table import reported_matrices
 
 
@@ -69,7 +68,7 @@ def _cell_states(
 
     A robot without a pose so far has its first one.
     """
-    rows = robot_rows_at_stops(session.declaration, session.views)
+    rows = session.robot_rows
     models = result_parts.calibrated_robots(calibration)
     states: dict[str, Mapping[int, RobotState]] = {}
     for flange, name in result_parts.frames(calibration).robots.items():

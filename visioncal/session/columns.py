@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 
 from scipy.spatial.transform import Rotation
 
@@ -97,7 +98,8 @@ def _no_temperature(value: float) -> str:
     )
 
 
-def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:
+@cache
+def joint_columns(columns: tuple[str, ...]) -> tuple[str, ...]:
     """The columns of joint angles, q1_rad first."""
     numbers = sorted(int(match[1]) for name in columns if (match := _JOINT.fullmatch(name)))
     return tuple(f"q{number}_rad" for number in numbers)
@@ -130,7 +132,7 @@ def check_header(columns: Sequence[str], where: str) -> None:
         rotations = (names for names in ROTATIONS if lower.keys() >= set(names))
         others += [lower[name] for name in next(rotations, ())]
     # Additional columns beside complete poses or joints are not meant as poses.
-    has_state = bool(set(POSE) & set(columns) or joint_columns(columns))
+    has_state = bool(set(POSE) & set(columns) or joint_columns(tuple(columns)))
     if others and (problems or (not has_state and len(others) > len(POSITION))):
         raise DataError(
             f"{where}: poses are in {','.join(others)}, and {', '.join(POSE)} are needed, in "
@@ -163,7 +165,7 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
             "the column view, a whole number that names each row, is missing"
             f"{_spelt_otherwise(columns, ['view'])}"
         )
-    joints = joint_columns(columns)
+    joints = joint_columns(tuple(columns))
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]
     if gaps:

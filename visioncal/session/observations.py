@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.transforms import pose_difference
-from visioncal.session.columns import LOAD, POSE, joint_columns
+from visioncal.session.columns import LOAD, POSE
 from visioncal.session.document import Declaration
 from visioncal.session.frames import observed, robots_between
 from visioncal.session.kinds import has_robot_state, name_of
@@ -149,8 +149,8 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
     majority = {}
     for robot, own in rows_of.items():
-        counts = Counter(map(_pose_cells, own))
-        first = {_pose_cells(view): view for view in own[::-1]}
+        counts = Counter(view.robot_cells for view in own)
+        first = {view.robot_cells: view for view in own[::-1]}
         votes = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )
@@ -158,19 +158,13 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
     return majority
 
 
-def _pose_cells(view: View) -> tuple[float | None, ...]:
-    """Pose and joints of a row as they were read, for exact comparison."""
-    names = (*POSE, *joint_columns(tuple(view.numbers)))
-    return tuple(view.numbers.get(name) for name in names)
-
-
 def _differ(first: View, second: View) -> bool:
     """Whether two rows have different poses of one robot."""
-    if _pose_cells(first) == _pose_cells(second):
+    if first.robot_cells == second.robot_cells:
         return False
-    poses = first.base_from_flange(), second.base_from_flange()
-    if poses[0] is not None and poses[1] is not None:
-        mm, deg = pose_difference(poses[0].as_matrix(), poses[1].as_matrix())
+    before, after = first.matrix(POSE), second.matrix(POSE)
+    if before is not None and after is not None:
+        mm, deg = pose_difference(before, after)
         return mm > APART_MM or deg > APART_DEG
     joints = first.joints_rad, second.joints_rad
     if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:

@@ -12,7 +12,6 @@ from visioncal.session.document import KINDS
 from visioncal.session.frames import frame_name, frames_of_kind, object_name, robots_between
 from visioncal.session.kinds import COLUMN as TARGET
 from visioncal.session.kinds import has_robot_state, is_camera_observation, name_of
-from visioncal.session.observations import robot_rows_at_stops
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
@@ -208,7 +207,6 @@ def select(
         return session
     if "camera" not in needs:
         chosen = replace(chosen, camera="", target="")
-    robot_rows = robot_rows_at_stops(session.declaration, session.views)
     seen = {one.view.number: (one.seer, one.seen) for one in session.observations}
     # The selected rows, each with the robot's numbers at its stop.
     rows: dict[int, View] = {}
@@ -220,7 +218,7 @@ def select(
             robot = name_of(session.declaration, "robot", view)
             is_selected = has_robot_state(view) and not sees and robot == chosen.robot
         if is_selected:
-            robot_row = robot_rows[view.number].get(chosen.robot, View(0))
+            robot_row = session.robot_rows[view.number].get(chosen.robot, View(0))
             numbers = {k: v for k, v in view.numbers.items() if not _is_of_robots(k)}
             numbers |= {k: v for k, v in robot_row.numbers.items() if _is_of_robots(k)}
             rows[view.number] = replace(view, numbers=numbers)

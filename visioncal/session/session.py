@@ -43,7 +43,12 @@ from visioncal.session.kinds import (
     read_robots,
     read_targets,
 )
-from visioncal.session.observations import Observation, observations_of, stop_warnings
+from visioncal.session.observations import (
+    Observation,
+    observations_of,
+    robot_rows_at_stops,
+    stop_warnings,
+)
 from visioncal.session.saving import digest_of, save_session
 from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import (
@@ -435,6 +440,11 @@ class Session:
         if len(self.robots) > 1:
             return self.robot_document
         return dict.fromkeys(self.robots, self.robot_document)
+
+    @cached_property
+    def robot_rows(self) -> Mapping[int, Mapping[str, View]]:
+        """Rows with the robots' poses at each row's stop: by view number, then by robot."""
+        return robot_rows_at_stops(self.declaration, self.views)
 
     @cached_property
     def frames(self) -> Mapping[str, str]:

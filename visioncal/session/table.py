@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -9,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.core.documents.columns import Column, TableReader, as_whole
 from visioncal.core.documents.tables import TextTable, parse_table
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.robot import Loads
 from visioncal.session import columns as cols
@@ -78,17 +80,28 @@ class View:
             np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
         )
 
-    def instrument_from_probe(self) -> RigidTransform | None:
-        """Pose of a probe measured by an instrument (meas_*), if its rotation was measured, too."""
+    def instrument_from_probe(self) -> FloatArray | None:
+        """(4, 4) of a probe measured by an instrument (meas_*), if its rotation was, too."""
         names = (*cols.INSTRUMENT_POSITION, *cols.INSTRUMENT_QUATERNION)
         complete = names[0] in self.numbers and names[-1] in self.numbers
-        return self._transform(names) if complete else None
+        return self.matrix(names) if complete else None
 
-    def _transform(self, names: Sequence[str]) -> RigidTransform | None:
+    def matrix(self, names: Sequence[str]) -> FloatArray | None:
+        """(4, 4) pose in some columns, if recorded: a transform takes ten times as long."""
         if names[0] not in self.numbers:
             return None
-        values = [self.numbers[name] for name in names]
-        return RigidTransform.from_components(values[:3], Rotation.from_quat(values[3:]))
+        values = np.array([self.numbers[name] for name in names])
+        return compose(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
+
+    def _transform(self, names: Sequence[str]) -> RigidTransform | None:
+        matrix = self.matrix(names)
+        return None if matrix is None else RigidTransform.from_matrix(matrix)
+
+    @cached_property
+    def robot_cells(self) -> tuple[float | None, ...]:
+        """Pose and joints as they were read, for exact comparison."""
+        names = (*cols.POSE, *cols.joint_columns(tuple(self.numbers)))
+        return tuple(self.numbers.get(name) for name in names)
 
     def cell(self, column: str) -> str:
         """Text of a column in views.csv, empty where not filled; numbers read back the same."""
@@ -185,7 +198,7 @@ def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, .
     for row, view in enumerate(views):
         for column, words in _load_problems(view):
             reader.report(row, column, words)
-    joints = cols.joint_columns(columns)
+    joints = cols.joint_columns(tuple(columns))
     # Robots may have different numbers of joints.
     several = "robot" in columns
     reader.complete(

@@ -15,6 +15,7 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
 from visioncal.session import Session
+from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.vision.targets import (
     first_corners,
     numbered_positions,
@@ -209,12 +210,12 @@ def _with_rivals(
 def stated_poses(session: Session) -> dict[int, ViewPoses]:
     """Collects the poses that the session states itself (`cft_` columns), by view."""
     boards = {name: at for at, name in enumerate(session.boards)}
-    given = ((view, view.cam_from_target()) for view in session.views)
+    given = ((view, view.matrix(MEASURED_CAM_POSE)) for view in session.views)
     return {
         view.number: ViewPoses(
             view.number,
             None,
-            np.asarray(pose.as_matrix())[None],
+            pose[None],
             (0,),
             np.zeros((1, 6, 6)),
             np.zeros((1, 6, 0)),

@@ -164,7 +164,7 @@ def _probe(view: View) -> FloatArray:
     """(4, 4) the probe's pose; for a position alone, with the identity as rotation."""
     pose, matrix, read_m = view.instrument_from_probe(), np.eye(4), view.reading_m
     if pose is not None:
-        return np.asarray(pose.as_matrix())
+        return pose
     matrix[:3, 3] = np.zeros(3) if read_m is None else read_m
     return matrix
 

@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import RigidTransform
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
@@ -132,7 +131,10 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
     groups = defaultdict(list)
     for row in session.observations:
         view, found = row.view, corners.get(row.view.number)
-        measured = [_entries(view.cam_from_target()), _entries(view.instrument_from_probe())]
+        measured = [
+            _entries(view.matrix(MEASURED_CAM_POSE)),
+            _entries(view.instrument_from_probe()),
+        ]
         reading = np.concatenate(measured)
         if found is not None:
             reading = found.px.ravel() / _APART_PX
@@ -143,7 +145,7 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
         states = [np.zeros(0)]
         for _, robot in sorted(row.robots.items()):
             joints = robot.joints_rad
-            states += [_entries(robot.base_from_flange())]
+            states += [_entries(robot.matrix(POSE))]
             states += [] if joints is None else [joints / APART_RAD]
         # Who observes what, and what else is measured. A robot's pose in its stream is that of the
         # time.
@@ -172,12 +174,12 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
     return dict(sorted(repeated.items()))
 
 
-def _entries(pose: RigidTransform | None) -> FloatArray:
+def _entries(pose: FloatArray | None) -> FloatArray:
     """Numbers of a pose in units of what rows of one stop may differ by; none for none."""
     if pose is None:
         return np.zeros(0)
     units = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
-    return np.asarray((pose.as_matrix()[:3] / units).ravel())
+    return np.asarray((pose[:3] / units).ravel())
 
 
 def _others(row: View) -> frozenset[tuple[str, float]]:
