@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from support.refusals import raised
 
 from visioncal import calibrate
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.verification import to_document, verdict_of
+from visioncal.calibration.verification import to_document, triggers_of, verdict_of
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
@@ -23,6 +24,7 @@ from visioncal.calibration.verification.prediction import predict_detected, pred
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS
+from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Payload, Second, simulate, write_session
@@ -105,25 +107,50 @@ def test_stops_that_repeat_calibrated_ones_show_what_the_arms_errors_hide(mount)
         assert names(bumped)[0] == "camera"
 
 
+def test_triggers_fire_by_their_limits_and_say_what_is_not_known():
+    place = usual("eye-in-hand")
+    created = datetime(2026, 1, 1, tzinfo=UTC)
+    calibration = replace(place.calibration, means={"ambient_c": 21.0}, created=created.isoformat())
+    session = session_of(place.cell.only(range(5)))
+    warm = tuple(replace(view, numbers={"ambient_c": 33.0}) for view in session.views)
+    also = {"failed": False, "collision": True, "now": created + timedelta(days=200)}
+    evaluated = triggers_of(replace(session, views=warm), calibration, **also)
+    told = {trigger.quantity: trigger for trigger in evaluated}
+    assert {name: trigger.state for name, trigger in told.items()} == {
+        "failed_check": "quiet",
+        "collision": "fired",
+        "ambient_change_k": "fired",
+        "payload_change_kg": "unknown",
+        "age_days": "quiet",
+    }
+    assert "12 K (limit 10)" in told["ambient_change_k"].words
+    assert told["age_days"].value == 200.0
+
+
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     """A calibrated session of pose pairs, and five later ones of the same cell."""
     folder = tmp_path_factory.mktemp("pairs")
     whole = write_session(simulate(CellOptions(views=25, seed=5)), folder / "all", images=False)
     session = Session.load(whole)
-    for name, views in (("fit", session.views[:20]), ("later", session.views[20:])):
-        replace(session, views=views).save(folder / name)
+    cold = [replace(view, numbers={**view.numbers, "ambient_c": 20.0}) for view in session.views]
+    columns = (*session.columns, "ambient_c")
+    for name, views in (("fit", cold[:20]), ("later", cold[20:])):
+        replace(session, columns=columns, views=tuple(views)).save(folder / name)
     assert visioncal("calibrate", folder / "fit", "-o", folder / "out").status == 0
     return folder
 
 
 def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     out = pairs / "out"
+    assert Calibration.load(out).means == {"ambient_c": 20.0}
     done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
     assert done.status == 0
     assert done.out.startswith("pass")
+    assert "the ambient temperature's change, 0 K (limit 10)" in done.out
     written = json.loads((tmp_path / "check/verify.json").read_text())
     assert written["passed"]
+    assert not written["recalibrate"]
     page = Page((tmp_path / "check/report.html").read_text(encoding="utf-8"))
     assert "The calibration still holds" in page.words
     assert all(reference.startswith(("#", "data:")) for reference in page.references)
@@ -143,6 +170,7 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     document = json.loads(done.out)
     assert document["changes"][0]["cause"] == "camera"
     assert document["changes"][0]["moved_mm"] == pytest.approx(20.0, rel=0.1)
+    assert document["recalibrate"]
     assert visioncal("verify", pairs / "later").status == 2
 
 
@@ -189,7 +217,7 @@ def test_a_change_is_told_with_its_size(place, name):
     assert names(found) == expected
     assert not found.passed
     assert words in verdict_of(found).reasons[0]
-    told = to_document(found)["changes"][0]
+    told = to_document(found, ())["changes"][0]
     if name == "two":
         assert set(told) >= {"camera", "board"}
     if true is not None:

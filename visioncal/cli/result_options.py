@@ -133,6 +133,7 @@ class VerifyOptions:
     part: PartOptions
     against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
+    collision: bool = flag("A collision was reported since.")
     output: Path | None = out_folder(f"A folder for {REPORT} and {VERIFY}.", "-o", "--output")
     as_json: bool = json_flag()
 

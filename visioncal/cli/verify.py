@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from visioncal.calibration.verification import to_document, verdict_of, verify
+from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.cli.console import EXIT_BAD, answer, report_written
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
@@ -14,6 +14,13 @@ from visioncal.interchange.outputs import Written, refuse_calibration, write_che
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
+
+# Headings of the triggers by state, with their styles.
+_TRIGGERED = {
+    "fired": ("calibrate again because of: ", "bold yellow"),
+    "quiet": ("no reason to calibrate again: ", ""),
+    "unknown": ("could not be checked: ", ""),
+}
 
 
 def verify_command(options: VerifyOptions) -> None:
@@ -28,12 +35,15 @@ def verify_command(options: VerifyOptions) -> None:
         check = verify(
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
         )
+    triggers = triggers_of(
+        loaded, calibration, failed=not check.passed, collision=options.collision
+    )
     verdict = verdict_of(check).with_paths(options.session, against, ["visioncal", *sys.argv[1:]])
-    document = json.dumps(to_document(check, verdict), indent=2, allow_nan=False) + "\n"
+    document = json.dumps(to_document(check, triggers, verdict), indent=2, allow_nan=False) + "\n"
     written = (
         Written(())
         if options.output is None
-        else write_check(options.output, check, verdict, document)
+        else write_check(options.output, check, triggers, verdict, document)
     )
     if options.as_json:
         typer.echo(document, nl=False)
@@ -47,4 +57,8 @@ def verify_command(options: VerifyOptions) -> None:
         print_steps(verdict.next_steps)
         for view, reason in sorted(check.predicted.observed.reasons.items()):
             answer(f"  view {view} was not used: {reason}")
+        for state, (begin, style) in _TRIGGERED.items():
+            words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
+            if words:
+                answer(words, begin, style)
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

@@ -14,7 +14,7 @@ from visioncal.core.files import json_text, write_atomically, write_generation
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
     from visioncal.calibration.run import Run as Calibrated
-    from visioncal.calibration.verification import Check
+    from visioncal.calibration.verification import Check, Trigger
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
@@ -107,13 +107,15 @@ def write_outputs(
     return _write(folder, results, drawings, without=without)
 
 
-def write_check(folder: Path, check: "Check", verdict: "Verdict", document: str) -> Written:
+def write_check(
+    folder: Path, check: "Check", triggers: "Sequence[Trigger]", verdict: "Verdict", document: str
+) -> Written:
     """Writes a check's page and JSON into a folder; see `write_outputs`."""
 
     def page(path: Path) -> None:
         from visioncal.present.report.check import render_check
 
-        write_atomically(path, render_check(check, verdict))
+        write_atomically(path, render_check(check, triggers, verdict))
 
     return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
 

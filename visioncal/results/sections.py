@@ -264,6 +264,8 @@ class CalibrationSections(ArmSections):
     rigs: Mapping[str, RigResult] = field(default_factory=dict)
     # Uncertainty of a point located where the views look.
     uncertainty: UncertaintyResult | NoiseIntervals | None = None
+    # Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
+    means: Mapping[str, float] = field(default_factory=dict)
     # Parameters of the fit and their covariance, for verification.
     joint_fit: JointFit | None = None
     touch_test: TouchTest | None = None  # Result of a touch test.

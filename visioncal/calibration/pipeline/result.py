@@ -63,6 +63,8 @@ _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
     "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
 )
+# Columns of views.csv with the conditions under which a view was taken.
+CONDITIONS = ("ambient_c", "payload_kg")
 
 
 def result_of(run: RunState) -> Calibration:
@@ -133,6 +135,7 @@ def _sections_of_pair(
     if sections.arm is not None and arm.model is not None:
         views = held_back_by_arm(run.cell_fit, run, arm.robot)
         sections = replace(sections, arm=replace(sections.arm, holdout=views))
+    used = [view.numbers for view in session.views if view.number in run.used]
     # A single target without a name has one section.
     is_unnamed = not session.targets
     return {
@@ -164,6 +167,12 @@ def _sections_of_pair(
         "rig": next(iter(rigs.values()), None) if is_unnamed else None,
         "rigs": {} if is_unnamed else rigs,
         "uncertainty": run.uncertainty,
+        # Of those that all used views state.
+        "means": {
+            name: float(np.mean([numbers[name] for numbers in used]))
+            for name in CONDITIONS
+            if used and all(name in numbers for numbers in used)
+        },
         "joint_fit": _joint_fit(run),
         **vars(sections),
     }

@@ -17,6 +17,7 @@ from visioncal.calibration.verification.change_hypotheses import (
     VIEW,
 )
 from visioncal.calibration.verification.check import Check, Suspect
+from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
@@ -270,11 +271,14 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def to_document(check: Check, verdict: Verdict | None = None) -> dict[str, Any]:
+def to_document(
+    check: Check, triggers: Sequence[Trigger], verdict: Verdict | None = None
+) -> dict[str, Any]:
     """Converts a check to a JSON document; unknown values are absent.
 
     Args:
         check: The check.
+        triggers: Evaluation of the reasons to calibrate again.
         verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
     """
     calibration, observed = check.calibration, check.predicted.observed
@@ -318,6 +322,8 @@ def to_document(check: Check, verdict: Verdict | None = None) -> dict[str, Any]:
             {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
         ],
         "warnings": list(check.predicted.warnings),
+        "recalibrate": any(trigger.state == "fired" for trigger in triggers),
+        "triggers": [trigger.document for trigger in triggers],
     }
 
 

@@ -7,14 +7,18 @@ import numpy as np
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
 from visioncal.calibration.verification.messages import change_words, listed_suspects
+from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
 
+# Words for the states of triggers, in the order of the table.
+_STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
 
-def render_check(check: Check, verdict: Verdict) -> str:
+
+def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) -> str:
     """Renders the page of a check as HTML text."""
     change = check.named[0] if check.named else None
     # The change that can be undone, unlike mere noise.
@@ -31,6 +35,14 @@ def render_check(check: Check, verdict: Verdict) -> str:
         provenance={},
         undone=undone,
         changes=_change_table(check),
+        triggers=_reasons(
+            TableRow(
+                (_STATES[state], "", trigger.words), "look" if state == "fired" else "rejected"
+            )
+            for state in _STATES
+            for trigger in triggers
+            if trigger.state == state
+        ),
         not_used=_reasons(
             TableRow((str(view), "not used", reason), "rejected")
             for view, reason in sorted(check.predicted.observed.reasons.items())
