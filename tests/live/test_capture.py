@@ -377,7 +377,7 @@ class Hand:
     def __init__(self, arm, places):
         self.arm, self.places = arm, iter(places)
 
-    def stepped(self, _):
+    def __call__(self, _):
         """Leads it on."""
         place = next(self.places, None)
         if place is None:
@@ -397,7 +397,7 @@ def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_p
         return frame(**words)
 
     camera.frame = led
-    capture.watchers = (Hand(arm, [plan.stops[1].q + 0.001, plan.stops[2].q]),)
+    capture.watch = Hand(arm, [plan.stops[1].q + 0.001, plan.stops[2].q])
     state, last = arm.state, plan.stops[2].q
 
     def led_on():
@@ -415,7 +415,7 @@ def test_an_arm_that_is_led_on_before_it_settles_gives_no_view_twice(plan, tmp_p
 def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
     arm, camera = fake_devices(plan)
     capture = _capture(tmp_path / "live", plan, arm, camera)
-    capture.watchers = (Hand(arm, [plan.stops[1].q]),)
+    capture.watch = Hand(arm, [plan.stops[1].q])
     assert len(follow(capture, 0)) == 2
     assert len(Session.load(tmp_path / "live").views) == 2
 

@@ -53,7 +53,9 @@ def cell(planned, monkeypatch):
 
 
 def _use(monkeypatch, arm, camera):
-    monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm, "manual": lambda _: arm})
+    monkeypatch.setattr(
+        devices, "ARMS", {"fake": lambda *_, **__: arm, "manual": lambda *_, **__: arm}
+    )
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
     monkeypatch.setattr(record_module, "HostClock", lambda: arm.clock)
 
@@ -221,7 +223,7 @@ def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_pa
     arm.clock = HostClock()
     start_move = arm.start_move
     arm.start_move = lambda q, **_: start_move(q, speed=20.0, acceleration=100.0)
-    monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm})
+    monkeypatch.setattr(devices, "ARMS", {"fake": lambda *_, **__: arm})
     sent = NetworkCamera(lambda: camera.frame().image)
     with served(sent) as url:
         words = ("--camera", f"uvc:{url}", "--plan", planned[0], "--yes", "--json")

@@ -1,15 +1,16 @@
 """Records fake cells; as a program, one that can be killed: `python recorded.py FOLDER STOPS`."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import CaptureFacts, Journal
+from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.recording import CaptureEvent, Watcher, record
+from visioncal.live.capture.recording import CaptureEvent, record
 from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.plan_file import PlanFile
 
@@ -21,18 +22,8 @@ QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
 
 def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> CaptureFacts:
     """What is written of a fake cell."""
-    return CaptureFacts(
-        name,
-        plan.cell.mount,
-        plan.cell.target,
-        plan.cell.robot,
-        arm.name,
-        camera.name,
-        camera.resolution,
-        camera.factory,
-        camera.settings,
-        plan.digest,
-    )
+    recorded = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
+    return CaptureFacts.of(LiveCell(arm, (camera,)), name, recorded, plan)
 
 
 def recorded(
@@ -41,7 +32,7 @@ def recorded(
     arm: FakeArm,
     camera: FakeCamera,
     options: CaptureOptions = QUICK,
-    watchers: tuple[Watcher, ...] = (),
+    watch: Callable[[CaptureEvent], None] = lambda _: None,
     *,
     resume: bool = False,
 ) -> list[CaptureEvent]:
@@ -50,22 +41,17 @@ def recorded(
     facts = facts_of(plan, arm, camera)
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
     cell = LiveCell(arm, (camera,), arm.clock)
-    return record(cell, plan, journal, options, Consent(None), watchers)
+    return record(cell, plan, journal, options, Consent(None), watch)
 
 
-class _Acknowledged:
-    """Prints the number of each view that is on the disk."""
-
-    def stepped(self, step: CaptureEvent) -> None:
-        """Prints it."""
-        if isinstance(step.found, TakenView):
-            print(step.view, flush=True)
+def _acknowledge(step: CaptureEvent) -> None:
+    """Prints the number of a view that is on the disk."""
+    if isinstance(step.found, TakenView):
+        print(step.view, flush=True)
 
 
 if __name__ == "__main__":
     planned = fake_plan(int(sys.argv[2]))
     print("begun", flush=True)
-    recorded(
-        Path(sys.argv[1]), planned, *fake_devices(planned), watchers=(_Acknowledged(),), resume=True
-    )
+    recorded(Path(sys.argv[1]), planned, *fake_devices(planned), watch=_acknowledge, resume=True)
     print("done", flush=True)

@@ -17,14 +17,7 @@ from visioncal.cli.console import (
     say,
 )
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.record import (
-    RecordedSetup,
-    ViewLines,
-    check_all,
-    facts_of,
-    record_driven,
-    scene_of,
-)
+from visioncal.cli.record import check_all, record_driven, say_line
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_rows
 from visioncal.core.extras import client_library
@@ -33,12 +26,13 @@ from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.transforms import invert, log, pose_difference
 from visioncal.interchange.outputs import write_outputs, write_plan
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
 from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.recording import CaptureEvent
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.messages import summary_of
 from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import plan_document
+from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.simulated.cell import Bench
 from visioncal.results import Calibration
@@ -72,12 +66,12 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     plan.parent.mkdir(parents=True, exist_ok=True)
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
-    scene = _planned(bench.known, stops, seed, plan)
-    bench.start(scene.planned.stops[0].q + _NEAR_RAD)
+    planned = _planned(bench.known, stops, seed, plan)
+    bench.start(planned.stops[0].q + _NEAR_RAD)
     with closing(bench):
         host = bench.controller.host
         say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
-        _drive(bench, scene, session)
+        _drive(bench, planned, session)
     flange = np.array([state.base_from_flange[0] for _, state in bench.views])
     x, z = bench.truth.transforms.values()
     poses = {"base_from_flange": flange, "cam_from_target": invert(flange @ x) @ z}
@@ -88,7 +82,7 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     say(f"where views were taken the flange was within {1e3 * away_mm:.0f} um of what was recorded")
 
 
-def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> RecordedSetup:
+def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> PlanFile:
     """Plans stops from the rough poses, and reads them back as a recording does."""
     request = PlanRequest(purpose_of("hand-eye"), stops, candidates=_CANDIDATES, seed=seed)
     with shown_progress(quiet=False) as progress:
@@ -96,16 +90,20 @@ def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> RecordedSe
         written = write_plan(folder, plan, plan_document(plan, {"kind": "demo"}))
     report_written(written, quiet=True)
     say(f"plan: {summary_of(plan)}")
-    return scene_of(folder)
+    return read_plan(folder)
 
 
-def _drive(bench: Bench, scene: RecordedSetup, session: Path) -> None:
+def _drive(bench: Bench, plan: PlanFile, session: Path) -> None:
+    def watch(step: CaptureEvent) -> None:
+        say_line(step)
+        bench.note(step)
+
     with ExitStack() as opened, signals_as_interrupts():
         cell = opened.enter_context(bench.connected())
-        facts = facts_of(scene, cell, session.name)
-        count, offset_s = len(scene.planned.stops), cell.clock.unix_offset_s()
-        journal = Journal.begin(session, facts, offset_s, count)
-        steps = record_driven(cell, scene, journal, _TAKING, [ViewLines(), bench], Consent(None))
+        recorded = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
+        facts = CaptureFacts.of(cell, session.name, recorded, plan)
+        journal = Journal.begin(session, facts, cell.clock.unix_offset_s(), len(plan.stops))
+        steps = record_driven(cell, plan, journal, _TAKING, Consent(None), watch)
         check_all(journal, steps)
 
 

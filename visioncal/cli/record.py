@@ -5,8 +5,6 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from visioncal.cli.console import asked, print_json, say
@@ -15,18 +13,16 @@ from visioncal.cli.session_options import RecordCellOptions, RecordOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import signals_as_interrupts
-from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.cell import HostClock, LiveCell
-from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
+from visioncal.live.capture.devices import open_arm, open_camera
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import CaptureFacts, Journal
+from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import (
     Capture,
     CaptureEvent,
     MotionSummary,
-    Watcher,
     ask_and_take,
     follow,
     missed_stops,
@@ -35,89 +31,84 @@ from visioncal.live.capture.recording import (
 )
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
 from visioncal.live.planning.plan_file import PlanFile, read_plan
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import load_robot
 
 
 def record_command(options: RecordOptions) -> None:
     """Runs `visioncal record`."""
-    scene = scene_of(options.plan, options.described)
+    plan = None if options.plan is None else read_plan(options.plan)
+    recorded = _recorded(plan, options.described)
     drives = not options.follow and options.arm.partition(":")[0] != "manual"
-    if drives:
-        # Refuses to drive without a plan, before a device is opened.
-        _ = scene.planned
-    else:
+    if drives and plan is None:
+        raise DataError(
+            "record: an arm is driven by a plan, and none is given.",
+            culprits=["--plan"],
+            next_step="Make one with visioncal plan, or guide the arm by hand: --follow.",
+        )
+    if not drives:
         is_dry = {"--dry-run": options.dry_run or None}
         refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
-    takes, device = options.takes, options.device
+    takes = options.takes
     taking = CaptureOptions(
         speed=takes.speed,
         frames=takes.frames,
         still=Stillness(image_px=takes.still_px, quiet_s=takes.settle_s),
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
-    requested = DeviceSetup(device.resolution, device.exposure_us, device.gain, device.focus)
-    answers = sys.stdin.isatty()
-    wish = ArmSetup("", not drives or options.dry_run, asked, options.described.pose_form, answers)
-    with signals_as_interrupts(), opened(options.arm, wish, options.camera, requested) as cell:
-        scene.check(cell.camera.resolution, drives=drives)
-        if options.dry_run:
-            report_departure(motion_summary(cell, scene.planned, (), taking), cell, taking)
+    with signals_as_interrupts(), _opened(options, is_moved=drives and not options.dry_run) as cell:
+        if drives and plan is not None:
+            _check_resolution(plan.cell.camera.resolution, cell.camera.resolution)
+        if options.dry_run and plan is not None:
+            report_departure(motion_summary(cell, plan, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
         consent = Consent.of("record", asked, yes=options.yes or not drives)
         start = Journal.resume if options.resume else Journal.begin
-        count = len(scene.planned.stops) if drives else options.views
-        facts = facts_of(scene, cell, options.out.name)
+        count = len(plan.stops) if drives and plan is not None else options.views
+        facts = CaptureFacts.of(cell, options.out.name, recorded, plan)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        watchers = [ViewLines()]
-        if drives:
-            steps = record_driven(cell, scene, journal, taking, watchers, consent)
+        if drives and plan is not None:
+            steps = record_driven(cell, plan, journal, taking, consent, say_line)
         else:
-            ask = asked if answers else None
-            steps = record_guided(cell, scene, journal, taking, watchers, options.views, ask)
+            lens = cell.camera.factory or (None if plan is None else plan.cell.camera)
+            target, robot = recorded.target, recorded.robot
+            capture = Capture(cell, target, robot, lens, journal, taking, None, say_line)
+            steps = _guided(capture, options.views, asked if sys.stdin.isatty() else None)
     if drives:
         check_all(journal, steps)
-    finish(journal, steps, as_json=options.as_json)
+    _finish(journal, steps, as_json=options.as_json)
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedSetup:
-    """Setup of a recording."""
+def _recorded(plan: PlanFile | None, described: RecordCellOptions) -> RecordedCell:
+    """What is recorded, by the plan or by options."""
+    target, robot, mount = described.target, described.robot, described.mount
+    if plan is not None:
+        given = {"--target": target, "--robot": robot, "--mount": mount}
+        refuse_given(given, "the plan says that already")
+        found = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
+    elif target is None:
+        raise DataError(
+            "record: --plan or --target is needed to know what to look for.",
+            culprits=["--plan", "--target"],
+            next_step="Name the board, as --target charuco_9x6_30mm.",
+        )
+    else:
+        arm = None if robot is None else load_robot(robot)
+        found = RecordedCell(mount or "eye-in-hand", target_named(target), arm)
+    if found.target.is_rig and not found.target.point_tags:
+        raise DataError(
+            f"record: target {found.target.name} is a rig of points, which no image is searched "
+            "for.",
+            culprits=["--target"],
+            next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
+        )
+    return found
 
-    mount: Mount
-    target: Target
-    robot: Robot | None  # The arm's model; None where unknown.
-    plan: PlanFile | None  # The stops; None without a plan.
 
-    @property
-    def planned(self) -> PlanFile:
-        """The plan.
-
-        Raises:
-            DataError: There is none.
-        """
-        if self.plan is None:
-            raise DataError(
-                "record: an arm is driven by a plan, and none is given.",
-                culprits=["--plan"],
-                next_step="Make one with visioncal plan, or guide the arm by hand: --follow.",
-            )
-        return self.plan
-
-    @property
-    def lens(self) -> Camera | None:
-        """The plan's lens; None without a plan."""
-        return None if self.plan is None else self.plan.cell.camera
-
-    def check(self, resolution: tuple[int, int], *, drives: bool) -> None:
-        """Checks that the camera has the image size of the plan.
-
-        Raises:
-            DataError: It has another.
-        """
-        if not drives or self.lens is None or resolution == self.lens.resolution:
-            return
-        had, has = (f"{w} x {h}" for w, h in (self.lens.resolution, resolution))
+def _check_resolution(planned: tuple[int, int], given: tuple[int, int]) -> None:
+    """Checks that the camera has the image size of the plan."""
+    if planned != given:
+        had, has = (f"{width} x {height}" for width, height in (planned, given))
         raise DataError(
             f"the plan is for pictures of {had} px, and the camera gives {has} px: the board might "
             "not be in them.",
@@ -126,130 +117,51 @@ class RecordedSetup:
         )
 
 
-def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> RecordedSetup:
-    """Builds the setup of a recording from a plan or from options.
-
-    Raises:
-        DataError: The plan cannot be read, options contradict it, or no board is named.
-    """
-    described = described or RecordCellOptions()
-    target, robot, mount = described.target, described.robot, described.mount
-    if plan is not None:
-        given = {"--target": target, "--robot": robot, "--mount": mount}
-        repeated = [name for name, value in given.items() if value is not None]
-        if repeated:
-            raise DataError(
-                f"{', '.join(repeated)}: the plan says that already.",
-                culprits=repeated,
-                next_step="Leave it out, or record without --plan.",
-            )
-        plan_file = read_plan(plan)
-        return RecordedSetup(
-            plan_file.cell.mount, _findable(plan_file.cell.target), plan_file.cell.robot, plan_file
-        )
-    if target is None:
-        raise DataError(
-            "record: --plan or --target is needed to know what to look for.",
-            culprits=["--plan", "--target"],
-            next_step="Name the board, as --target charuco_9x6_30mm.",
-        )
-    return RecordedSetup(
-        mount or "eye-in-hand",
-        _findable(target_named(target)),
-        None if robot is None else load_robot(robot),
-        None,
-    )
-
-
-def _findable(target: Target) -> Target:
-    """Refuses a rig of points that cannot be detected in images."""
-    if target.is_rig and not target.point_tags:
-        raise DataError(
-            f"record: target {target.name} is a rig of points, which no image is searched for.",
-            culprits=["--target"],
-            next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
-        )
-    return target
-
-
-def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
-    """Facts of the cell that are recorded besides its views."""
-    camera = cell.camera
-    return CaptureFacts(
-        name or "session",
-        scene.mount,
-        scene.target,
-        scene.robot,
-        cell.arm.name,
-        camera.name,
-        camera.resolution,
-        camera.factory,
-        dict(camera.settings),
-        "" if scene.plan is None else scene.plan.digest,
-    )
-
-
-def record_guided(
-    cell: LiveCell,
-    scene: RecordedSetup,
-    journal: Journal,
-    taking: CaptureOptions,
-    watchers: Sequence[Watcher],
-    views: int,
-    ask: Callable[[str], str] | None,
-) -> list[CaptureEvent]:
-    """Records an arm that a person moves.
-
-    Raises:
-        DriverError: A device failed, or nothing was recorded.
-        DataError: A view cannot be written, or three in a row gave none.
-    """
-    lens = cell.camera.factory or scene.lens
-    capture = Capture(cell, scene.target, scene.robot, lens, journal, taking, None, watchers)
-    if not isinstance(cell.arm, MovingArm):
-        if ask is None:
-            say("Poses are read from stdin, one a line, and no question is asked; q ends.")
-        return ask_and_take(capture, cell.arm, views, ask)
-    say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
-    return follow(capture, views)
+def _guided(capture: Capture, views: int, ask: Callable[[str], str] | None) -> list[CaptureEvent]:
+    """Records an arm that a person moves."""
+    if isinstance(capture.cell.arm, MovingArm):
+        say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
+        return follow(capture, views)
+    if ask is None:
+        say("Poses are read from stdin, one a line, and no question is asked; q ends.")
+    return ask_and_take(capture, capture.cell.arm, views, ask)
 
 
 @contextmanager
-def opened(arm: str, wish: ArmSetup, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
+def _opened(options: RecordOptions, *, is_moved: bool) -> Iterator[LiveCell]:
     """Opens both devices, and closes them at the end of the block."""
-    with closing(open_arm(arm, wish)) as opened:
-        if not wish.watch_only and not isinstance(opened, MovingArm):
+    device = options.device
+    requested = DeviceSetup(device.resolution, device.exposure_us, device.gain, device.focus)
+    form = options.described.pose_form
+    opened = open_arm(options.arm, asked, form, moves=is_moved, answers=sys.stdin.isatty())
+    with closing(opened) as arm:
+        if is_moved and not isinstance(arm, MovingArm):
             raise DriverError(
-                f"{opened.name} cannot be driven.",
-                culprits=[opened.name],
+                f"{arm.name} cannot be driven.",
+                culprits=[arm.name],
                 next_step="Guide it by hand: --follow.",
             )
-        with closing(open_camera(camera, requested)) as device:
-            yield LiveCell(opened, (device,), HostClock())
+        with closing(open_camera(options.camera, requested)) as camera:
+            yield LiveCell(arm, (camera,), HostClock())
 
 
-class ViewLines:
-    """A watcher that prints a line for each view."""
-
-    def stepped(self, step: CaptureEvent) -> None:
-        """Prints the line."""
-        say(step.line)
+def say_line(step: CaptureEvent) -> None:
+    """Prints the line of a view."""
+    say(step.line)
 
 
 def record_driven(
     cell: LiveCell,
-    scene: RecordedSetup,
+    plan: PlanFile,
     journal: Journal,
     taking: CaptureOptions,
-    watchers: Sequence[Watcher],
     consent: Consent,
+    watch: Callable[[CaptureEvent], None],
 ) -> list[CaptureEvent]:
     """Drives the plan's stops, each with the user's consent."""
-    leaving = motion_summary(cell, scene.planned, [view.number for view in journal.views], taking)
+    leaving = motion_summary(cell, plan, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
-    if not leaving.stops:
-        return []
-    return record(cell, scene.planned, journal, taking, consent, watchers)
+    return record(cell, plan, journal, taking, consent, watch) if leaving.stops else []
 
 
 def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
@@ -258,20 +170,15 @@ def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOpti
     if not count:
         say("All stops of the plan have their view; nothing is left to drive.")
         return
-    first, seconds = leaving.stops[0], leaving.duration_s
+    seconds, between = leaving.duration_s, len(leaving.first) - 1
     duration = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
-    postures = len(leaving.first)
-    via = (
-        f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
-        if postures > 1
-        else ""
-    )
+    via = f" by {counted(between, 'posture')} in between" if between else ""
     say(
         f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
         f"{taking.speed:g} rad/s, about {duration}"
     )
     say(
-        f"  first to view {first.view}{via}; a joint turns by up to "
+        f"  first to view {leaving.stops[0].view}{via}; a joint turns by up to "
         f"{figure(math.degrees(leaving.turn_rad))} deg; the way is clear of all that was declared "
         "to the plan"
     )
@@ -290,23 +197,20 @@ def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
         )
 
 
-def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
+def _finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
     """Prints a summary of the recording, and the next command."""
-    if as_json:
-        predicted = [
-            step.accuracy
-            for step in steps
-            if step.accuracy is not None and not step.accuracy.is_open
-        ]
-        summary: dict[str, Any] = {
-            "session": str(journal.folder),
-            "views": [view.number for view in journal.views],
-        }
-        if predicted:
-            summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
-        print_json(summary)
+    if not as_json:
+        say(
+            f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
+            f"{shlex.quote(str(journal.folder))} -o out"
+        )
         return
-    say(
-        f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
-        f"{shlex.quote(str(journal.folder))} -o out"
-    )
+    summary: dict[str, Any] = {
+        "session": str(journal.folder),
+        "views": [view.number for view in journal.views],
+    }
+    for step in steps:
+        if step.accuracy is not None and not step.accuracy.is_open:
+            sigmas = {"sigma_mm": step.accuracy.mm, "sigma_deg": step.accuracy.deg}
+            summary["predicted"] = sigmas
+    print_json(summary)

@@ -1,44 +1,38 @@
 """Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `uvc:0`."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
-# Kinds that need an address, with its form.
-_ADDRESSES = {"ur": "ur:HOST, as ur:192.168.0.10"}
-
-
-@dataclass(frozen=True)
-class ArmSetup:
-    """Options of an arm to open."""
-
-    address: str  # What follows the kind: a host.
-    watch_only: bool  # Whether it is only read, and need not be ready to be driven.
-    ask: Callable[[str], str]  # Asks a question and returns the line that was typed.
-    form: str | None = None  # Form of typed poses; None to recognise it.
-    answers: bool = True  # Whether a person types, who can be asked again, unlike a file.
-
-
 _Opener = TypeVar("_Opener")
 
 
-def open_arm(words: str, wish: ArmSetup) -> Arm:
+def open_arm(
+    words: str,
+    ask: Callable[[str], str],
+    form: str | None = None,
+    *,
+    moves: bool,
+    answers: bool = True,
+) -> Arm:
     """Opens an arm.
 
     Args:
         words: `KIND` or `KIND:ADDRESS`.
-        wish: Its options; the address is replaced by that of the words.
+        ask: Asks a question and returns the line that was typed.
+        form: Form of typed poses; None to recognise it.
+        moves: Whether it is to be driven; otherwise it need not be ready for that.
+        answers: Whether a person types, who can be asked again, unlike a file.
 
     Raises:
         DataError: There is no such kind.
         DriverError: It cannot be opened.
     """
     opener, address = _opener(words, ARMS, "--arm")
-    return opener(replace(wish, address=address))
+    return opener(address, ask=ask, form=form, moves=moves, answers=answers)
 
 
 def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
@@ -60,24 +54,26 @@ def _opener(words: str, openers: Mapping[str, _Opener], option: str) -> tuple[_O
             culprits=[option],
             next_step=did_you_mean(kind, openers),
         )
-    if not address and kind in _ADDRESSES:
-        raise DataError(f"{kind} needs an address: {_ADDRESSES[kind]}.")
+    if kind == "ur" and not address:
+        raise DataError("ur needs an address: ur:HOST, as ur:192.168.0.10.", culprits=[option])
     return openers[kind], address
 
 
 # Drivers and their client libraries are imported only when a device is opened.
 
 
-def _ur(wish: ArmSetup) -> Arm:
+def _ur(address: str, *, moves: bool, **_: object) -> Arm:
     from visioncal.live.drivers.ur import UrArm
 
-    return UrArm(wish.address, watch_only=wish.watch_only)
+    return UrArm(address, watch_only=not moves)
 
 
-def _manual(wish: ArmSetup) -> Arm:
+def _manual(
+    _: str, *, ask: Callable[[str], str], form: str | None, answers: bool, **__: object
+) -> Arm:
     from visioncal.live.drivers.manual import ManualArm
 
-    return ManualArm(wish.ask, wish.form, answers=wish.answers)
+    return ManualArm(ask, form, answers=answers)
 
 
 def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
@@ -92,8 +88,5 @@ def _uvc(address: str, requested: DeviceSetup) -> CameraDevice:
     return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, requested)
 
 
-ARMS: Mapping[str, Callable[[ArmSetup], Arm]] = {"ur": _ur, "manual": _manual}
-CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
-    "oak": _oak,
-    "uvc": _uvc,
-}
+ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual}
+CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {"oak": _oak, "uvc": _uvc}

@@ -1,9 +1,8 @@
 """The gate that every command passes before it moves an arm: limits, collisions, consent."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -32,28 +31,12 @@ _ARRIVED_RAD = 2e-2
 _SAME_ARM_MM = 50.0
 
 
-@dataclass(frozen=True)
-class JointPace:
-    """Speed of a synchronised joint motion, led by the joint that travels farthest."""
-
-    speed: float  # Speed of that joint [rad/s].
-    acceleration: float  # Its acceleration [rad/s^2].
-
-    @classmethod
-    def of(cls, options: CaptureOptions) -> "JointPace":
-        """The pace of a recording."""
-        return cls(options.speed, options.acceleration)
-
-    def travel_s(self, start: FloatArray, end: FloatArray) -> float:
-        """Duration of a motion with a trapezoidal or triangular speed profile [s]."""
-        distance = float(np.abs(np.asarray(end) - start).max(initial=0.0))
-        if distance * self.acceleration < self.speed**2:
-            return float(2.0 * np.sqrt(distance / self.acceleration))
-        return distance / self.speed + self.speed / self.acceleration
-
-    def path_duration_s(self, postures: Iterable[FloatArray]) -> float:
-        """Duration of a path from posture to posture [s]."""
-        return sum(self.travel_s(start, end) for start, end in pairwise(postures))
+def travel_s(pace: CaptureOptions, start: FloatArray, end: FloatArray) -> float:
+    """Duration of a motion with a trapezoidal or triangular speed profile [s]."""
+    distance = float(np.abs(np.asarray(end) - start).max(initial=0.0))
+    if distance * pace.acceleration < pace.speed**2:
+        return float(2.0 * np.sqrt(distance / pace.acceleration))
+    return distance / pace.speed + pace.speed / pace.acceleration
 
 
 @dataclass(eq=False)
@@ -112,7 +95,7 @@ class Gate:
     live: LiveCell
     robot: Robot  # The arm's model, as in its controller.
     consent: Consent
-    pace: JointPace
+    pace: CaptureOptions  # Its speed and acceleration.
 
     def move(
         self, postures: Sequence[FloatArray], motion: str, look: Callable[[], None] = lambda: None
@@ -142,7 +125,7 @@ class Gate:
                 f"{name} cannot be driven.", culprits=[name], next_step="Guide it by hand."
             )
         for goal in postures:
-            expected_s = self.pace.travel_s(live.joints(), goal)
+            expected_s = travel_s(self.pace, live.joints(), goal)
             live.arm.start_move(goal, speed=self.pace.speed, acceleration=self.pace.acceleration)
             self._wait(live.arm, expected_s, look)
             off_rad = np.abs(live.joints() - goal)

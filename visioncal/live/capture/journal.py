@@ -24,8 +24,10 @@ from visioncal.core.files import (
 )
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.core.version import __version__
+from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import Session, View
 from visioncal.session.columns import pose_row
@@ -44,19 +46,44 @@ _DIGEST = 64
 
 
 @dataclass(frozen=True, eq=False)
-class CaptureFacts:
-    """Facts of a recording that are the same for all views."""
+class RecordedCell:
+    """What a recording is of."""
 
-    name: str
     mount: Mount
     target: Target
     robot: Robot | None  # The arm's model; None where it is not known.
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureFacts(RecordedCell):
+    """Facts of a recording that are the same for all views."""
+
+    name: str
     arm: str  # The name that the arm reports.
     camera: str  # The name that the camera reports.
     resolution: tuple[int, int]  # (width, height) of its pictures [px].
     lens: Camera | None  # Intrinsics that it reports, to be refined; None to have them estimated.
     settings: Mapping[str, str | float]
     plan: str  # Digest of the plan that is driven; empty for none.
+
+    @classmethod
+    def of(
+        cls, cell: LiveCell, name: str, recorded: RecordedCell, plan: PlanFile | None
+    ) -> "CaptureFacts":
+        """Facts of a recording by a cell's devices."""
+        camera = cell.camera
+        return cls(
+            recorded.mount,
+            recorded.target,
+            recorded.robot,
+            name or "session",
+            cell.arm.name,
+            camera.name,
+            camera.resolution,
+            camera.factory,
+            dict(camera.settings),
+            "" if plan is None else plan.digest,
+        )
 
     def texts(self) -> dict[str, str]:
         """Files of the session besides its views, by name; session.toml is the last."""

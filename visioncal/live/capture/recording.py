@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Protocol
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, Corners, FloatArray, Target
 from visioncal.live.capture.assessment import Coach, JointPoseCheck, Prediction, planned_accuracy
 from visioncal.live.capture.cell import Clock, LiveCell
-from visioncal.live.capture.gate import Consent, Gate, JointPace, check_same_arm, clear_path
+from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_path, travel_s
 from visioncal.live.capture.journal import Journal, state_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
@@ -37,7 +37,7 @@ _NEW_MM, _NEW_DEG = 20.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class CaptureEvent:
-    """Result of a stop, for watchers."""
+    """Result of a stop."""
 
     view: int  # Number of the view.
     place: int  # Number of the stop, from 1 on.
@@ -66,13 +66,6 @@ class CaptureEvent:
         )
 
 
-class Watcher(Protocol):
-    """Observer of a recording; it must be quick."""
-
-    def stepped(self, step: CaptureEvent) -> None:
-        """Handles a stored view, or a stop that gave none."""
-
-
 class Capture:
     """A recording in progress; the views that are on the disk already count.
 
@@ -84,7 +77,7 @@ class Capture:
         journal: Where views are stored.
         options: Its options.
         prediction: Predicted accuracy; None for no prediction.
-        watchers: Its observers.
+        watch: Called with each stored view, or stop that gave none; it must be quick.
     """
 
     def __init__(
@@ -96,10 +89,10 @@ class Capture:
         journal: Journal,
         options: CaptureOptions,
         prediction: Prediction | None,
-        watchers: Sequence[Watcher] = (),
+        watch: Callable[[CaptureEvent], None] = lambda _: None,
     ) -> None:
         self.cell, self.target, self.journal, self.options = cell, target, journal, options
-        self.prediction, self.watchers = prediction, watchers
+        self.prediction, self.watch = prediction, watch
         self.coach = Coach(target, cell.camera.resolution, lens)
         self.steps: list[CaptureEvent] = []
         self._check = JointPoseCheck(robot)
@@ -148,8 +141,7 @@ class Capture:
                 advice += f", for {figure(predicted.mm)} mm"
         covered = self.coach.words()
         self.steps.append(CaptureEvent(number, place, count, result, covered, accuracy, advice))
-        for watcher in self.watchers:
-            watcher.stepped(self.steps[-1])
+        self.watch(self.steps[-1])
         self._check_missed_in_a_row()
         return self.steps[-1]
 
@@ -236,7 +228,7 @@ def motion_summary(
     first = checked_path(plan, stops[0], here)
     postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
-    duration_s = JointPace.of(options).path_duration_s(postures) + _STOP_S * len(stops)
+    duration_s = sum(travel_s(options, *ends) for ends in pairwise(postures)) + _STOP_S * len(stops)
     return MotionSummary(stops, first, float(turns.max()), duration_s)
 
 
@@ -246,7 +238,7 @@ def record(
     journal: Journal,
     options: CaptureOptions,
     consent: Consent,
-    watchers: Sequence[Watcher] = (),
+    watch: Callable[[CaptureEvent], None] = lambda _: None,
 ) -> list[CaptureEvent]:
     """Records the stops of a plan that have no view yet, and returns their results.
 
@@ -261,11 +253,11 @@ def record(
     planned, lens = plan.cell, cell.camera.factory or plan.cell.camera
     capture = Capture(
         *(cell, planned.target, planned.robot, lens, journal, options),
-        *(planned_accuracy(plan), watchers),
+        *(planned_accuracy(plan), watch),
     )
     done = {view.number for view in journal.views}
     remaining = [stop for stop in plan.stops if stop.view not in done]
-    gate = Gate(cell, planned.robot, consent, JointPace.of(options))
+    gate = Gate(cell, planned.robot, consent, options)
 
     def look() -> None:
         # A failure is reported now, not at the end of a long motion.

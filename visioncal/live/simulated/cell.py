@@ -111,8 +111,8 @@ class SimulatedCamera:
 class Bench:
     """A simulated cell with a camera on the flange of a UR; the same seed gives the same cell.
 
-    Once started, its controller is another process, and its camera renders the truth. As a watcher
-    of its recording it notes the truth of each view.
+    Once started, its controller is another process, and its camera renders the truth. It
+    notes the truth of each view.
 
     Attributes:
         truth: The true arm, edges, lens and board.
@@ -171,7 +171,7 @@ class Bench:
         """Ends the controller."""
         self.controller.close()
 
-    def stepped(self, step: CaptureEvent) -> None:
+    def note(self, step: CaptureEvent) -> None:
         """Notes the truth of a view."""
         if isinstance(step.found, TakenView):
             state = self.controller.state([step.found.frame.stamp_s])
