@@ -33,7 +33,7 @@ from visioncal.session.selecting import ARM, EYE, Choice, Part, has_several, sel
 
 
 @dataclass(frozen=True)
-class FrameLocation:
+class _Place:
     """Destination of a frame."""
 
     name: str
@@ -42,126 +42,96 @@ class FrameLocation:
     result: Calibration | None  # The result from which it was extracted, of a cell or itself.
     folder: Path | None  # The output folder that the frame joins; None where it does not.
     file: Path | None  # The file of frames that it joins; None where it does not.
+    frames: Mapping[str, Frame]  # Those that are there.
 
-    @classmethod
-    def of(
-        cls,
-        options: FrameOptions,
-        kind: FrameKind,
-        choice: Choice,
-        needs: Sequence[Part],
-        touched_by: str | None = None,
-    ) -> "FrameLocation":
-        """Resolves the calibration and the frame's destination, before anything is computed.
 
-        Args:
-            options: The user's options.
-            kind: The kind of frame.
-            choice: Which camera and robot of a cell are meant.
-            needs: Which of them have to be unambiguous.
-            touched_by: The only robot that the touches name; the default robot where the cell has
-                it.
+def _place(
+    options: FrameOptions,
+    kind: FrameKind,
+    choice: Choice,
+    needs: Sequence[Part],
+    touched_by: str | None = None,
+) -> _Place:
+    """Resolves the calibration and the frame's destination, before anything is computed.
 
-        Raises:
-            DataError: A frame of that name exists, or the destination cannot take one.
-        """
-        name, path, out = transform_name(kind, options.name), options.calibration, options.out
-        result = None if path is None else load_result(path)
-        cell = None if result is None else result.cell
-        if cell is not None and choice.robot is None and touched_by in cell.robots:
+    Of a cell, `touched_by` is the default robot: the only one that the touches name.
+    """
+    name, path, file = transform_name(kind, options.name), options.calibration, options.out
+    result = calibration = folder = None
+    frames: Mapping[str, Frame] = {}
+    if path is not None:
+        result = load_result(path)
+        if result.cell and choice.robot is None and touched_by in result.cell.robots:
             choice = replace(choice, robot=touched_by)
-        calibration = None if result is None else result.chosen(choice, needs)
-        if result is not None:
-            name = transform_name_in_cell(result, choice, needs, name)
-        folder = None if path is None or out is not None else _folder(path)
-        location = cls(name, calibration, result, folder, out)
-        present, child = location._frames(), name.partition("_from_")[2]
-        for other in present:
-            if other != name and other.partition("_from_")[2] == child:
-                raise DataError(
-                    f"{child!r} is taken: {other} is there already.",
-                    culprits=[other],
-                    next_step="Give this one another name with --name.",
-                )
-        taken_in = out or folder
-        if name in present and taken_in is not None and not options.force:
+        calibration = result.chosen(choice, needs)
+        name, frames = transform_name_in_cell(result, choice, needs, name), result.frames
+    if file is not None:
+        frames = FrameFile.load(file).frames if file.exists() else {}
+    elif path is not None:
+        folder = path if path.is_dir() else path.parent
+        if path.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
             raise DataError(
-                f"{taken_in} already has {name}, and nothing is overwritten.",
-                culprits=[name],
-                next_step="Replace it with --force, or give this one another name with --name.",
+                f"{path} is no output folder that a frame could join.",
+                culprits=[str(path)],
+                next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
             )
-        return location
-
-    def _frames(self) -> dict[str, Frame]:
-        """The frames that exist at the destination."""
-        if self.file is not None:
-            return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
-        return {} if self.result is None else dict(self.result.frames)
-
-    def keep(self, frame: Frame) -> Written:
-        """Writes the frame to its destination, if any; a bad one joins no result."""
-        if frame.verdict.status == "bad" and self.file is None:
-            return Written(())
-        frames = {**self._frames(), self.name: frame}
-        if self.file is not None:
-            FrameFile(frames).save(self.file)
-            return Written((self.file,))
-        if self.folder is None or self.result is None:
-            return Written(())
-        return rewrite_result(self.folder, replace(self.result, frames=frames))
-
-
-def _folder(path: Path) -> Path:
-    folder = path if path.is_dir() else path.parent
-    if path.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
+    child, another = name.partition("_from_")[2], "give this one another name with --name."
+    for other in frames:
+        if other != name and other.partition("_from_")[2] == child:
+            raise DataError(
+                f"{child!r} is taken: {other} is there already.",
+                culprits=[other],
+                next_step=another.capitalize(),
+            )
+    if name in frames and (file or folder) and not options.force:
         raise DataError(
-            f"{path} is no output folder that a frame could join.",
-            culprits=[str(path)],
-            next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
+            f"{file or folder} already has {name}, and nothing is overwritten.",
+            culprits=[name],
+            next_step=f"Replace it with --force, or {another}",
         )
-    return folder
+    return _Place(name, calibration, result, folder, file, frames)
 
 
-def keep_and_report(place: FrameLocation, frame: Frame, source: Path, *, as_json: bool) -> None:
+def _keep_and_report(place: _Place, frame: Frame, source: Path, *, as_json: bool) -> None:
     """Writes a frame to its destination, and prints it for people, or as JSON."""
     # The suggested command runs again, and has a frame to replace then.
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
-    out = place.file or place.folder or ""
-    frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
-    written, status = place.keep(frame), exit_status(frame.verdict)
+    destination = place.file or place.folder
+    verdict = frame.verdict.with_paths(source, destination or "", ["visioncal", *again[1:]])
+    frame, written = replace(frame, verdict=verdict), Written(())
+    frames = {**place.frames, place.name: frame}
+    # A bad one joins no result.
+    if place.file is not None:
+        FrameFile(frames).save(place.file)
+        written = Written((place.file,))
+    elif place.folder is not None and place.result is not None and verdict.status != "bad":
+        written = rewrite_result(place.folder, replace(place.result, frames=frames))
     if as_json:
         print_json(frames_document({place.name: frame}))
-        report_written(written, quiet=True, status=status)
+        report_written(written, quiet=True, status=exit_status(verdict))
         return
-    print_verdict(frame.verdict, place.name)
-    turn = ", ".join(
-        f"{value:.3f}" for value in frame.edge.transform.rotation.as_rotvec(degrees=True)
-    )
-    rotation = (
-        f"turned by ({turn}) deg, sigma {figure(frame.edge.sigma_deg)} deg"
-        if frame.oriented
-        else "rotation not measured"
-    )
-    position = f"{frame.edge.place_words(3)}, sigma {figure(frame.edge.sigma_mm)} mm"
-    answer(f"{place.name}: {position}; {rotation}")
+    print_verdict(verdict, place.name)
+    edge, rotation = frame.edge, "rotation not measured"
+    if frame.oriented:
+        vector = edge.transform.rotation.as_rotvec(degrees=True)
+        turn = ", ".join(f"{value:.3f}" for value in vector)
+        rotation = f"turned by ({turn}) deg, sigma {figure(edge.sigma_deg)} deg"
+    answer(f"{place.name}: {edge.place_words(3)}, sigma {figure(edge.sigma_mm)} mm; {rotation}")
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
     answer(f"{frame.method}: {fit}")
-    joins = place.file is not None or place.folder is not None
-    if joins and not written.files:
-        say(f"nothing was written: a bad {place.name} does not join {place.folder}")
-        report_written(written, status=status)
-        return
     before = None if place.result is None else place.result.frames.get(place.name)
-    if before is not None:
-        mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
+    if written.files and before is not None:
+        mm, deg = pose_difference(before.edge.matrix, edge.matrix)
         say(f"it replaces the one of {before.created}, {mm_and_deg(mm, deg)} away")
     undrawn = [undrawn.file for undrawn in written.failed_drawings]
     recording = None if place.folder is None else place.folder / RECORDING
-    if recording is not None and recording not in (*written.files, *undrawn):
-        say(f"{recording} was not renewed: it is missing or of another result")
-    if not written.files:
+    if destination is None:
         say("nothing was written: -c joins it to a calibration, -o puts it into a file")
-    report_written(written, status=status)
+    elif not written.files:
+        say(f"nothing was written: a bad {place.name} does not join {place.folder}")
+    elif recording is not None and recording not in (*written.files, *undrawn):
+        say(f"{recording} was not renewed: it is missing or of another result")
+    report_written(written, status=exit_status(verdict))
 
 
 def place_frame(
@@ -201,11 +171,11 @@ def place_frame(
         if request.goes.calibration is None and not robots and tool in (None, "none"):
             refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
         touched_by = robots[0] if len(robots) == 1 else None
-        location = FrameLocation.of(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
-        frame = by_touches(source, location.calibration)
+        place = _place(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
+        frame = by_touches(source, place.calibration)
     else:
-        location = FrameLocation.of(request.goes, kind, replace(part.choice, target=None), EYE)
-        if location.calibration is None:
+        place = _place(request.goes, kind, replace(part.choice, target=None), EYE)
+        if place.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
                 "to place what they show.",
@@ -216,8 +186,8 @@ def place_frame(
             session = select(session, part.choice, robot_between=False)
         point_m = np.array(request.point or np.zeros(3))
         with shown_progress(quiet=request.as_json) as progress:
-            frame = seen_frame(session, location.calibration, kind, point_m, progress=progress)
-    keep_and_report(location, frame, source, as_json=request.as_json)
+            frame = seen_frame(session, place.calibration, kind, point_m, progress=progress)
+    _keep_and_report(place, frame, source, as_json=request.as_json)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:

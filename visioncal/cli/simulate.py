@@ -54,14 +54,16 @@ _SINGLE = frozenset(
         *("images", "stiffness_knm", "payload_kg", "recording", "camera_moved_mm", "seed"),
     )
 )
-# Kinds of session that a whole cell can include.
-_WITH_CELL = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
     "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
-    "cell": _WITH_CELL
-    | {"views", "images", "seed", "recording", "camera_moved_mm", "touches", "currents"},
+    "cell": frozenset(
+        (
+            *("views", "images", "seed", "recording", "camera_moved_mm", "touches", "currents"),
+            *("instrument", "torques"),
+        )
+    ),
     "instrument": frozenset(
         (
             *("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"),
@@ -70,36 +72,22 @@ _TAKES: Mapping[str, frozenset[str]] = {
     ),
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
 }
+# Centre of a simulated load in the flange's frame [m].
+_CENTRE_M = (0.0, 0.0, 0.1)
+# Half the side of a cubic load [m], and torque constant of each drive [N m/A].
+_HALF_M = 0.05
+_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
 
 def simulate_command(asked: SimulateOptions) -> None:
     """Runs `visioncal simulate`."""
-    kinds = [take for take in _TAKES if take and getattr(asked, take)]
-    if "cell" in kinds:
-        kinds = [kind for kind in kinds if kind not in _WITH_CELL]
-    if len(kinds) > 1:
-        named = [_option(kind) for kind in kinds]
-        raise DataError(
-            f"{' and '.join(named)}: each makes a session of its own kind.",
-            culprits=named,
-            next_step="A whole cell's own file says which robots warm up, and what is swept."
-            if "cell" in kinds
-            else "Give one of them, and make the others into folders of their own.",
-        )
-    kind = kinds[0] if kinds else ""
-    takes = _TAKES[kind]
-    if kind == "cell" and not asked.torques:
-        takes = takes - {"currents"}
-    for wrong in sorted(asked.given - takes - {"folder", kind}):
-        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
-        raise DataError(
-            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
-            culprits=[_option(wrong)],
-            next_step="Leave it out."
-            if kind != "cell"
-            else "Leave it out: a file of your own says what a cell is made of, and its errors.",
-        )
-    given, folder = asked.given, asked.folder
+    _check(asked)
+    folder = asked.folder
+    # Checked first, as rendering takes long.
+    refuse_filled(folder.absolute())
+    compliance: tuple[float, ...] = ()
+    if asked.stiffness_knm is not None:
+        compliance = (1e-3 / asked.stiffness_knm,) * len(arm_named(asked.robot).offset)
     options = CellOptions(
         robot=asked.robot,
         mount=asked.mount,
@@ -113,22 +101,18 @@ def simulate_command(asked: SimulateOptions) -> None:
         dh_sigma_rad=1e-3 * asked.arm_sigma_mrad,
         wrong_views=asked.wrong_views,
         board_scale=asked.board_scale,
-        compliance_rad_per_nm=()
-        if asked.stiffness_knm is None
-        else (1e-3 / asked.stiffness_knm,) * len(arm_named(asked.robot).offset),
-        payloads=tuple(Payload(value, _CENTRE_M) for value in asked.payload_kg or ()),
+        compliance_rad_per_nm=compliance,
+        payloads=tuple(Payload(kg, _CENTRE_M) for kg in asked.payload_kg or ()),
         second=Second() if asked.second_board else None,
         recording=asked.recording,
         camera_moved_m=1e-3 * asked.camera_moved_mm,
         seed=asked.seed,
     )
-    # Checked first, as rendering takes long.
-    refuse_filled(folder.absolute())
     if asked.cell is not None:
         _write(_whole_cell(asked.cell, options, asked), asked)
     elif asked.instrument is not None:
         instrument = InstrumentOptions(
-            stops=asked.views if "views" in given else InstrumentOptions.stops,
+            stops=asked.views if "views" in asked.given else InstrumentOptions.stops,
             points=THREE if asked.instrument == "points" else THREE[:1],
             poses=asked.instrument == "probe",
             seed=options.seed,
@@ -137,23 +121,45 @@ def simulate_command(asked: SimulateOptions) -> None:
         write_tracked(tracked(instrument), folder)
     elif asked.torques:
         write_exercise(_exercise_options(asked, asked.robot, asked.seed), folder)
+    elif asked.warm_up:
+        rounds = Round(first=asked.views)
+        warm = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
+        _write(simulate_warm_up(warm), asked)
+    elif asked.sweep:
+        offset_s, readout_s = 1e-3 * asked.clock_offset_ms, 1e-3 * asked.readout_ms
+        clocks = SweepOptions(camera_minus_robot_s=offset_s, readout_s=readout_s)
+        _write(sweep(options, clocks), asked)
     else:
-        _write(_single(options, asked), asked)
+        _write(simulate(options), asked)
     say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: CellOptions, asked: SimulateOptions) -> SimulatedCell:
-    """A cell of one robot: at stops, in a sweep, or during warm-up."""
-    if asked.warm_up:
-        rounds = Round(first=asked.views)
-        warm_up = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
-        return simulate_warm_up(warm_up)
-    if asked.sweep:
-        clocks = SweepOptions(
-            camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
+def _check(asked: SimulateOptions) -> None:
+    """Refuses options that exclude each other, or that change nothing."""
+    kinds = [take for take in _TAKES if take and getattr(asked, take)]
+    if "cell" in kinds:
+        kinds = [kind for kind in kinds if kind not in _TAKES["cell"]]
+    if len(kinds) > 1:
+        named = [_option(kind) for kind in kinds]
+        raise DataError(
+            f"{' and '.join(named)}: each makes a session of its own kind.",
+            culprits=named,
+            next_step="Make each into a folder of its own; a whole cell's own file says which "
+            "robots warm up, and what is swept.",
         )
-        return sweep(options, clocks)
-    return simulate(options)
+    kind = kinds[0] if kinds else ""
+    takes = _TAKES[kind]
+    if kind == "cell" and not asked.torques:
+        takes = takes - {"currents"}
+    for wrong in sorted(asked.given - takes - {"folder", kind}):
+        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
+        raise DataError(
+            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
+            culprits=[_option(wrong)],
+            next_step="Leave it out; a whole cell's own file says what it is made of."
+            if kind == "cell"
+            else "Leave it out.",
+        )
 
 
 def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
@@ -171,13 +177,6 @@ def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
 
 def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}" if name else "a plain cell of one robot"
-
-
-# Centre of a simulated load in the flange's frame [m].
-_CENTRE_M = (0.0, 0.0, 0.1)
-# Half the side of a cubic load [m], and torque constant of each drive [N m/A].
-_HALF_M = 0.05
-_GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
 
 def _whole_cell(name: str, options: CellOptions, asked: SimulateOptions) -> SimulatedCell:
@@ -214,28 +213,23 @@ def _described(
         frame = frame_name("camera", described.cameras[0].name)
         knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
         described = replace(described, moved=(*described.moved, knocked))
-    return described if instrument is None else _with_instrument(name, described, instrument)
-
-
-def _with_instrument(
-    name: str, described: NetworkOptions, instrument: Instrument
-) -> NetworkOptions:
-    """The description with an instrument that measures every robot's flange."""
+    if instrument is None:
+        return described
     if described.instruments or described.points:
         raise DataError(
             f"--cell {name} has instruments or points of its own.",
             culprits=["--instrument"],
             next_step="Leave --instrument out.",
         )
+    # It measures every robot's flange.
     places = THREE if instrument == "points" else THREE[:1]
     points = tuple(
         PointAt(f"{robot.name}{at}", robot.name, place)
         for robot in described.robots
         for at, place in enumerate(places, start=1)
     )
-    tracker = InstrumentAt("tracker", (2.5, -1.0, 0.4), 2.5)
-    if instrument == "probe":
-        tracker = replace(tracker, sigma_rad=InstrumentOptions.sigma_rad)
+    sigma_rad = InstrumentOptions.sigma_rad if instrument == "probe" else 0.0
+    tracker = InstrumentAt("tracker", (2.5, -1.0, 0.4), 2.5, sigma_rad=sigma_rad)
     return replace(described, instruments=(tracker,), points=points)
 
 
