@@ -240,12 +240,7 @@ def read_toml(path: Path, label: str) -> dict[str, Any]:
 
 
 def parse_toml(text: str, label: str) -> dict[str, Any]:
-    """Parses TOML; `label` names its origin in errors.
-
-    Raises:
-        DataError: The text is not TOML (the message gives line and column), nested too deep, or has
-            an integer of more than TOML's 64 bits.
-    """
+    """Parses TOML; `label` names its origin in errors; raises DataError."""
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -268,12 +263,7 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
 
 
 def check_values(document: object, label: str, largest: float | None = None) -> None:
-    """Checks number, depth and size of a document's values without recursion.
-
-    Raises:
-        DataError: There are too many, nested too deep, a whole number has more than 64 bits, or
-            another is not finite or beyond `largest`, if given.
-    """
+    """Checks number, depth and size of a document's values without recursion; raises DataError."""
     pending: list[tuple[str, object, int]] = [("", document, 1)]
     count = 0
     while pending:

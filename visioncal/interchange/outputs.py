@@ -121,11 +121,7 @@ def write_check(
 
 
 def refuse_calibration(folder: Path) -> None:
-    """Refuses a folder whose report is a calibration's.
-
-    Raises:
-        DataError: It is one.
-    """
+    """Refuses a folder whose report is a calibration's; raises DataError."""
     if (folder / CALIBRATION).exists():
         raise DataError(
             f"{folder} holds a calibration, whose {REPORT} the check's would replace.",

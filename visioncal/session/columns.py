@@ -65,8 +65,6 @@ _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 _LARGEST = 1e60
 # Smallest similarity of a misspelt name; that of `status` and `stamp_s` is 0.62.
 _MISSPELT = 0.76
-# What cells look like, and column names do not: a number, or a file's name.
-_CELL = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", re.I)
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -112,19 +110,7 @@ def pose_row(pose: FloatArray) -> dict[str, float]:
 
 
 def check_header(columns: Sequence[str], where: str) -> None:
-    """Checks the header row of a views.csv; `where` names it in messages.
-
-    Raises:
-        DataError: A name is empty or duplicate, `view` is missing, the joints have gaps, or a pose
-            lacks some of its columns.
-    """
-    if sum(_CELL.fullmatch(name) is not None for name in columns) > len(columns) / 2:
-        raise DataError(
-            f"{where}: its first line has numbers, {', '.join(columns)[:80]!r}, and the names of "
-            "the columns are needed.",
-            culprits=[where],
-            next_step=f"Begin it with a line of names, as view,image,{','.join(POSE)}.",
-        )
+    """Checks the header row of a views.csv; `where` names it in messages; raises DataError."""
     problems = list(_header_problems(columns))
     lower = {name.lower(): name for name in columns}
     others = [*(position_columns(columns) or ())]
@@ -161,10 +147,7 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
             first = columns.index(name) + 1
             yield f"column {name} is there twice (columns {first} and {place}): delete one"
     if "view" not in columns:
-        yield (
-            "the column view, a whole number that names each row, is missing"
-            f"{_spelt_otherwise(columns, ['view'])}"
-        )
+        yield "the column view, a whole number that names each row, is missing"
     joints = joint_columns(tuple(columns))
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]
@@ -175,15 +158,8 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
         if 0 < len(missing) < len(group):
             yield (
                 f"the columns {', '.join(name for name in group if name in columns)} "
-                f"lack {', '.join(missing)}{_spelt_otherwise(columns, missing)}"
+                f"lack {', '.join(missing)}"
             )
-
-
-def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
-    """Hint at columns that differ from missing ones by capitals or an appended unit."""
-    plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
-    similar = [plain[word] for word in missing if word in plain]
-    return f"; {', '.join(similar)} may be meant: names are plain and small" if similar else ""
 
 
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:

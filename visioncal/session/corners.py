@@ -93,20 +93,12 @@ class CornerTable:
 
 
 def read_corners(folder: Path) -> CornerTable | None:
-    """Reads the corners of a session's folder; None where there are none.
-
-    Raises:
-        DataError: A column is missing or a cell is wrong.
-    """
+    """Reads the corners of a session's folder; None where there are none; raises DataError."""
     return parse_corners(read_text_inside(folder, FILE)) if (folder / FILE).exists() else None
 
 
 def parse_corners(text: str) -> CornerTable:
-    """Reads the text of a corners.csv.
-
-    Raises:
-        DataError: A column is missing or a cell is wrong.
-    """
+    """Reads the text of a corners.csv; raises DataError."""
     table = parse_table(text, FILE)
     if len(table.rows) > _MOST_CORNERS:
         raise DataError(

@@ -272,15 +272,6 @@ def read_declaration(
         DataError: A field is missing, of another type, out of range, or contradicts another; the
             message names all of them by their dotted paths.
     """
-    # Checked first: fields of another schema would be reported wrongly.
-    schema = document.get("schema")
-    if schema is not None and (schema != 1 or isinstance(schema, bool)):
-        is_newer = isinstance(schema, int) and schema > 1
-        raise DataError(
-            f"{label}: schema is {schema!r}; this version reads schema 1.",
-            culprits=[f"{label}: schema"],
-            next_step="A newer visioncal may read it." if is_newer else "Write schema = 1.",
-        )
     hints: list[str] = []
     try:
         declaration = Declaration.model_validate(dict(document))
@@ -366,17 +357,6 @@ def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
             yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
-    for name, table in declaration.named("camera").items():
-        camera = cast(CameraTable, table)
-        if camera.matrix is not None and camera.resolution is not None:
-            (width, height), (_, _, cx, cy) = camera.resolution, camera.matrix
-            if not (0 < cx < width and 0 < cy < height):
-                path = f"cameras.{name}" if name else "camera"
-                yield (
-                    f"{label}: {path}.matrix puts the principal point at ({cx:g}, {cy:g}) px, "
-                    f"outside the image of {width} x {height} px. Check the order fx, fy, cx, cy "
-                    "and that the matrix belongs to this resolution."
-                )
 
 
 def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:

@@ -64,11 +64,7 @@ def resolve_frames(
 
 
 def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
-    """Checks `[frames]`: names, cycles, and `mount`.
-
-    Raises:
-        DataError: A frame is unknown, has two parents, is its own ancestor, or contradicts `mount`.
-    """
+    """Checks `[frames]`: names, cycles, and `mount`; raises DataError."""
     if declaration.frames:
         _ = _DeclaredTree(declaration, tuple(views), tuple(robots_of(declaration, views))).declared
 

@@ -19,11 +19,7 @@ class ImageStore(ABC):
 
     @abstractmethod
     def read(self, path: str) -> bytes:
-        """Reads the bytes of one image file.
-
-        Raises:
-            DataError: There is no such image, or it cannot be read.
-        """
+        """Reads the bytes of one image file; raises DataError."""
 
     @abstractmethod
     def absence(self, path: str) -> str:

@@ -25,11 +25,7 @@ if TYPE_CHECKING:
 
 
 def refuse_filled(folder: Path) -> None:
-    """Checks that a session can be written to a folder.
-
-    Raises:
-        DataError: It exists and is not empty.
-    """
+    """Checks that a session can be written to a folder; raises DataError."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(
             f"{folder} exists and is not empty; a session is written to a new folder.",

@@ -62,7 +62,6 @@ from visioncal.session.table import (
     check_times,
     parse_csv,
     read_views,
-    view_warnings,
 )
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
@@ -528,7 +527,6 @@ def _build(
     warnings = [
         *declaration_warnings(declaration, "session.toml"),
         *cols.column_warnings(columns, "views.csv"),
-        *view_warnings(views),
         *kind_warnings(declaration, views, target_document),
     ]
     check_kinds_named(declaration, views)

@@ -92,11 +92,7 @@ class Stream:
 
 
 def read_streams(folder: Path) -> dict[str, Stream]:
-    """Reads the streams of a session's folder, by name.
-
-    Raises:
-        DataError: A cell is not a number.
-    """
+    """Reads the streams of a session's folder, by name; raises DataError."""
     paths = sorted((folder / FOLDER).glob("*.csv"))
     streams, bytes_left = {}, _MOST_BYTES
     for path in paths:
@@ -146,11 +142,7 @@ def write_stream(stream: Stream) -> str:
 
 
 def save_stream(folder: Path, name: str, stream: Stream) -> None:
-    """Writes a stream into a session's folder.
-
-    Raises:
-        DataError: It cannot be written.
-    """
+    """Writes a stream into a session's folder; raises DataError."""
     path = folder / FOLDER / f"{name}.csv"
     with named_errors(path):
         path.parent.mkdir(exist_ok=True)
@@ -158,12 +150,7 @@ def save_stream(folder: Path, name: str, stream: Stream) -> None:
 
 
 def check_stream(name: str, stream: Stream) -> None:
-    """Checks a stream's name, columns and values.
-
-    Raises:
-        DataError: Its name is invalid, columns are missing or duplicate, it has no rows, times are
-            missing or do not ascend, a pose is incomplete, or a quaternion is not of unit length.
-    """
+    """Checks a stream's name, columns and values; raises DataError."""
     label = f"{FOLDER}/{name}.csv"
     # A stream needs no `view`, and may have it.
     header = stream.columns if "view" in stream else ("view", *stream.columns)

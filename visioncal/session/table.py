@@ -24,10 +24,6 @@ _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
 _FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
 # Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
-# Median position above which the unit is millimetres, not inches or centimetres.
-_SURELY_MM = 200.0
-# Plausible limits: an arm's reach [m] and a joint's range [rad].
-_FAR_M, _WIDE_RAD = 20.0, 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,34 +279,3 @@ def check_times(views: Sequence[View]) -> None:
         if wrong:
             place = f"views.csv, view {view.number}, column stamp_s"
             raise DataError(f"{place}: {wrong}.", culprits=[place])
-
-
-def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
-    """Warning that most positions, in columns `names`, seem to be in another unit than metres."""
-    norms = [
-        float(np.linalg.norm([view.numbers[name] for name in names]))
-        for view in views
-        if names[0] in view.numbers
-    ]
-    median = float(np.median(norms)) if norms else 0.0
-    if median <= _FAR_M:
-        return ""
-    unit = (
-        "It looks like millimetres: multiply these columns by 0.001."
-        if median > _SURELY_MM
-        else "Metres are needed, and these are inches, centimetres or millimetres."
-    )
-    return f"views.csv: the median length of ({', '.join(names)}) is {median:.4g} m. {unit}"
-
-
-def view_warnings(views: Sequence[View]) -> Iterator[str]:
-    """Warnings of positions and angles in another unit."""
-    for names in (cols.POSITION, cols.MEASURED_CAM_POSE[:3]):
-        if words := unit_warning(views, names):
-            yield words
-    angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
-    if angles and float(np.median(angles)) > _WIDE_RAD:
-        yield (
-            f"views.csv: the largest joint angle of a row is {np.median(angles):.4g} rad in the "
-            "median. It looks like degrees: multiply q1_rad ... by pi / 180."
-        )

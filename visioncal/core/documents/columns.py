@@ -200,11 +200,7 @@ class TableReader(NumberChecks):
 
 
 def as_number(cell: str) -> float:
-    """Reads a finite number.
-
-    Raises:
-        DataError: It is not one.
-    """
+    """Reads a finite number; raises DataError."""
     # float() alone also accepts 1_000 and digits of other scripts.
     value = float(cell) if is_number(cell) else math.nan
     if not math.isfinite(value):
@@ -213,11 +209,7 @@ def as_number(cell: str) -> float:
 
 
 def as_whole(cell: str) -> int:
-    """Reads a whole number, also as `3.0`, which some programs write.
-
-    Raises:
-        DataError: It is not one.
-    """
+    """Reads a whole number, also as `3.0`, which some programs write; raises DataError."""
     cell = cell.removesuffix(".0")
     if not _INTEGER.fullmatch(cell) or len(cell) > 18:
         raise DataError(f"{cell[:60]!r} is no whole number")

@@ -333,8 +333,8 @@ def rows_of(
             files by the same paths. If it goes away, the remaining rows say so.
 
     Raises:
-        DataError: A scheduler is named without the extra, or does not answer; or no local process
-            can be started.
+        DataError: The scheduler does not answer.
+        DriverError: A scheduler is named without the extra.
     """
     waiting, count = [*reversed(jobs)], min(workers or os.cpu_count() or 1, len(jobs))
     while waiting:
@@ -377,19 +377,14 @@ def _row(future: Future[FleetRow], job: Job, scheduler: str | None) -> FleetRow:
         return failed_row(job, DIED, f"its worker died: {error}.", _MEMORY)
 
 
-_MEMORY = "It may need more memory: calibrate it by itself."
+_MEMORY = (
+    "It may need more memory: calibrate it by itself. A script that calls batch does so below "
+    'if __name__ == "__main__":, since each worker imports it.'
+)
 
 
 def _row_alone(job: Job) -> FleetRow:
     with _pool(1) as executor:
-        try:
-            executor.submit(os.getpid).result()
-        except BrokenExecutor as error:
-            raise DataError(
-                "worker processes end as soon as they start.",
-                next_step='A script that calls batch does so below if __name__ == "__main__":, '
-                "since each worker imports it.",
-            ) from error
         try:
             return executor.submit(work, job).result()
         except BrokenExecutor:

@@ -139,11 +139,7 @@ class ArmFormat(Format[ArmContent]):
 
 
 def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
-    """Selects the arm to export.
-
-    Raises:
-        DataError: The source has no calibrated arm, or an option does not apply to the format.
-    """
+    """Selects the arm to export; raises DataError."""
     form.check(selection)
     arm = source.arm if isinstance(source, Calibration) else None
     nominal = source.robot if isinstance(source, Calibration) else None

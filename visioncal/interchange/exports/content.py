@@ -123,16 +123,10 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     """Lists the transforms of a source; `camera` selects one of a cell, by name or frame.
 
     Raises:
-        DataError: There is no such camera, or the source is no cell.
+        DataError: There is no such camera.
     """
     frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
     cell = source.cell if isinstance(source, Calibration) else None
-    if cell is None and camera is not None:
-        raise DataError(
-            "Which camera is meant is said of a whole cell alone, and this is none.",
-            culprits=["--camera"],
-            next_step="Leave it out.",
-        )
     if isinstance(source, FrameFile):
         return Placements(frames, tuple(frames), "this file of frames", None, None)
     if cell is None:

@@ -73,11 +73,7 @@ def export(source: Source | Identified, to: str, selection: Selection = _EVERYTH
 
 
 def document(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> Document:
-    """Writes a result as `export` does, together with its warnings.
-
-    Raises:
-        DataError: As for `export`.
-    """
+    """Writes a result as `export` does, together with its warnings; raises DataError."""
     by_name = {form.name: form for form in EXPORT_FORMATS}
     if to not in by_name:
         raise DataError(
@@ -125,31 +121,26 @@ def _robot_part(
     source: Source, selection: Selection, form: ExportFormat | ArmFormat
 ) -> tuple[Source, Selection]:
     """Extracts one robot's part of a cell, where a robot is named or an arm is exported."""
+    is_arm, names = isinstance(form, ArmFormat), (selection.robot, selection.target)
     if not isinstance(source, Calibration) or source.cell is None:
-        if selection.robot is not None or selection.target is not None:
+        if {*names, selection.camera} != {None}:
             raise DataError(
-                "Which robot or target is meant is said of a whole cell alone, and this is none.",
-                culprits=["--robot", "--target"],
+                "Which camera, robot or target is meant is said of a whole cell alone, and this is "
+                "none.",
+                culprits=["--camera", "--robot", "--target"],
                 next_step="Leave it out.",
             )
         return source, selection
-    named = selection.robot is not None or selection.target is not None
-    if not named and not isinstance(form, ArmFormat):
+    if names == (None, None) and not is_arm:
         return source, selection
-    is_of_robot = isinstance(form, ArmFormat) or form.holds in ("tool", "fixture")
-    needs = PARTS if selection.target is not None else ARM if is_of_robot else EYE
+    of_robot = ARM if isinstance(form, ArmFormat) or form.holds in ("tool", "fixture") else EYE
     choice = Choice(selection.camera, selection.robot, selection.target)
-    part = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
+    part = source.chosen(choice, PARTS if selection.target is not None and not is_arm else of_robot)
     return part, replace(selection, camera=None, robot=None, target=None)
 
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
-    """Selects the content to export.
-
-    Raises:
-        DataError: There is no such transform, the format cannot hold the selection, or a frame's
-            name cannot be written safely.
-    """
+    """Selects the content to export; raises DataError."""
     available = placements(source, selection.camera)
     _check_takes(form, selection)
     name = selection.edge
@@ -238,18 +229,13 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
     form.check(selection, OF_TRANSFORMS)
-    if selection.number is not None and selection.number < 1:
+    number, load = selection.number, selection.load
+    is_load = load is None or (0.0 < load.mass_kg < np.inf and np.isfinite(load.centre_mm).all())
+    if not is_load or (number is not None and number < 1):
         raise DataError(
-            f"The number is {selection.number}; controllers count tools and bases from 1.",
-            culprits=["--number"],
-        )
-    if selection.load is not None and not (
-        0.0 < selection.load.mass_kg < np.inf and np.isfinite(selection.load.centre_mm).all()
-    ):
-        raise DataError(
-            f"The load is {selection.load.mass_kg:g} kg at {selection.load.centre_mm}; a mass "
-            "above 0 and three numbers are needed.",
-            culprits=["--mass-kg", "--cog-mm"],
+            f"{load} and the number {number}: a mass above 0 and three numbers are needed, and "
+            "tools and bases are counted from 1.",
+            culprits=["--number", "--mass-kg", "--cog-mm"],
         )
 
 

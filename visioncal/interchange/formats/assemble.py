@@ -49,11 +49,7 @@ class FileImages(ImageStore):
 
 
 def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
-    """Adds the user's options to a recording, other than those of its poses.
-
-    Raises:
-        DataError: A name that the user gives is not known, or a named file is wrong.
-    """
+    """Adds the user's options to a recording, other than those of its poses; raises DataError."""
     if requested.mount is not None:
         foreign = replace(foreign, mount=requested.mount)
     if requested.target is not None:

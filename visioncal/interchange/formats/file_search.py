@@ -150,11 +150,7 @@ def _unique_numbers(paths: Sequence[Path]) -> dict[int | None, Path]:
 
 
 def path_inside(base: Path, name: str) -> Path:
-    """Path of a file that a document names, relative to the document's folder.
-
-    Raises:
-        DataError: The path is invalid, or leaves the folder, itself or by a link.
-    """
+    """Path of a file that a document names, relative to the document's folder; raises DataError."""
     path = base / name.replace("\\", "/")
     if not is_inside(path, base):
         raise DataError(

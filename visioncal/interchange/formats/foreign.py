@@ -40,11 +40,7 @@ class PoseImportOptions:
         return replace(source, **stated)
 
     def reading(self, declared: Reading) -> Reading:
-        """The declared reading with the user's options in its place.
-
-        Raises:
-            DataError: There is no such form or unit.
-        """
+        """The declared reading with the user's options in its place; raises DataError."""
         reading = declared
         if self.form is not None:
             maker = POSE_FORMS.get(self.form)

@@ -84,11 +84,7 @@ class Fields:
         )
 
     def column(self, name: str) -> FloatArray:
-        """The numbers of a field, (n, k).
-
-        Raises:
-            DataError: There is no such field, or it holds text.
-        """
+        """The numbers of a field, (n, k); raises DataError."""
         full = self.find(name)
         if full in self.shape_errors:
             raise DataError(self.shape_errors[full], culprits=[full])
@@ -271,11 +267,7 @@ _COMMENTS = ("#", "%", "//", "!")
 
 
 def read_fields(path: Path) -> Fields:
-    """Reads a table, JSON, YAML, .npz or .npy as rows of named values.
-
-    Raises:
-        DataError: It cannot be read, or holds no rows.
-    """
+    """Reads a table, JSON, YAML, .npz or .npy as rows of named values; raises DataError."""
     suffix = path.suffix.lower()
     if suffix in (".npz", ".npy"):
         return fields_of_document(_lists(read_arrays(path)), path)
@@ -307,11 +299,7 @@ def _lists(arrays: Mapping[str, Array]) -> dict[str, object]:
 
 
 def read_document(path: Path) -> object:
-    """Reads JSON, YAML or OpenCV's XML.
-
-    Raises:
-        DataError: It cannot be read.
-    """
+    """Reads JSON, YAML or OpenCV's XML; raises DataError."""
     if path.suffix.lower() == ".json":
         return read_json(path)
     return read_opencv(path) if path.suffix.lower() == ".xml" else read_yaml(path)
