@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
@@ -94,15 +95,19 @@ class FolderImages(ImageStore):
 
 @dataclass(frozen=True, eq=False)
 class MemoryImages(ImageStore):
-    """Images held in memory."""
+    """Images held in memory; subclasses load them from elsewhere."""
 
-    files: Mapping[str, bytes]
+    files: Mapping[str, Any]  # By path: the bytes, or where a subclass finds them.
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file."""
         if path not in self.files:
             raise DataError(f"The session has no image {path}.", culprits=[path])
-        return self.files[path]
+        return self.load(self.files[path])
+
+    def load(self, place: Any) -> bytes:  # noqa: ANN401 - as the subclass has it
+        """The bytes of the image at a place."""
+        return bytes(place)
 
     def absence(self, path: str) -> str:
         """Why there is no such image; empty where there is one."""

@@ -1,7 +1,7 @@
 """Builds a session from a foreign recording."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -26,26 +26,29 @@ from visioncal.interchange.formats.intrinsics import (
     target_name,
 )
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
-from visioncal.session import ImageStore, Session, Stream
+from visioncal.session import ImageStore, MemoryImages, Session, Stream
 from visioncal.session import columns as session_columns
 from visioncal.vision.boards.imaging import image_size, looks_like_image
 
 
-@dataclass(frozen=True, eq=False)
-class FileImages(ImageStore):
+class FileImages(MemoryImages):
     """Image files anywhere on the disk, by their paths in the session."""
 
-    files: Mapping[str, Path]
-
-    def read(self, path: str) -> bytes:
+    def load(self, place: Path) -> bytes:
         """Reads the bytes of one image file."""
-        if path not in self.files:
-            raise DataError(f"The session has no image {path}.", culprits=[path])
-        return _image_bytes(self.files[path])
+        data = read_bytes(place, MOST_IMAGE_BYTES)
+        # A failed camera leaves empty files, which are kept; else what is no image is refused.
+        if data and not looks_like_image(data):
+            raise DataError(
+                f"{place} is no image (png, jpg, tif, bmp, webp).",
+                culprits=[str(place)],
+                next_step="Name each row's image with --image-column, or the folder with --images.",
+            )
+        return data
 
     def absence(self, path: str) -> str:
         """Says why there is no such image; empty where there is one."""
-        return absence(self.files[path]) if path in self.files else "is missing"
+        return super().absence(path) or absence(self.files[path])
 
 
 def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
@@ -311,18 +314,6 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )
     return lens
-
-
-def _image_bytes(file: Path) -> bytes:
-    data = read_bytes(file, MOST_IMAGE_BYTES)
-    # A failed camera leaves empty files, which are kept; anything else that is no image is refused.
-    if data and not looks_like_image(data):
-        raise DataError(
-            f"{file} is no image (png, jpg, tif, bmp, webp).",
-            culprits=[str(file)],
-            next_step="Name each row's image with --image-column, or the folder with --images.",
-        )
-    return data
 
 
 def _robot(foreign: ForeignRecording, document: dict[str, Any]) -> dict[str, Any] | None:

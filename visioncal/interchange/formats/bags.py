@@ -39,7 +39,7 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
-from visioncal.session.images import ImageStore
+from visioncal.session.images import MemoryImages
 from visioncal.vision.boards.imaging import image_size
 
 # A message, or a reader of these: their classes are made from the bag's own definitions.
@@ -107,12 +107,10 @@ class _Contents:
 
 
 @dataclass(frozen=True, eq=False)
-class BagImages(ImageStore):
-    """Images in a bag, by their paths in the session."""
+class BagImages(MemoryImages):
+    """Images in a bag: topic, whether it is compressed, and time of receipt [ns], by path."""
 
     source: Path
-    # The topic, whether it is compressed, and the time of receipt [ns], by path.
-    places: Mapping[str, tuple[str, bool, int]]
     _lock: Lock = field(default_factory=Lock, repr=False)  # A reader is of one thread at a time.
 
     @cached_property
@@ -121,11 +119,9 @@ class BagImages(ImageStore):
         finalize(self, stack.close)
         return stack.enter_context(_opened(self.source))
 
-    def read(self, path: str) -> bytes:
+    def load(self, place: tuple[str, bool, int]) -> bytes:
         """Reads one image: as it was compressed, or as a PNG."""
-        if path not in self.places:
-            raise DataError(f"The bag has no image {path}.", culprits=[path])
-        topic, is_compressed, at_ns = self.places[path]
+        topic, is_compressed, at_ns = place
         with self._lock, _bag_errors(self.source):
             reader = self._reader
             connections = [each for each in reader.connections if each.topic == topic]
@@ -133,10 +129,6 @@ class BagImages(ImageStore):
             connection, _, raw = next(iter(rows))
             message = reader.deserialize(raw, connection.msgtype)
         return bytes(message.data) if is_compressed else _png(message, topic)
-
-    def absence(self, path: str) -> str:
-        """Why there is no such image; empty where there is one."""
-        return "" if path in self.places else "is missing"
 
 
 def _rosbags(name: str) -> ModuleType:
@@ -229,7 +221,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         name=name,
         robot=PoseNumbers.empty(labels),
         images=tuple(Path(path) for _, _, path in rows),
-        store=BagImages(source, places),
+        store=BagImages(places, source),
         stamps_s=np.array([stamp_s for _, stamp_s, _ in rows]),
         mount=_mount(contents, [contents.images[topic].frame for topic in cameras], tip),
         lens=one,

@@ -5,7 +5,6 @@ view; of a motion without stops, frames evenly. Videos are read when the session
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from visioncal.interchange.formats.foreign import (
     frames_to_take,
 )
 from visioncal.robot import robot_names
-from visioncal.session.images import ImageStore
+from visioncal.session.images import MemoryImages
 
 _STATE, _IMAGES = "observation.state", "observation.image"
 # Built-in models by words in `robot_type`, beside their own names.
@@ -42,18 +41,11 @@ _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad
 _MOST_FRAMES = 60
 
 
-@dataclass(frozen=True, eq=False)
-class FrameImages(ImageStore):
-    """Frames of videos, or images in parquet, by their paths in the session."""
+class FrameImages(MemoryImages):
+    """Frames of videos by file and number, or images in parquet, by their paths in the session."""
 
-    # The video and the frame's number in it, or the bytes of the image.
-    places: Mapping[str, tuple[Path, int] | bytes]
-
-    def read(self, path: str) -> bytes:
+    def load(self, place: tuple[Path, int] | bytes) -> bytes:
         """Reads one frame, as a PNG."""
-        place = self.places.get(path)
-        if place is None:
-            raise DataError(f"The data set has no image {path}.", culprits=[path])
         if isinstance(place, bytes):
             return place
         video = cv2.VideoCapture(str(place[0]), cv2.CAP_FFMPEG)
@@ -68,10 +60,6 @@ class FrameImages(ImageStore):
                 "-crf 1 OUT.mp4",
             )
         return cv2.imencode(".png", image)[1].tobytes()
-
-    def absence(self, path: str) -> str:
-        """Why there is no such image; empty where there is one."""
-        return "" if path in self.places else "is missing"
 
 
 def _info(path: Path) -> Path:
