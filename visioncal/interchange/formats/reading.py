@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.conventions import write_pose
-from visioncal.core.documents.jsons import Array, read_arrays, read_json
+from visioncal.core.documents.jsons import read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.structured import read_opencv, read_yaml
 from visioncal.core.documents.tables import TextTable, is_number, read_table
@@ -258,8 +258,8 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     return next(named, "")
 
 
-DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS)
+DOCUMENTS = (".json", ".yaml", ".yml", ".xml", ".npz", ".npy")
+ENDINGS = (".csv", ".tsv", ".txt", ".log", *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
@@ -268,10 +268,7 @@ _COMMENTS = ("#", "%", "//", "!")
 
 def read_fields(path: Path) -> Fields:
     """Reads a table, JSON, YAML, .npz or .npy as rows of named values; raises DataError."""
-    suffix = path.suffix.lower()
-    if suffix in (".npz", ".npy"):
-        return fields_of_document(_lists(read_arrays(path)), path)
-    if suffix in DOCUMENTS:
+    if path.suffix.lower() in DOCUMENTS:
         return fields_of_document(read_document(path), path)
     if lines := _pendant(path):
         return lines
@@ -285,24 +282,19 @@ def read_fields(path: Path) -> Fields:
     return fields_of_table(table, path)
 
 
-def _lists(arrays: Mapping[str, Array]) -> dict[str, object]:
-    """Arrays as lists of rows; without images and other large ones."""
-    small = {
-        name: array
-        for name, array in arrays.items()
-        if array.ndim and array.size <= _MOST_NUMBERS * max(len(array), 1)
-    }
-    return {
-        name: (np.char.decode(array, "latin-1") if array.dtype.kind == "S" else array).tolist()
-        for name, array in small.items()
-    }
-
-
 def read_document(path: Path) -> object:
-    """Reads JSON, YAML or OpenCV's XML; raises DataError."""
-    if path.suffix.lower() == ".json":
+    """Reads JSON, YAML, OpenCV's XML, or arrays as lists, without large ones; raises DataError."""
+    suffix = path.suffix.lower()
+    if suffix in (".npz", ".npy"):
+        arrays = {
+            name: np.char.decode(array, "latin-1") if array.dtype.kind == "S" else array
+            for name, array in read_arrays(path).items()
+            if array.ndim and array.size <= _MOST_NUMBERS * max(len(array), 1)
+        }
+        return {name: array.tolist() for name, array in arrays.items()}
+    if suffix == ".json":
         return read_json(path)
-    return read_opencv(path) if path.suffix.lower() == ".xml" else read_yaml(path)
+    return read_opencv(path) if suffix == ".xml" else read_yaml(path)
 
 
 def fields_of_document(document: object, path: Path) -> Fields:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from visioncal.core.documents.jsons import read_arrays
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.tables import is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
@@ -201,10 +200,7 @@ def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
 
 def _record(path: Path) -> dict[str, object]:
     """Reads one view's file; numbers without a name are its matrix or pose."""
-    suffix = path.suffix.lower()
-    if suffix in (".npz", ".npy"):
-        document: object = read_arrays(path)
-    elif suffix in DOCUMENTS:
+    if path.suffix.lower() in DOCUMENTS:
         document = read_document(path)
     else:
         table = read_table(path)
