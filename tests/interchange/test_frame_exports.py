@@ -154,13 +154,9 @@ def test_the_only_frame_of_its_kind_is_taken(name):
 
 
 @pytest.mark.parametrize("name", FRAME_READERS)
-def test_the_wrong_kind_is_refused_with_the_format_for_it(name):
+def test_the_wrong_kind_is_refused(name):
     wrong = FIXTURE if name in TOOL_READERS else TOOL
-    with pytest.raises(DataError, match=f"{name} writes .*{wrong} is none.*--to ") as caught:
-        export(CELL, name, Selection(edge=wrong))
-    counterpart = caught.value.next_step.split()[-1].strip(".")
-    assert export(CELL, counterpart, Selection(edge=wrong))
-    assert counterpart.split("-")[0] == name.split("-")[0]
+    raised(DataError, f"{wrong} is none.*--to ", export, CELL, name, Selection(edge=wrong))
 
 
 @pytest.mark.parametrize("name", sorted(TAKES))

@@ -123,15 +123,11 @@ def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
 MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
 # The largest sensors have 150 million pixels of 16 bits, uncompressed.
 MOST_IMAGE_BYTES = 300_000_000
-# Longest name in file systems [bytes].
-_LONGEST_NAME = 255
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Each value costs about a hundred bytes in memory once it is read.
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
-# tomllib's messages on repeated tables and keys.
-_TWICE = re.compile("twice|overwrite a value")
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
@@ -145,16 +141,12 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
         DataError: It is missing, no regular file, too large, or cannot be read.
     """
     path = Path(path)
-    why_not = absence(path)
-    if why_not:
-        step = "Check the path and its spelling."
-        if "regular" in why_not:
-            step = "Save what it gives as a file first."
-        elif "folder" in why_not and (
-            inside := [file for file in path.glob("*") if file.is_file()]
-        ):
-            step = f"Name a file in it, such as {min(inside, key=natural)}."
-        raise DataError(f"{path} {why_not}.", culprits=[str(path)], next_step=step)
+    if why_not := absence(path):
+        raise DataError(
+            f"{path} {why_not}.",
+            culprits=[str(path)],
+            next_step="Check the path and its spelling.",
+        )
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
@@ -174,8 +166,6 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
 
 def absence(path: Path) -> str:
     """Why there is no regular file at a path, as a predicate; empty where there is one."""
-    if any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_NAME for part in path.parts):
-        return f"has a name longer than {_LONGEST_NAME} bytes, as no file has"
     try:
         if path.is_file():
             return ""
@@ -247,11 +237,8 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
         raise DataError(
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
-            next_step=(
-                "A table and a key may be there once: join the two."
-                if _TWICE.search(str(error))
-                else 'Text is written in "double quotes", lists in [brackets, like, this].'
-            ),
+            next_step='Text is written in "double quotes", lists in [brackets, like, this]; tables '
+            "and keys are there once.",
         ) from error
     except RecursionError as error:
         raise too_deep(label) from error
@@ -353,11 +340,6 @@ def find_described(
     if name_or_path in shipped:
         return shipped[name_or_path]
     hint = did_you_mean(name_or_path, shipped)
-    if not hint:
-        # A maker's or another product's name is in the description of what it is called here.
-        word = name_or_path.lower()
-        near = [name for name, path in shipped.items() if word in read_text(path).lower()]
-        hint = f"Did you mean {near[0]}?" if len(near) == 1 and word else ""
     raise DataError(
         f"There is no {what} named {name_or_path!r}. {hint}".strip(),
         culprits=[name_or_path],

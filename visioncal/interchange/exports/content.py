@@ -19,7 +19,6 @@ _NOTICED_PX = 0.01
 
 
 Source: TypeAlias = Calibration | FrameFile
-Kind: TypeAlias = Literal["tool", "fixture"]
 
 # Name of the camera's or the instrument's transform by its mount.
 HAND_EYE: Mapping[Mount, str] = {
@@ -28,6 +27,8 @@ HAND_EYE: Mapping[Mount, str] = {
     "instrument": "base_from_instrument",
 }
 WORST_FIRST = ("bad", "check", "good")
+# By what a format holds: the beginning of its transform's parent.
+PARENTS: Mapping[str, str] = {"tool": "flange", "fixture": "base"}
 _COMMANDS: Mapping[str, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
@@ -85,7 +86,7 @@ class Placements:
         """
         wanted, names = "transform", self.frames
         if holds == "tool" or holds == "fixture":
-            wanted, names = holds, tuple(name for name in names if is_kind(name, holds))
+            wanted, names = holds, tuple(name for name in names if name.startswith(PARENTS[holds]))
         elif self.mount is not None:
             return HAND_EYE[self.mount]
         elif self.cell is not None:
@@ -110,13 +111,6 @@ def ends_of(name: str) -> tuple[str, str]:
     """Names of a transform's parent and child; empty where the name has none."""
     parent, _, child = name.partition("_from_")
     return parent, child
-
-
-def is_kind(name: str, kind: Kind) -> bool:
-    """Whether a transform is a pose on the flange, or in the base."""
-    # The parent by our names: flange, flange_2, ...
-    wanted = "flange" if kind == "tool" else "base"
-    return ends_of(name)[0].partition("_")[0] == wanted
 
 
 def placements(source: Source, camera: str | None = None) -> Placements:

@@ -14,13 +14,14 @@ from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write
 from visioncal.interchange.exports.content import (
     HAND_EYE,
     OF_TRANSFORMS,
+    PARENTS,
     WORST_FIRST,
     Content,
     ExportFormat,
     Placements,
     Selection,
     Source,
-    is_kind,
+    ends_of,
     placements,
 )
 from visioncal.interchange.exports.mujoco import MUJOCO
@@ -141,36 +142,41 @@ def _robot_part(
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """Selects the content to export; raises DataError."""
-    available = placements(source, selection.camera)
+    available, name = placements(source, selection.camera), selection.edge
     _check_takes(form, selection)
-    name = selection.edge
-    if form.holds in ("lens", "hand-eye"):
-        _check_camera(form, selection, available)
-    if form.holds == "tool" or form.holds == "fixture":
-        name = available.chosen(form.holds) if name is None else name
-        available.find(name)
-        if selection.inverse or not is_kind(name, form.holds):
-            maker = form.name.partition("-")[0]
-            others = (
-                other.name
-                for other in ROBOTS
-                if other.holds not in ("any edge", form.holds) and other.name.startswith(maker)
-            )
-            what = f"the inverse of {name}" if selection.inverse else name
-            parent = "flange" if form.holds == "tool" else "base"
-            raise DataError(
-                f"{form.name} writes a {form.holds}, {parent}_from_*, and {what} is none.",
-                culprits=[name],
-                next_step="Leave --inverse out."
-                if selection.inverse
-                else f"Choose another format, as --to ros or --to {next(others)}.",
-            )
-    elif name is None and form.holds == "lens" and available.cell is not None:
+    why = _camera_fault(form, selection, available)
+    if name is None and not why and form.holds == "lens" and available.cell is not None:
         frame = next(name for name, lens in available.lenses.items() if lens is available.lens)
         name = f"{available.cell.tree.parents[frame]}_from_{frame}"
-    elif name is None:
+    elif name is None and not why:
         name = available.chosen(form.holds)
+    parent = PARENTS.get(form.holds)
+    if parent and (selection.inverse or ends_of(name or "")[0].partition("_")[0] != parent):
+        what = f"the inverse of {name}" if selection.inverse else name
+        why = f"writes a {form.holds}, {parent}_from_*, and {what} is none"
+    if why or name is None:
+        raise DataError(
+            f"{form.name} {why}.",
+            culprits=[form.name],
+            next_step="Choose another format, as --to ros, or other options.",
+        )
     return _content(form, selection, available, name)
+
+
+def _camera_fault(form: ExportFormat, selection: Selection, available: Placements) -> str:
+    """Why a format of the camera, or of its transform, cannot hold a selection; else empty."""
+    of_lens, cell, edge = form.holds == "lens", available.cell, selection.edge
+    if form.holds not in ("lens", "hand-eye"):
+        return ""
+    if not (of_lens and cell is not None) and available.mount in (None, "instrument"):
+        return f"holds the camera, and {available.words} has none"
+    if of_lens and (selection.inverse or edge or selection.parent):
+        return "holds the lens and no transform; --child names the camera"
+    if of_lens and cell is not None and available.lens is None:
+        return f"holds one camera; this cell has {', '.join(available.lenses) or 'none'}"
+    if not of_lens and (selection.inverse or edge not in (None, *HAND_EYE.values())):
+        return "holds the camera's pose on the flange or in the base, and nothing else"
+    return ""
 
 
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
@@ -237,23 +243,3 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
             "tools and bases are counted from 1.",
             culprits=["--number", "--mass-kg", "--cog-mm"],
         )
-
-
-def _check_camera(form: ExportFormat, selection: Selection, available: Placements) -> None:
-    """Refuses what a format of the camera, or of its transform, cannot hold."""
-    of_lens, cell = form.holds == "lens", available.cell
-    why, step = "", ""
-    if not (of_lens and cell is not None) and available.mount in (None, "instrument"):
-        why = f"holds the camera, and {available.words} has none"
-        step = "Name the calibration instead, or choose a format of poses: --to ros."
-    elif of_lens and (selection.inverse or selection.edge or selection.parent):
-        why = "holds the lens and no transform: --edge, --inverse and --parent do not go with it"
-        step = "Leave them out; --child names the camera."
-    elif of_lens and cell is not None and available.lens is None:
-        why = f"holds one camera; this cell has {', '.join(available.lenses) or 'none'}"
-        step = "Name one with --camera."
-    elif not of_lens and (selection.inverse or selection.edge not in (None, *HAND_EYE.values())):
-        why = "holds the camera's pose on the flange or in the base, and nothing else"
-        step = "Leave --edge and --inverse out, or choose --to ros."
-    if why:
-        raise DataError(f"{form.name} {why}.", culprits=[form.name], next_step=step)
