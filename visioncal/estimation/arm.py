@@ -122,42 +122,33 @@ def find_arm_errors(
     likelihood: RobotLikelihood,
     robot: int,
     basis: FloatArray,
-    *,
-    of_links: bool,
 ) -> ArmErrors | None:
-    """Estimates the size of one robot's arm errors, if they are significant.
+    """Estimates the size of the errors of one robot's links; None where they gain no likelihood.
+
+    Every arm has link errors: their size counts even where it hardly gains likelihood.
 
     Args:
         likelihood: That of the robots' noise levels without these errors, at the solution.
         robot: Index of the robot.
-        basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
-        of_links: Whether the basis is of this arm's links.
-
-    Returns:
-        The errors; None where the gain is no larger.
+        basis: (s, 6, p) of `link_basis`, by stop.
     """
     # The basis is empty for an arm whose link errors all equal errors of its frames (parallel
     # axes).
     stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
     if len(np.unique(stops)) < FEWEST_STOPS or not size:
         return None
-    levels, start = likelihood.start_beside(robot, basis)
-    if start <= _NOTHING:
-        return None
-    # Every arm has link errors: their size counts even where it hardly gains likelihood.
-    min_gain = 0.0 if of_links else _LIKELY
-    white_value = likelihood.white[1]
+    start = likelihood.start_beside([likelihood.moved(robot, basis)], np.array([_NOTHING]))
     sigmas, value = likelihood.beside(robot, basis, np.ones((size, 1))).most_likely(
-        np.append(levels, start),
+        start,
         np.append(np.repeat(likelihood.seen, 2), True),
-        np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
-        # The search stops early where the likelihood seems not to reach the least gain.
-        enough=white_value - 0.5 * min_gain,
+        np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING),
+        # The search stops early where the likelihood seems not to reach that without them.
+        enough=likelihood.white[1],
     )
-    gain = 2.0 * (white_value - value)
-    if gain <= min_gain:
+    gain = 2.0 * (likelihood.white[1] - value)
+    if gain <= 0.0:
         return None
-    return ArmErrors(basis, float(np.sqrt(level_weight(gain)) * sigmas[-1]), gain, of_links)
+    return ArmErrors(basis, float(np.sqrt(level_weight(gain)) * sigmas[-1]), gain, of_links=True)
 
 
 def rows_of(problem: Problem, robot: str) -> Mask:

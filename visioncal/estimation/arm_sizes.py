@@ -59,8 +59,6 @@ _TYPICAL = {
     HARMONICS: 2e-4,
 }
 _TORQUE_NM = 10.0
-# Noise at the start, as a share of the residuals with the nominal arm.
-_LITTLE_NOISE = 0.1
 # Least twice gain by functions with all other sizes held: those that are just significant have half
 # of that or more. Least gain in log-likelihood of a step.
 _LEAST_GAIN, _LITTLE = 5.0, 1e-2
@@ -220,17 +218,9 @@ class _Blocks:
         return np.asarray(self.likelihood.jacobian[self.mine][:, :, self.slice_of(name)])
 
     def start(self) -> FloatArray:
-        """Logarithms (2 r + g,): sizes that explain all residuals, beside little noise.
-
-        A search from much noise may stay there, with sizes of next to nothing.
-        """
-        rms = self.nominal.rms
-        levels = np.maximum(_LITTLE_NOISE * rms, LEAST_SIGMA)
-        moved = (self.columns(name)[:, :6] for name in self.bases)
-        motion = [np.sqrt(np.sum(np.mean(columns**2, axis=0))) for columns in moved]
+        """Logarithms (2 r + g,): sizes that explain all residuals, beside little noise."""
         typical = np.array([_TYPICAL[name] for name in self.bases])
-        sizes = np.maximum(typical, np.linalg.norm(rms) / np.maximum(motion, LEAST_SIGMA))
-        return np.asarray(np.log(np.append(np.tile(levels, len(self.nominal.before)), sizes)))
+        return np.log(self.nominal.start_beside([*map(self.columns, self.bases)], typical))
 
     def gain(self, estimate: MixedEstimate) -> float:
         """Twice the gain in log-likelihood over the nominal arm."""

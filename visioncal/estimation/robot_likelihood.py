@@ -1,6 +1,6 @@
 """Restricted likelihood (REML) of the robots' noise levels at a fit."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -38,8 +38,8 @@ def ratio_prior(robots: Iterable[int], count: int, first: int = 0) -> SizePrior:
 START_SIGMA = 5e-4
 # Lower bound of the initial levels of a repeated search: from zero, levels cannot grow.
 _ABOVE_NOTHING = 2e-5
-# Factors of the rotation and translation levels tried as start values beside errors of an arm.
-_LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
+# Noise at the start beside random effects, as a share of the residuals.
+_LITTLE_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,30 +105,20 @@ class RobotLikelihood:
         """Levels (r, 2) from a search from above, and the negative log-likelihood there."""
         return self._levels(np.maximum(self.rms, START_SIGMA) * np.ones_like(self.before))
 
-    def start_beside(self, robot: int, moves: FloatArray) -> tuple[FloatArray, float]:
-        """Initial levels with additional random effects, of equal variance, on a robot's flange.
+    def start_beside(self, moved: Sequence[FloatArray], least: FloatArray) -> FloatArray:
+        """Initial sigmas (2 r + g,) with g groups of additional random effects.
 
-        Effects may explain most of the robot's rotation level, translation level, or both: the
-        case of the highest likelihood is returned.
+        They explain all residuals, beside little noise: a search from much noise may stay there,
+        with sizes of next to nothing.
 
         Args:
-            robot: Index of the robot.
-            moves: (s, 6, k) Jacobian of its flange by the effects at each stop.
-
-        Returns:
-            The levels (r, 2), and the size of the effects; zero if none raises the likelihood.
+            moved: (m, 6 w, p) Jacobian of a robot's units by the effects of each group.
+            least: (g,) least sizes.
         """
-        mine, moved = (self.members == robot).any(axis=1), self.moved(robot, moves)
-        start, least = (self.white[0], 0.0), np.inf
-        for lower in _LOWER:
-            levels = self.white[0].copy()
-            levels[robot] *= lower
-            levels = np.maximum(levels, LEAST_SIGMA)
-            weighed = self.model.at(np.log(levels.ravel()), is_sloped=False)
-            size, gain = weighed.likely_size(moved, mine)
-            if weighed.value - gain < least and (gain > 0.0 or least == np.inf):
-                start, least = (levels, size), weighed.value - gain
-        return start
+        levels = np.maximum(_LITTLE_NOISE * self.rms, LEAST_SIGMA)
+        motion = [np.sqrt(np.sum(np.mean(columns[:, :6] ** 2, axis=0))) for columns in moved]
+        sizes = np.maximum(least, np.linalg.norm(self.rms) / np.maximum(motion, LEAST_SIGMA))
+        return np.append(np.tile(levels, len(self.before)), sizes)
 
     @property
     def negative_log_likelihood(self) -> float:

@@ -201,7 +201,7 @@ def _calibrate_arms(
     for iteration in range(_ROUNDS + 1):
         if cell_fit.level != "hand-eye":
             arms = _choose_levels(cell_fit, noise)
-            erring = [name for name, arm in arms.items() if arm.has_free_errors()]
+            erring = [name for name, arm in arms.items() if arm.has_free_errors]
             clock_errors = clock_effects(cell_fit.cell, observed.clocks, erring)
             effects = (*clock_errors, *of_random_effects(cell_fit.other_effects))
             cell_fit = _converge_arms(replace(cell_fit, arms=arms, other_effects=effects))
@@ -325,7 +325,7 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
     effects_of_fit = cell_fit.inlier_fit.problem.effect_columns
     # The fit may still estimate an arm that is nominal again, with other inliers.
     is_outdated = any(
-        f"arm of {name}" in effects_of_fit and not arm.has_free_errors()
+        f"arm of {name}" in effects_of_fit and not arm.has_free_errors
         for name, arm in cell_fit.arms.items()
     )
     for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):

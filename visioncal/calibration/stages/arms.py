@@ -141,16 +141,17 @@ class RobotArm:
             poses[self.has_pose] = poses[self.has_pose] @ drift.motion(self.heat)
         return poses
 
-    def has_free_errors(self, *, freely: bool = False) -> bool:
-        """Whether its errors are unknowns: estimated ones, or with `freely` any that were found."""
-        return self.errors is not None and (freely or self.errors.is_estimated)
+    @property
+    def has_free_errors(self) -> bool:
+        """Whether its errors are unknowns of the fit."""
+        return self.errors is not None and self.errors.is_estimated
 
-    def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
+    def effects(self) -> tuple[Effect, ...]:
         """Effects that move its flange at the stops: drift uncertainty and errors."""
         drift, found = self.drift, []
         if drift is not None and self.heat is not None:
             found.append(drift.effect(self.robot, self.heat, self.has_pose))
-        if self.errors is not None and self.has_free_errors(freely=freely):
+        if self.errors is not None and self.errors.is_estimated:
             values = None if self.model is None else self.model.values
             found.append(self.errors.effect(self.robot, values=values))
         return tuple(found)
@@ -186,8 +187,8 @@ class RobotArm:
         return replace(self, thermal=drift)
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
-        """Looks for posture-dependent errors, by the likelihood at the fit with the nominal arm."""
-        errors = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
+        """Looks for errors of its links, by the likelihood at the fit with the nominal arm."""
+        errors = find_arm_errors(likelihood, robot, self.basis) if self.is_modelled else None
         return replace(self, errors=errors)
 
     def reports_matching_joints(self, agrees: Mask) -> Mask:
@@ -387,10 +388,10 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     )
 
 
-def arm_effects(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
+def arm_effects(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
     """The effects of all arms; see `RobotArm.effects`."""
     for arm in arms.values():
-        yield from arm.effects(freely=freely)
+        yield from arm.effects()
 
 
 def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:

@@ -31,19 +31,11 @@ class CellFrameModel:
     arms: Mapping[str, RobotArm]  # The robots' arms, with the errors that were found.
     effects: Sequence[Effect] = ()  # All effects but lenses, boards and arms.
     noise: Noise | None = None  # Its levels to start from; None for those from above.
-    # Whether all errors that were found are free, rather than only the estimated ones.
-    frees_all_errors: bool = False
-
-    @property
-    def errors(self) -> tuple[ArmErrors, ...]:
-        """The errors of arms that were found."""
-        return tuple(arm.errors for arm in self.arms.values() if arm.errors is not None)
 
     @property
     def has_links(self) -> bool:
         """Whether errors of an arm's links are free."""
-        free = (arm.has_free_errors(freely=self.frees_all_errors) for arm in self.arms.values())
-        return any(free) and any(error.of_links for error in self.errors)
+        return any(arm.has_free_errors for arm in self.arms.values())
 
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the inliers, repeated ones sharing an error."""
@@ -69,7 +61,7 @@ class CellFrameModel:
         effects = [
             seen.effect(rows),
             *self.effects,
-            *arm_effects(self.arms, freely=self.frees_all_errors),
+            *arm_effects(self.arms),
         ]
         return replace(problem, observations=observations).with_effects(effects)
 
@@ -79,7 +71,7 @@ class CellFrameModel:
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
             name: arm
-            if arm.has_free_errors(freely=self.frees_all_errors)
+            if arm.has_free_errors
             else arm.with_errors(likelihood, problem.robots.index(name))
             for name, arm in self.arms.items()
         }
@@ -100,10 +92,6 @@ class CellFrameModel:
         fit = fit_problem(problem, State(fitted.fit.state.edges, values))
         found = {robot: find_pose_errors(problem, fit.state, fit.noise, robot) for robot in arms}
         return {robot: errors for robot, errors in found.items() if errors is not None}
-
-    def freed(self, *, freely: bool) -> Self:
-        """Frees all errors of the arms that were found, or only the estimated ones."""
-        return replace(self, frees_all_errors=freely)
 
     def camera_parameters(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]

@@ -83,7 +83,7 @@ def refine_jointly(
             stated = fit_jointly(optics, model, frames)
         fitted, posture = with_sizes(model, stated)
         new_model, sized = model.with_errors(fitted), fitted
-        if any(error.is_significant for error in new_model.errors):
+        if new_model.has_links:
             fitted, new_model = _beside_arms(model, new_model, stated)
         weighed = fitted.camera_parameters.weighed(fitted.linearised)
         stacks = zip(weighed.problems.values(), optics.problems.values(), strict=True)
@@ -99,25 +99,13 @@ def _beside_arms(
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """The fit with errors of the arms, which may have passed for those of lenses and boards.
 
-    Their sigma is that under the stated lenses and boards: a board whose size changes with the arm
-    hides a part of it. Errors of any arm's shape decide the sizes of the others, but not all are
-    estimated.
+    Their sigma is that under the stated lenses and boards, where these show any: a board whose size
+    changes with the arm hides a part of it.
     """
-
-    def beside(other: FrameModel, fit: ConvergedFit) -> ConvergedFit:
-        return fit_jointly(fit.camera_parameters, other, fit.frames)
-
     under_stated = model.with_errors(stated)
-    freeing = (under_stated if under_stated.errors else after).freed(freely=True)
-    sized, _ = with_sizes(freeing, beside(freeing, stated))
-    estimating = freeing.freed(freely=False)
-    if all(error.is_estimated for error in freeing.errors):
-        return sized, estimating
-    fitted = beside(estimating, sized)
-    new_model = estimating.with_errors(fitted)
-    # Errors that were not significant under the stated lenses may be so under these.
-    now, earlier = ([error.is_estimated for error in at.errors] for at in (new_model, estimating))
-    return (fitted if now == earlier else beside(new_model, fitted)), new_model
+    estimating = under_stated if under_stated.has_links else after
+    fitted = fit_jointly(stated.camera_parameters, estimating, stated.frames)
+    return with_sizes(estimating, fitted)[0], estimating
 
 
 def with_sizes(

@@ -297,7 +297,7 @@ def find_drift(
     basis[mine] = model.columns("links", stops.q)
     with one_blas_thread():
         likelihood = robot_likelihood(problem, start, starting_noise(problem))
-        links = find_arm_errors(likelihood, problem.robots.index(robot), basis, of_links=True)
+        links = find_arm_errors(likelihood, problem.robots.index(robot), basis)
         if links is not None:
             problem = problem.with_effects([*problem.effects, links.effect(robot)])
             start = State(start.edges, problem.start_values)
