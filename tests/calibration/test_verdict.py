@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import chdtrc
-from support.cells import calibrated, reporting, showing
+from support.cells import calibrated, pairs_session, reporting, showing
 from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, views
 
@@ -26,7 +26,7 @@ from visioncal.core.codec import read, write
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert, pose_difference
-from visioncal.core.types import Need, Rejection
+from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
     CALIBRATE,
     GUESS,
@@ -268,6 +268,17 @@ def test_poses_with_too_few_digits_are_the_cause(digits: int, is_found: bool) ->
     verdict = calibrate(replace(session, views=tuple(map(written, session.views)))).verdict
     assert (ids(verdict)[:1] == ["rounded_poses"]) == is_found
     assert not is_found or "positions to 1 mm and their quaternions to 0.001" in verdict.top[0]
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
+    cell = simulate(CellOptions(views=20, mount=mount))
+    robot, camera = cell.robot.base_from_flange, cell.cam_from_target
+    assert "mirrored_cell" not in ids(calibrate(pairs_session(mount, robot, camera)).verdict)
+    other = MOUNTS[mount == MOUNTS[0]]
+    verdict = calibrate(pairs_session(other, invert(robot), camera)).verdict
+    assert ids(verdict)[:1] == ["mirrored_cell"]
+    assert verdict.status == "check"
 
 
 @pytest.mark.parametrize("freedom", [np.inf, 15.0])

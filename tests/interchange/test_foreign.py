@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from support.foreign_samples import (
     BASE_FROM_FLANGE,
     CAM_FROM_TARGET,
@@ -81,6 +82,26 @@ def test_samples_that_say_where_the_camera_is_need_no_mount(tmp_path):
     np.testing.assert_allclose(
         poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
     )
+
+
+def test_samples_are_found_in_their_folder_with_the_mount_beside_them(tmp_path):
+    recording = easy_handeye(tmp_path / "in")
+    result = recording.source.with_suffix(".calib")
+    result.write_text("parameters: {calibration_type: eye_in_hand}\n")
+    session = convert(tmp_path / "in", tmp_path / "out")
+    assert session.mount == "eye-in-hand"
+    # As the services of ROS 1 have them: a list each, here below a header.
+    samples = yaml.safe_load(recording.source.read_text())["samples"]
+    lists = {
+        name: {"header": {"seq": 0}, "transforms": [sample[part] for sample in samples]}
+        for name, part in (("hand_world_samples", "robot"), ("camera_marker_samples", "tracking"))
+    }
+    (tmp_path / "samples.yaml").write_text(yaml.safe_dump({"samples": lists}))
+    again = convert(
+        tmp_path / "samples.yaml", tmp_path / "again", requested=ImportOptions(mount="eye-in-hand")
+    )
+    for name in ("base_from_flange", "cam_from_target"):
+        np.testing.assert_array_equal(poses_of(again, name), poses_of(session, name))
 
 
 def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):

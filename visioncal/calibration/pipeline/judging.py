@@ -255,7 +255,8 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
             can_tilt=arm.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
-        if not problem.is_combined:
+        # Of pose pairs without a stated noise, the detection's may be in the flange's.
+        if not problem.is_combined and problem.observations.covariance.any():
             noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()
             judged = replace(
                 judged,

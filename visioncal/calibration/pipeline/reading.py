@@ -23,11 +23,13 @@ from visioncal.calibration.stages.robots import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.session import STREAMS
 
 # Beginning of warnings about the robot's model.
 _OF_MODEL = "session.toml: robot.model:"
+# Part of a warning about a column that may be misspelt, or the user's own.
+_KEPT_COLUMN = "is not a known one and is kept as text"
 _MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
@@ -88,6 +90,8 @@ def _suspicious(warning: str) -> Finding:
     if warning.startswith(_OF_MODEL):
         return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
     file = warning.partition(": ")[0]
+    if _KEPT_COLUMN in warning:
+        return Finding(NOTE, warning)
     return Finding("remark", warning, Remedy(f"In {file}, correct or delete what this names."))
 
 

@@ -6,7 +6,15 @@ from dataclasses import replace
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.priors import components
-from visioncal.calibration.suspects import arm, board, growing, lens, rounded_poses, steps
+from visioncal.calibration.suspects import (
+    arm,
+    board,
+    growing,
+    lens,
+    mirrored_cell,
+    rounded_poses,
+    steps,
+)
 from visioncal.calibration.suspects.outliers import moved_finding
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
@@ -84,6 +92,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.SHAPE,
     *growing.GROWING,
     rounded_poses.ROUNDED_POSES,
+    mirrored_cell.MIRRORED_CELL,
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
     # What was seen and read.

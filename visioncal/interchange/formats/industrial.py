@@ -32,6 +32,8 @@ from visioncal.interchange.formats.reading import (
 )
 
 _NONE = PoseImportOptions()
+# easy_handeye's lists of the robot's poses and of the marker's.
+_SAMPLE_LISTS = ("hand_world_samples", "camera_marker_samples")
 _EASY_MOUNTS: Mapping[str, Mount] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand"}
 
 
@@ -40,25 +42,56 @@ def _quaternions(*names: str, inverse: bool | None = None) -> PoseImportOptions:
     return PoseImportOptions(names, "quaternion-xyzw", "m", inverse)
 
 
-def _is_easy_handeye(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    words = head(path)
-    return path.suffix == ".samples" or (
-        "samples:" in words and "robot:" in words and "tracking:" in words
-    )
+def _easy_handeye_file(path: Path) -> Path | None:
+    """The file of samples: `path` itself, or the only one in a folder."""
+    found = []
+    for file in files_in(path) if path.is_dir() else (path,):
+        words = head(file) if file.suffix in (".samples", ".yaml", ".yml") else ""
+        pair = ("robot:", "tracking:") if "robot:" in words else _SAMPLE_LISTS
+        if file.suffix == ".samples" or all(word in words for word in ("samples:", *pair)):
+            found.append(file)
+    return found[0] if len(found) == 1 else None
+
+
+def _stated_mount(document: object) -> Mount | None:
+    """The mount in the parameters of easy_handeye, whose older ones have `eye_on_hand`."""
+    content = document if isinstance(document, Mapping) else {}
+    parameters = content.get("parameters")
+    stated = {**content, **(parameters if isinstance(parameters, Mapping) else {})}
+    if isinstance(stated.get("eye_on_hand"), bool):
+        return "eye-in-hand" if stated["eye_on_hand"] else "eye-to-hand"
+    return _EASY_MOUNTS.get(str(stated.get("calibration_type")))
 
 
 def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording:
-    """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform."""
-    # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
-    # serves both (easy_handeye2, HandeyeSampler). Newer files say in their parameters which it is.
-    document = mapping(read_yaml(path), str(path))
-    fields = fields_of_document(document.get("samples"), path)
-    parameters = document.get("parameters")
-    stated = {**document, **(parameters if isinstance(parameters, Mapping) else {})}
-    mount = requested.mount or _EASY_MOUNTS.get(str(stated.get("calibration_type")))
+    """Reads samples: `robot` and `tracking` as geometry_msgs/Transform, in one list or two."""
+    file = _easy_handeye_file(path) or path
+    document = mapping(read_yaml(file), str(file))
+    samples = document.get("samples")
+    if isinstance(samples, Mapping):
+        # As the services of ROS 1 have them, with or without a header.
+        robot, camera = (
+            each.get("transforms") if isinstance(each, Mapping) else each
+            for each in map(samples.get, _SAMPLE_LISTS)
+        )
+        if not (isinstance(robot, list) and isinstance(camera, list) and len(robot) == len(camera)):
+            raise DataError(
+                f"{file}: {' and '.join(_SAMPLE_LISTS)} are not two lists of one length.",
+                culprits=[str(file)],
+            )
+        pairs = zip(robot, camera, strict=True)
+        samples = [{"robot": first, "tracking": second} for first, second in pairs]
+    fields = fields_of_document(samples, file)
+    result, notes = file.with_suffix(".calib"), list[str]()
+    stated = _stated_mount(document)
+    if stated is None and result.is_file():
+        stated = _stated_mount(read_yaml(result))
+    mount = requested.mount or stated
+    if stated not in (None, mount):
+        notes.append(f"easy_handeye's own parameters state {stated}; {mount} is taken, as asked.")
     seen = "tracking" if "tracking.translation" in fields.numbers else "optical"
+    # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
+    # serves both (easy_handeye2, HandeyeSampler).
     requested = requested.with_poses(
         _quaternions("robot.translation", "robot.rotation", inverse=mount == "eye-to-hand"),
         _quaternions(f"{seen}.translation", f"{seen}.rotation"),
@@ -69,8 +102,8 @@ def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording
         else "as they stand, as with the camera in the hand"
     )
     foreign = foreign_from(fields, requested)
-    notes = (*foreign.notes, f"The robot's poses are read {note}.")
-    return replace(foreign, mount=mount, notes=notes)
+    notes += [*foreign.notes, f"The robot's poses are read {note}."]
+    return replace(foreign, mount=mount, notes=tuple(notes))
 
 
 def _is_moveit(path: Path) -> bool:
@@ -96,7 +129,10 @@ def _read_moveit(path: Path, requested: ImportOptions) -> ForeignRecording:
 
 
 EASY_HANDEYE = ForeignFormat(
-    "easy-handeye2", "easy_handeye2's .samples", _is_easy_handeye, _read_easy_handeye
+    "easy-handeye2",
+    "samples of easy_handeye and easy_handeye2",
+    lambda path: _easy_handeye_file(path) is not None,
+    _read_easy_handeye,
 )
 MOVEIT = ForeignFormat("moveit", "MoveIt's hand-eye samples", _is_moveit, _read_moveit)
 

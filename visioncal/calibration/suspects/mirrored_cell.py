@@ -1,0 +1,42 @@
+"""A cell the other way round: inverse poses with the other mount, which fit the views as well."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.core.types import MOUNTS
+from visioncal.core.verdict import Finding, Remedy
+
+# What rides on a flange is nearer to it than so, and than a third of what it is compared with [m].
+_CARRIED_M, _RATIO = 0.35, 3.0
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    # Where a model's poses are those of the joints, they are no inverse ones.
+    if run.mount not in MOUNTS or run.reported.matched is not None:
+        return
+    camera, target = (
+        (name, float(np.linalg.norm(edge.transform.translation)))
+        for name, edge in [*run.assessment.last_edges.items()][:2]
+    )
+    in_hand = run.mount == MOUNTS[0]
+    (carried, carried_m), (placed, placed_m) = (camera, target) if in_hand else (target, camera)
+    if carried_m > _CARRIED_M and carried_m > _RATIO * placed_m:
+        yield Finding(
+            "mirrored_cell",
+            f"By this result, {carried} is {carried_m:.2f} m away from the flange that carries it, "
+            f"and {placed} only {placed_m:.2f} m from the robot's base. With inverse poses of the "
+            f"robot and the mount {MOUNTS[in_hand]} the views fit just as well, and both change "
+            "places.",
+            Remedy(
+                "Measure roughly which is right. If it is the other, convert the recording again "
+                f"with --mount {MOUNTS[in_hand]} and --robot-inverse (for easy_handeye, --mount "
+                "alone)."
+            ),
+            until_mm=0.0,
+        )
+
+
+MIRRORED_CELL = Suspect("mirrored_cell", _found, 1e-2)
