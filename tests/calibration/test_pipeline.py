@@ -19,6 +19,7 @@ from visioncal.calibration.verification.calibration_prior import CalibrationPrio
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS, Camera, Target
+from visioncal.core.verdict import NOTE
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.live.planning.information import predict_worlds
@@ -211,7 +212,8 @@ def test_a_board_of_several_may_be_known_whole():
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     # The board is turned no farther than that is known.
     assert sigmas[12:15].max() < 1.001e-5
-    assert sum("was used" in note and name in note for note in known.notes) == 3
+    notes = [finding.words for finding in known.verdict.findings if finding.kind == NOTE]
+    assert sum("was used" in note and name in note for note in notes) == 3
 
 
 # Ten sigma, and so many that noise beside the priors would explain them.

@@ -20,7 +20,6 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
-from visioncal.calibration.suspects.judged import PointAccuracy
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, explained_by
 from visioncal.core.codec import read, write
 from visioncal.core.number_format import figure
@@ -69,8 +68,6 @@ HOME = Remedy('Write model = "ur5e".')
 MISREAD = Finding("misread_joints", "With the arm a ur5e and not a ur3e, they fit.", HOME)
 ALIKE = replace(load_target("checkerboard_9x6_25mm"), rows=7)
 LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
-FAR = PointAccuracy("cam", {"pixels": 2.0, "total": 2.0}, 4.0)
-SEEN = PointAccuracy("Where the views look, a point", {"intrinsics": 1.7, "total": 1.7}, 3.0)
 MISSPELT = Finding("remark", "squaresize is not read.", Remedy("Correct it."))
 NEED = Need(0.5)
 
@@ -158,9 +155,9 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     known = judge(replace(found, arms=(replace(arm, modelled=True),)))
     assert known.causes[1].do.command == PLAN
     # No view tells how large a board is that limits the rest.
-    budget = {"pixels": 0.05, "board": 0.02, "held values": 0.1, "total": 0.12}
-    of_board = replace(found, places=(PointAccuracy("A point", budget, 0.2),))
-    assert judge(of_board).causes[1].do is MEASURE_BOARD
+    parts = {"calibration": small, "board": 1.1 * small, "look": large}
+    of_board = judge(replace(found, picks=(replace(picks[0], parts=parts),)))
+    assert all(cause.do is MEASURE_BOARD for cause in of_board.causes[1:])
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
     assert ids(judge(met)) == ["moved_slowly"]
@@ -169,14 +166,14 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
 def test_a_sigma_far_beyond_its_limit_is_the_cause_of_a_bad_result() -> None:
     spread = np.diag(np.repeat([1e-6, 4e-4], 3) ** 2)[None]
     picks = (Picks("cam", "robot", {"look": spread}, np.inf, 0.5),)
-    place = PointAccuracy("cam", {"pixels": 4.0, "total": 4.0}, 7.0)
-    bad = replace(SOUND, picks=picks, worst=directions(4e-3), places=(place, place))
+    bad = replace(SOUND, picks=picks, worst=directions(4e-3))
     verdict = judge(bad)
     assert verdict.status == "bad"
     # What picks err by is within the limits, and no reason for it.
     assert ids(verdict) == ["weak_motion"]
     assert verdict.reasons[0].startswith("Weakly determined by the motion")
-    assert ids(judge(replace(bad, worst=directions(1e-4)))) == ["place"]
+    misplaced = replace(bad, worst=directions(1e-4), picks=(of_size(4.0),))
+    assert ids(judge(misplaced)) == ["place"]
     # A mistake that is found is likelier, and a need asks for what picks err by.
     drifting = judge(replace(bad, warnings=(DRIFT,)))
     assert "moved_slowly" in ids(drifting)
@@ -429,8 +426,7 @@ def test_each_doubt_has_its_sentence(changes, status, words):
 @pytest.mark.parametrize(
     ("changes", "causes"),
     [
-        ({"worst": directions(2e-3), "places": (FAR,)}, ["weak_motion"]),
-        ({"places": (FAR,)}, ["place"]),
+        ({"worst": directions(2e-3)}, ["weak_motion"]),
         ({"warnings": (MISSPELT,)}, ["remark"]),
         ({"stops": 8, "warnings": (MISSPELT,)}, ["few_stops", "remark"]),
         ({"stops": 8, "worst": directions(2e-3)}, ["weak_motion", "few_stops"]),
@@ -484,9 +480,8 @@ def test_poses_that_are_misread_explain_the_rest_unless_rows_are_exchanged() -> 
         ({}, 0.1, Need(0.5, 0.05), "good", []),
         ({}, 0.1, Need(0.5, 0.005), "bad", ["calibration"]),
         ({}, 0.1, Need(None, 0.05), "good", []),
-        # What a camera sees counts where its frame is known less well.
-        ({"places": (SEEN,)}, 0.2, None, "good", []),
-        ({"places": (SEEN,)}, 0.7, None, "check", ["calibration"]),
+        ({}, 0.2, None, "good", []),
+        ({}, 0.7, None, "check", ["calibration"]),
         # What moves picks by 0.08 mm is no doubt where they err by three times that anyway.
         ({"warnings": (FIELD,)}, 0.1, None, "check", ["lens_field"]),
         ({"warnings": (FIELD,)}, 0.3, None, "good", []),
@@ -503,7 +498,7 @@ def test_the_verdict_is_about_what_picks_err_by(changes, sigma_mm, need, status,
     found = {finding.words for finding in verdict.findings}
     assert {finding.words for finding in changes.get("warnings", ())} <= found
     placed = "place" in {finding.kind for finding in verdict.findings}
-    assert placed == ("places" in changes and status == "check")
+    assert placed == (sigma_mm == 0.7)
 
 
 @pytest.mark.parametrize("need", [None, NEED])

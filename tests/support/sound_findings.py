@@ -6,7 +6,6 @@ from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
     JudgedPair,
-    PointAccuracy,
     Sensor,
 )
 from visioncal.estimation.observability import Direction
@@ -37,11 +36,6 @@ SOUND = Findings(
     (SENSOR,),
     (ARM,),
     directions(1e-4, 1e-4, 1e-4, 1e-4),
-    (
-        PointAccuracy(
-            "Where the views look, a point", {"pixels": 0.05, "robot": 0.03, "total": 0.06}, 0.1
-        ),
-    ),
 )
 PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
 

@@ -36,7 +36,6 @@ class CalibrationLimits:
     sigma_deg: Pair = (0.1, 0.3)
     # Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
     pixel_px: Pair = (0.7, 3.0)
-    level: float = 2.0  # Scatter of a camera's poses over that expected from its corners.
     # Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and larger errors
     # are seldom independent between stops, as the covariance assumes.
     robot_mm: float = 0.2

@@ -15,8 +15,7 @@ from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
-from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, mm_and_deg, some_of
+from visioncal.core.number_format import counted, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
@@ -151,27 +150,6 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
                 CALIBRATE,
             ),
             views,
-        )
-    used, limits = int(inliers.used.sum()), CalibrationLimits()
-    enough = limits.stops[0]
-    if used < enough:
-        yield Finding(
-            "few_stops",
-            f"Only {counted(used, 'view')} can be used; {enough} or more give a result something "
-            "to be checked with.",
-            Remedy(
-                f"Add {counted(enough - used, 'view')} or more, tilted by 20 to 40 degrees about "
-                "different axes."
-            ),
-        )
-    rad, metres = inliers.fit.noise.robots[0].tolist()
-    if 1e3 * metres > limits.sigma_mm[0]:
-        yield Finding(
-            "scatter",
-            f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} "
-            "from stop to stop, and arms repeat to 0.1 mm: the board is of another size than "
-            "stated, the lens is not this camera's, or the poses are not of these images.",
-            Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.core.errors import DegenerateError
-from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
@@ -26,7 +25,8 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
         return
     untied = [base for base in bases if base in lost] or [*lost]
     moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
-    advice = [_tilting_advice(cell, base) or connection_advice(cell, base) for base in bases]
+    how = ", tilted by 20 to 40 degrees about different axes."
+    advice = [connection_advice(cell, base).removesuffix(".") + how for base in bases]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: the observations that link "
         f"{'this robot' if len(bases) == 1 else 'these robots'} to the rest of the cell are too "
@@ -35,33 +35,6 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
         culprits=untied,
         next_step=" ".join(advice),
     )
-
-
-def measuring_advice(cell: Cell, flange: str) -> str:
-    """Advice to measure an offset that is undetermined if the arm cannot tilt; empty for none."""
-    ends = (end for row in cell.rows for end in (row.seer, row.seen))
-    carried = next((end for end in ends if cell.tree.body(end) == flange), "")
-    if not carried:
-        return ""
-    return (
-        f"Where the arm cannot tilt, measure how far {carried} is from {flange} along that axis, "
-        f"for [prior.{flange}_from_{carried}]."
-    )
-
-
-def _tilting_advice(cell: Cell, base: str) -> str:
-    """Advice to tilt a robot that was observed often, but never tilted; empty otherwise."""
-    stations, robot = _stations(cell, base), _robot_on(cell, base)
-    if len(stations) < FEWEST_VIEWS:
-        return ""
-    turning, flange = Turning.of(invert(cell.poses[robot][stations])), cell.tree.flanges[robot]
-    if turning.is_enough:
-        return ""
-    measured = measuring_advice(cell, flange) if turning.has_lone_axis else ""
-    return (
-        f"To tie {base}: add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 "
-        f"degrees about different axes, not only about one. {measured}"
-    ).rstrip()
 
 
 def _robot_on(cell: Cell, base: str) -> str:

@@ -2,16 +2,12 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
 
 import numpy as np
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
-from visioncal.calibration.pipeline.connectivity import (
-    measuring_advice,
-    robot_motion,
-)
+from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.need import PickInputs, predict_picks
@@ -19,7 +15,6 @@ from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
     JudgedPair,
-    PointAccuracy,
     Sensor,
 )
 from visioncal.calibration.suspects.registry import found_in
@@ -29,7 +24,6 @@ from visioncal.core.number_format import mm_and_deg, some_of
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
-from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
     CellWords,
@@ -40,7 +34,6 @@ from visioncal.estimation.observability import (
     edge_directions,
     too_little_motion,
 )
-from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
@@ -51,14 +44,12 @@ def findings_of(run: RunState) -> Findings:
     frames = run.cell_fit.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    worst, places = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
     is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
         _sensors(connected, run),
         _arms(answer),
-        worst,
-        places,
+        _worst(run),
         (*found_in(run), *run.warnings),
         run.notes,
         run.mount or ("instrument" if is_read else "eye-to-hand"),
@@ -116,39 +107,17 @@ def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, Floa
     return {seer: np.array(errors) for seer, errors in strays.items()}
 
 
-_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy]]
-
-
-def _pair_accuracy(run: RunState) -> _Parts:
-    """Worst directions, and accuracy where the views look, of one camera and one robot."""
-    answer, work, mount = run.assessment, run.uncertainty, run.session.mount
-    place = _place("Where the views look, a point", work.budget_mm, work.radius95_mm)
-    names = chain_words(answer.problem, mount).names
-    found = directions(answer.problem, answer.state, answer.covariance, names)
-    worst = [direction for _, direction in found]
-    return worst, [place]
-
-
-def _place(words: str, budget_mm: Mapping[str, float], radius95_mm: float) -> PointAccuracy:
-    """Accuracy of a point; underscores in the sources' names, but not in frames', become spaces."""
-    parts = ((name.partition(" of "), mm) for name, mm in budget_mm.items())
-    in_words = {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
-    return PointAccuracy(words, in_words, radius95_mm)
-
-
-def _cell_accuracy(run: RunState) -> _Parts:
-    """Worst directions and accuracy of the frames of a whole cell."""
-    answer, cell, budget = run.assessment, run.cell_fit.cell, run.assessment.budget_mm
+def _worst(run: RunState) -> list[Direction]:
+    """The least certain directions of the unknown frames, the worst first."""
+    answer, cell = run.assessment, run.cell_fit.cell
+    if run.mount is not None:
+        names = chain_words(answer.problem, run.session.mount).names
+        found = directions(answer.problem, answer.state, answer.covariance, names)
+        return [direction for _, direction in found]
     absorbing = {*_absorbing(run)}
     edges = {frame: edge for frame, edge in answer.last_edges.items() if frame not in absorbing}
     worst = [value for frame, edge in edges.items() for value in _directions(cell, frame, edge)]
-    return (
-        sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
-        [
-            _place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
-            for frame, edge in edges.items()
-        ],
-    )
+    return sorted(worst, key=lambda value: (value.is_rotation, -value.sigma))
 
 
 def _absorbing(run: RunState) -> Iterator[str]:
@@ -224,14 +193,12 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     for seer in seers:
         mine = [view for view in views if view.seer == seer]
         unused = [view for view in mine if not view.used and view.view not in not_needed]
-        levels = run.assessment.sigmas.get(seer, {})
         sensors.append(
             Sensor(
                 used=sum(view.used for view in mine),
                 lost=[Rejection(view.view, view.reason) for view in unused],
                 outliers=[view.view for view in mine if _is_outlier(view)],
-                pixel_px=run.cell_fit.residual_px.get(seer, levels.get("pixel_px")),
-                level=levels.get("level", 1.0),
+                pixel_px=run.cell_fit.residual_px.get(seer),
                 spared=sum(view.view in run.spared for view in mine),
                 name=seer if len(seers) > 1 else "",
             )
@@ -251,7 +218,6 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
             workspace_mm=None if accuracy is None else accuracy.median,
             modelled=robot in modelled,
-            by_functions=arm.function_gain > 0.0,
             can_tilt=arm.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
@@ -299,15 +265,24 @@ def _words_of(run: RunState) -> CellWords:
     """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
     cell, part = run.cell_fit.cell, run.cell_fit.inlier_problem
 
-    def advice(frame: str, culprit: str) -> str:
-        seen, flanges = part.observations_through(frame), part.tree.flanges.values()
-        between = [name for name in flanges if part.observations_through(name)[seen].any()]
-        measured = between and "offset along" in culprit
-        more = measuring_advice(cell, between[0]) if measured else ""
-        return f"{_frame_advice(cell, frame)} {more}".rstrip()
+    def advice(frame: str, _: str) -> str:
+        frame = frame.partition("@")[0]
+        rows = [row for row in cell.rows if frame in (row.seer, row.seen)]
+        others = sorted({row.seen if row.seer == frame else row.seer for row in rows})
+        shown = f" with {some_of(others)} and {frame}" * bool(others)
+        return f"Add stops{shown}, turned by 30 degrees or more about two axes."
 
-    names = {name: _names(part.tree, name) for name in part.unknown}
-    return CellWords("cell", names, lambda frame: _motion(cell, part, frame), advice)
+    def motion(frame: str) -> str:
+        rows, words = part.observations_through(frame), []
+        for robot, base in part.tree.bases.items():
+            through = rows & part.observations_through(part.tree.flanges[robot])
+            stops = np.unique(part.observations.stops[through])
+            words += [robot_motion(cell, base, stops)] if len(stops) > 1 else []
+        return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
+
+    return CellWords(
+        "cell", {name: _names(part.tree, name) for name in part.unknown}, motion, advice
+    )
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:
@@ -316,38 +291,10 @@ def _names(tree: Tree, frame: str) -> tuple[str, str]:
     return frame.partition("@")[0], "the cell" if parent == tree.root else parent
 
 
-def _motion(cell: Cell, part: Problem, frame: str) -> str:
-    """Describes the motion of the robots between a frame and its observers."""
-    rows, words = part.observations_through(frame), []
-    for robot, base in part.tree.bases.items():
-        through = rows & part.observations_through(part.tree.flanges[robot])
-        stops = np.unique(part.observations.stops[through])
-        words += [robot_motion(cell, base, stops)] if len(stops) > 1 else []
-    return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
-
-
 def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
     """The worst directions of a frame: of its translation and, if estimated, of its rotation."""
     found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
     return [direction for direction in found if edge.oriented or not direction.is_rotation]
-
-
-def _frame_advice(cell: Cell, frame: str) -> str:
-    """Advice on what would determine a frame better."""
-    frame = frame.partition("@")[0]
-    rows = [row for row in cell.rows if frame in (row.seer, row.seen)]
-    others = sorted({row.seen if row.seer == frame else row.seer for row in rows})
-    if not others:
-        return "Add stops at which its robot turns about two axes or more."
-    if frame.startswith("target") and len(others) == 1 and cell.tree.body(frame) == cell.tree.root:
-        return (
-            f"Let another camera than {others[0]} see {frame}, too, or measure its squares and "
-            "state square_sigma_m."
-        )
-    return (
-        f"Add stops with {some_of(others)} and {frame}, turned by 30 degrees or more about two "
-        "axes."
-    )
 
 
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:

@@ -1,6 +1,6 @@
 """Inputs of the verdict: the quality of sensors, robots and pairs in the fit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from visioncal.calibration.stages.need import Picks
@@ -43,7 +43,6 @@ class Sensor:
     lost: Sequence[Rejection] = ()  # Rejected views, without those held back on purpose.
     outliers: Sequence[int] = ()  # The outliers among these.
     pixel_px: float | None = None  # Noise of a corner's coordinate; None without images [px].
-    level: float = 1.0  # Ratio of the scatter of its poses to their predicted noise.
     spared: int = 0  # Number of redundant views that were not needed.
     name: str = ""  # Its frame; empty for a single sensor.
 
@@ -64,18 +63,8 @@ class JudgedArm:
     # nominal arm [mm].
     workspace_mm: float | None = None
     modelled: bool = False  # Whether its model is known.
-    by_functions: bool = False  # Whether joint error functions were fitted to the stops.
     can_tilt: bool = True  # Whether its flange turns about more than one direction.
     name: str = ""  # `Robot` and its name, for messages; empty for a single robot.
-
-
-@dataclass(frozen=True)
-class PointAccuracy:
-    """Accuracy of a point of interest."""
-
-    words: str  # The point in words.
-    budget_mm: Mapping[str, float]  # Its standard deviation by source, and as a `total` [mm].
-    radius95_mm: float  # Radius of 95 % probability [mm].
 
 
 @dataclass(frozen=True)
@@ -88,7 +77,6 @@ class Findings:
     # Directions of the unknown edges with the largest sigmas; the first is named in a good verdict.
     # Edges that absorb undetermined errors of a calibrated arm are left out.
     worst: Sequence[Direction]
-    places: Sequence[PointAccuracy]  # Accuracy of points of interest, without the same edges.
     warnings: Sequence[Finding] = ()  # Findings of earlier stages.
     notes: Sequence[str] = ()  # Their remarks that are no reason for doubt.
     mount: Mount = "eye-in-hand"  # Mount of the sensor.

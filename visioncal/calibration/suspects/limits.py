@@ -18,7 +18,7 @@ from visioncal.results import Rms, ViewResult
 _LIMITS = CalibrationLimits()
 # Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
 _ROUNDING = 1e-6
-# Views, and sources of a budget, that are named.
+# Views that are named.
 _LISTED = 3
 # Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
 # a small board far away.
@@ -134,25 +134,19 @@ def _holdout(pair: JudgedPair) -> Iterator[Finding]:
         )
 
 
-def _variance(judged: Findings, *sources: str) -> float:
-    """Share of sources in the variance of the points of interest."""
-    total, part = (
-        sum(
-            mm**2
-            for place in judged.places
-            for name, mm in place.budget_mm.items()
-            if name.startswith(names)
-        )
-        for names in (("total",), sources)
-    )
-    return part / total if total else 0.0
+def _uncertainty_mm(judged: Findings) -> tuple[float, float]:
+    """Sigma of what the calibration, and the boards' sizes, add to the worst picks [mm]."""
+    parts = [
+        (pick.budget_mm.get("calibration", 0.0), pick.budget_mm.get("board", 0.0))
+        for pick in judged.picks
+    ]
+    return max(parts, key=lambda part: np.hypot(*part), default=(0.0, 0.0))
 
 
 def _is_of_board(judged: Findings) -> bool:
-    """Whether most uncertainty comes from boards' stated sizes, which no view reduces."""
-    # Held values are lenses rather than boards where the budget has more of these.
-    board, lens, held = (_variance(judged, at) for at in ("board", "intrinsics", "held values"))
-    return board + held * (lens <= board) > 0.5
+    """Whether most uncertainty is that of boards' stated sizes, which no view reduces."""
+    calibration_mm, board_mm = _uncertainty_mm(judged)
+    return board_mm > calibration_mm
 
 
 def remedy_for_uncertainty(judged: Findings) -> Remedy | None:
@@ -197,8 +191,7 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     known = f"known to {named} (sigma; doubt begins at {least}): most of that"
     words = f"Weakly determined by the motion, with their sigmas: {named}; doubt begins at {least}."
     step = _tilted(judged)
-    has_no_joints = any(warning.do == NO_JOINTS for warning in judged.warnings)
-    if has_no_joints and _variance(judged, "arm", "robot", "poses") > 0.5:
+    if any(warning.do == NO_JOINTS for warning in judged.warnings):
         words = f"As mounts, {known} is the arm's, and is the same in every recording."
         step = NO_JOINTS
     elif _is_of_board(judged):
@@ -208,27 +201,18 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
 
 
 def _place(judged: Findings) -> Iterator[Finding]:
-    """Finding on the error budget of the worst point of interest."""
+    """Finding on the places of things where the views look."""
     check, bad = _LIMITS.sigma_mm
-    if all(arm.workspace_mm is not None for arm in judged.arms):
-        return
-    # Where errors of a lens and its mount cancel, picks are more accurate than points in the
-    # camera's frame.
-    if len(judged.places) == len(judged.picks) == 1 and judged.picks[0].budget_mm["total"] <= check:
-        return
-    beyond = [place for place in judged.places if place.budget_mm["total"] > check]
-    if not beyond:
-        return
-    beyond.sort(key=lambda place: -place.budget_mm["total"])
-    worst = beyond[0]
-    total, *parts = sorted(worst.budget_mm.items(), key=lambda at: (at[0] != "total", -at[1]))
-    listed = ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED])
-    words = (
-        f"{worst.words} is placed to {figure(total[1])} mm (sigma; 95 % within "
-        f"{figure(worst.radius95_mm)} mm): {listed}."
-    )
-    step = MEASURE_BOARD if _is_of_board(judged) else None
-    yield Finding("place", words, step, is_fatal=total[1] > bad, until_mm=0.0)
+    sigma_mm = float(np.hypot(*_uncertainty_mm(judged)))
+    if sigma_mm > check and any(arm.workspace_mm is None for arm in judged.arms):
+        yield Finding(
+            "place",
+            f"Where the views look, things are placed to {figure(sigma_mm)} mm (sigma; doubt "
+            f"begins at {check:g}).",
+            MEASURE_BOARD if _is_of_board(judged) else None,
+            is_fatal=sigma_mm > bad,
+            until_mm=0.0,
+        )
 
 
 def _workspace(judged: Findings) -> Iterator[Finding]:
@@ -297,13 +281,6 @@ def _corner_noise(sensor: Sensor) -> Iterator[Finding]:
             "are blurred.",
             Remedy("Look for blur, glare, and a lens or a board that is not as stated."),
             is_fatal=noise > bad,
-        )
-    if sensor.level > _LIMITS.level:
-        yield Finding(
-            "corner_noise",
-            f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
-            "of few pixels, blur, or a lens that is not as stated.",
-            Remedy("Go nearer, or show it larger squares."),
         )
 
 

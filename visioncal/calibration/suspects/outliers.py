@@ -1,7 +1,7 @@
 """Messages on outliers and moved frames: exchanged or wrong observations, by cause."""
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,17 +13,15 @@ from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
-from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
-from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, look_at, or_alone
+from visioncal.core.transforms import distances, invert, pose_difference
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, or_alone
 from visioncal.estimation.moves import agreed_change
 from visioncal.estimation.steps import agreed_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
-# The stops of a base that was pushed agree on its displacement to such a share of it.
-_ALIKE = 0.5
 # Views that a large step explains agree on it to within this share of the step: the uncertainty
 # that the fit leaves grows with it.
 _SURELY_ALIKE = 0.05
@@ -108,9 +106,7 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
     mutual = exchanged(agreed.problem, fitting)
     faults = [*_exchanged(cell_fit, mutual)]
-    if cell_fit.cell.mount is None:
-        faults += _wrong_poses(cell_fit, {row for fault in faults for row in fault.rows})
-    elif not faults:
+    if cell_fit.cell.mount is not None and not faults:
         faults += _moved_run(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, mutual) for at in outliers.tolist()} | clauses
@@ -194,19 +190,6 @@ def _moved_words(
     return ", or ".join(stood), advice
 
 
-def _base_displacement(
-    cell_fit: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
-) -> str:
-    """Mean displacement of a base by some observations, in words; empty where they disagree."""
-    changes = cell_fit.inlier_fit.problem.change_of(base, cell_fit.inlier_fit.fit.state)[rows]
-    if of is not None:
-        changes = invert(of) @ changes @ of
-    mean = mean_transform(changes)
-    shift_mm, turn_deg = pose_difference(np.eye(4), mean)
-    scatter_mm = 1e3 * float(np.median(distances(changes, mean)[0]))
-    return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
-
-
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
     """Poses of one robot that are exchanged, and pairs of views that fit each other's pose."""
     rows, problem, used = cell_fit.cell.rows, cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
@@ -232,44 +215,6 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
             "the other's row. They were left out."
         )
         yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
-
-
-def _wrong_poses(cell_fit: CellFit, explained: Collection[int]) -> Iterator[PoseFault]:
-    """Robots that stood elsewhere: of one stop by its flange, of all stops at the end by its base.
-
-    A base that was pushed stays where it was: all that its robot carries hangs on it.
-    """
-    problem, used = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    stops, named = problem.observations.stops, cell_fit.cell.stops
-    for robot, base in problem.tree.bases.items():
-        by_robot = problem.observations_through(problem.tree.flanges[robot])
-        last = int(stops[by_robot & used].max(initial=-1))
-        wrong = np.unique(stops[by_robot & ~used]).tolist()
-        after = [station for station in wrong if station > last]
-        pushed = [after] if len(after) >= FEWEST_VIEWS else []
-        parts = [[station] for station in wrong if not pushed or station <= last] + pushed
-        for part in parts:
-            rows = np.flatnonzero(by_robot & np.isin(stops, part))
-            if len(rows) < 2 or used[rows].any() or {*explained} & {*rows.tolist()}:
-                continue
-            at_flange = None if len(part) > 1 else problem.poses[robot][part[0]]
-            moved = _base_displacement(cell_fit, base, rows, at_flange)
-            if not moved and len(part) == 1:
-                continue
-            what = f"{base} had been pushed" if len(part) > 1 else "the flange had been moved"
-            as_if = f", as if {what} by {moved}" if moved else ""
-            when = f"at stop {named[part[0]]}" + " and after" * (len(part) > 1)
-            words = (
-                f"Robot {robot} did not stand {when} where its pose says: all {len(rows)} views by "
-                f"way of it disagree with the others{as_if}, and were left out ({{views}})."
-            )
-            do = Remedy(
-                "Correct its poses there in views.csv; or fasten its base, and record again.",
-                look_at(cell_fit.cell.rows[rows[0]].view),
-            )
-            kind = "something_moved" if len(part) > 1 else "wrong_pose"
-            short = f"the pose of robot {robot} {when} is wrong"
-            yield _fault(cell_fit, kind, rows.tolist(), words, do, short)
 
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:

@@ -72,7 +72,6 @@ _BY_CHAIN = (
 _ENTRIES: tuple[Suspect, ...] = (
     # Views.
     Suspect(EXCHANGED, _outliers, 1e-6, order=-1),
-    Suspect("wrong_pose", chance=1e-3),
     Suspect("something_moved", chance=1e-4),
     Suspect("moved_frame", chance=1e-4),
     Suspect("wrong_views", chance=1e-3),
