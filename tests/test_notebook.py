@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from support.refusals import raised
 from support.samples import made_up
 
 import visioncal
@@ -129,20 +130,17 @@ def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "words", "step"),
+    ("spoilt", "words"),
     [
-        (POSES.swapaxes(1, 2), r"\[0\] .* transposed", "Transpose"),
-        (POSES * [[[-1], [-1], [-1], [1]]], r"\[0\] .* reflection", "right-handed"),
-        (POSES * [[[1.05]] * 3 + [[1]]], r"\[0\] .* scaled by 1.05", "Divide"),
-        ([POSES[0], 0.0 * POSES[0], POSES[0]], r"\[1\] .* entries are zero", "never filled"),
-        ([POSES[0], POSES[0] * np.nan, POSES[0]], r"\[1\] .* not finite", "reported"),
-        ([POSES[0], POSES[0] + 0.1 * np.eye(4, k=1), POSES[0]], r"\[1\] .* right angles", "3 x 3"),
+        (POSES.swapaxes(1, 2), r"\[0\] .* transposed"),
+        (POSES * [[[-1], [-1], [-1], [1]]], r"\[0\] .* reflection"),
+        ([POSES[0], POSES[0] * np.nan, POSES[0]], r"\[1\] .* not finite"),
+        ([POSES[0], POSES[0] + 0.1 * np.eye(4, k=1), POSES[0]], r"\[1\] .* right angles"),
+        (POSES[:, :3], r"\[0\] .* shape is \(3, 4\)"),
     ],
 )
-def test_poses_that_are_no_rigid_transforms_are_refused_with_the_likely_cause(spoilt, words, step):
-    with pytest.raises(DataError, match=rf"^base_from_flange{words}") as caught:
-        from_corners(SEEN, spoilt)
-    assert step in caught.value.next_step
+def test_poses_that_are_no_rigid_transforms_are_refused(spoilt, words):
+    raised(DataError, rf"^base_from_flange{words}", from_corners, SEEN, spoilt)
 
 
 def test_joint_angles_of_other_views_are_refused_and_rounded_rotations_are_not():

@@ -199,40 +199,22 @@ def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     return 1e3 * float(np.linalg.norm(between[:3, 3])), float(np.rad2deg(rotation_angle(between)))
 
 
-def rigid_fault(matrix: FloatArray, most: float = RIGID) -> tuple[str, str]:
-    """Message on why a matrix is no rigid transform; the likeliest mistake is tested first.
+def rigid_fault(matrix: FloatArray, most: float = RIGID) -> str:
+    """Why a (4, 4) matrix is no rigid transform; empty where it is one.
 
-    Args:
-        matrix: (4, 4).
-        most: Tolerance of the entries of the rotation's product with its transpose.
-
-    Returns:
-        The fault, and how to correct it; both empty for a rigid transform.
+    `most` is the tolerance of the entries of the rotation's product with its transpose.
     """
-    rotation, last = matrix[:3, :3], matrix[3]
+    if matrix.shape != (4, 4):
+        return f"its shape is {matrix.shape}"
     if not np.isfinite(matrix).all():
-        return "it has entries that are not finite", "Give the pose that the robot reported."
-    if not matrix.any():
-        return "all its entries are zero", "It was never filled: give the pose there."
-    if not np.allclose(last, LAST_ROW, atol=most):
-        if np.allclose(matrix[:, 3], LAST_ROW, atol=most):
-            return "it is transposed: its translation is in the last row", "Transpose it."
-        row = ", ".join(f"{value:.4g}" for value in last)
-        return f"its last row is [{row}]", "The last row is [0, 0, 0, 1]."
-    product = rotation.T @ rotation
-    scale = float(np.sqrt(np.trace(product) / 3.0))
-    if np.abs(product - np.eye(3)).max() < most:
-        if np.linalg.det(rotation) > 0.0:
-            return "", ""
+        return "it has entries that are not finite"
+    if not np.allclose(matrix[3], LAST_ROW, atol=most):
+        row = ", ".join(f"{value:.4g}" for value in matrix[3])
+        return f"its last row is [{row}], and [0, 0, 0, 1] is needed; it may be transposed"
+    error = np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max()
+    if error >= most:
         return (
-            "its rotation is a reflection: its determinant is -1, and 1 is needed",
-            "Its axes are left-handed: give them right-handed.",
+            "the columns of its rotation are no unit vectors at right angles: they are off by "
+            f"{error:.2g}, and {most:g} is allowed"
         )
-    if scale > 0.0 and np.abs(product / scale**2 - np.eye(3)).max() < most:
-        return f"its rotation is scaled by {scale:.4g}", f"Divide the rotation by {scale:.4g}."
-    error = np.abs(product - np.eye(3)).max()
-    return (
-        f"the columns of its rotation are no unit vectors at right angles: they are off by "
-        f"{error:.2g}, and {most:g} is allowed",
-        "Give a rotation in its upper left 3 x 3.",
-    )
+    return "" if np.linalg.det(matrix[:3, :3]) > 0.0 else "its rotation is a reflection"

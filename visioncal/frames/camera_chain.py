@@ -277,11 +277,8 @@ def checked_pose(pose: FloatArray, name: str) -> None:
     Raises:
         DataError: It is no (4, 4) rigid transform, or its offset is longer than any arm reaches.
     """
-    fault, step = (f"its shape is {pose.shape}", "") if pose.shape != (4, 4) else rigid_fault(pose)
-    if fault:
-        raise DataError(
-            f"{name}: not a (4, 4) rigid transform: {fault}.", culprits=[name], next_step=step
-        )
+    if fault := rigid_fault(pose):
+        raise DataError(f"{name}: not a (4, 4) rigid transform: {fault}.", culprits=[name])
     length = float(np.linalg.norm(pose[:3, 3]))
     if length > FAR_M:
         raise DataError(

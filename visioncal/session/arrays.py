@@ -96,23 +96,17 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
         np.array(value.as_matrix() if isinstance(value, RigidTransform) else value, float)
         for value in given
     ]
-    shapes = dict.fromkeys(matrix.shape for matrix in matrices)
-    if len(matrices) != count or {*shapes} - {(4, 4)}:
+    if len(matrices) != count:
         raise DataError(
-            f"{count} {what} and {len(matrices)} poses in base_from_flange, of the shapes "
-            f"{', '.join(map(str, shapes))}: each view has one of each, in the same order; poses "
-            "are (4, 4).",
+            f"{count} {what} and {len(matrices)} poses in base_from_flange: each view has one of "
+            "each, in the same order.",
             culprits=[what, "base_from_flange"],
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
     for at, matrix in enumerate(matrices):
-        fault, step = rigid_fault(matrix, _ROUGH)
-        if fault:
-            raise DataError(
-                f"base_from_flange[{at}] is no rigid transform: {fault}.",
-                culprits=[f"base_from_flange[{at}]"],
-                next_step=step,
-            )
+        if fault := rigid_fault(matrix, _ROUGH):
+            name = f"base_from_flange[{at}]"
+            raise DataError(f"{name} is no rigid transform: {fault}.", culprits=[name])
     stacked = np.array(matrices).reshape(-1, 4, 4)
     stacked[:, 3] = LAST_ROW
     return stacked

@@ -97,24 +97,14 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
 
 def _sessions_of(given: str) -> Iterator[Path]:
     """Sessions of a path or glob; a path without a session is kept, so that its row says so."""
-    first_glob = next(
-        (at for at, part in enumerate(Path(given).parts) if set(part) & set("*?[")), None
-    )
-    if first_glob is None or Path(given).exists():
-        yield from _sessions_in(Path(given))
-    else:
-        parts = Path(given).parts
-        for found in Path(*parts[:first_glob]).glob(str(Path(*parts[first_glob:]))):
-            # Other files beside sessions, such as truths and notes, are skipped.
-            if found.is_dir() or found.suffix.lower() == ".rrd":
-                yield from _sessions_in(found)
-
-
-def _sessions_in(path: Path) -> Iterator[Path]:
-    folders = []
-    if path.is_dir() and not (path / _SESSION).exists():
-        folders = [file.parent for file in path.rglob(_SESSION)]
-    yield from folders or [path]
+    path, is_glob = Path(given), bool({*given} & {*"*?["}) and not Path(given).exists()
+    below = str(path.relative_to(path.anchor))
+    for found in Path(path.anchor).glob(below) if is_glob else [path]:
+        has_own = not found.is_dir() or (found / _SESSION).exists()
+        inner = [] if has_own else [file.parent for file in found.rglob(_SESSION)]
+        # Other files beside sessions, such as truths and notes, are skipped.
+        if not is_glob or found.is_dir() or found.suffix.lower() == ".rrd":
+            yield from inner or [found]
 
 
 def work(job: Job) -> FleetRow:

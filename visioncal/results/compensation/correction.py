@@ -282,11 +282,9 @@ def _matrices(poses: Poses) -> FloatArray:
         rigid = np.linalg.det(rotations) > 0.0
     if not rigid.all():
         at = int(np.argmin(rigid))
-        fault, step = rigid_fault(matrices[at])
         raise DataError(
-            f"correct: target {at} is no rigid transform: {fault}.",
+            f"correct: target {at} is no rigid transform: {rigid_fault(matrices[at])}.",
             culprits=[f"target {at}"],
-            next_step=step,
         )
     extent_m = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
     reachable = extent_m < FAR_M
