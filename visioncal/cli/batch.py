@@ -29,16 +29,15 @@ def batch_command(options: BatchOptions) -> None:
             progress=progress,
         )
     counts = found.counts
-    named = ("good", "check", "bad", "failed", "kept", "standing out")
+    named = ("good", "check", "bad", "failed", "kept")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
     answer(f"{counted(len(found.rows), 'session')}: {words}")
-    lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
     failed = [
         f"{row.name}: {row.words} {row.next_step}".rstrip()
         for row in found.rows
         if row.state == "failed"
     ]
-    for line in [*lines, *failed[:_MOST_NAMED]]:
+    for line in failed[:_MOST_NAMED]:
         answer(f"  {line}")
     answer(f"written: {found.page}, {found.table}")
     if found.is_cut_short:

@@ -1,8 +1,7 @@
 """Identification of base parameters, Stribeck humps and torque lag, and prediction of torques.
 
 Torques that are filtered, or stamped by another clock, lag the angles. One lag of all streams is
-searched on a grid by the residuals of the best fit, and refined by Gauss-Newton steps with the
-torques' time derivative as one more column.
+found by Gauss-Newton steps with the torques' time derivative as one more column.
 """
 
 from collections.abc import Sequence
@@ -40,12 +39,12 @@ from visioncal.robot import Robot, joint_torques
 SLOW_RAD_S = 1e-4
 
 _LIMITS = DynamicsLimits()
-# Greatest lag [s], grid points per period of the cut-off, and number of torques of the grid search.
-_LARGEST_S, _PER_PERIOD, _ROWS = 0.25, 16, 20_000
+# Greatest lag [s].
+_LARGEST_S = 0.25
 # A lag is significant from so many sigmas on, if the median residual of the joints is at most this
 # share of the torques' range: larger residuals have other causes.
 _SIGMAS, _LEFT = 5.0, 0.3
-_ROUNDS, _SETTLED = 5, 0.1
+_ROUNDS, _SETTLED = 15, 0.1
 
 
 @dataclass(frozen=True)
@@ -173,9 +172,7 @@ def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms)
 
 
 def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
-    lag_s = _grid_lag(streams, blocks)
-    if lag_s is None:
-        return None
+    lag_s = 0.0
     for _ in range(_ROUNDS):
         lagged = [_lagged(*pair, lag_s) for pair in zip(streams, blocks, strict=True)]
         fit = regress(lagged)
@@ -198,33 +195,6 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
     ]
     significant = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
     return lag if significant and np.median(residual_shares) < _LEFT else None
-
-
-def _grid_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> float | None:
-    """Most likely lag on a grid [s]; None where samples are too few."""
-    step_s = 1.0 / (_PER_PERIOD * max(stream.cutoff_hz for stream in streams))
-    steps = int(_LARGEST_S / step_s)
-    lags = step_s * np.arange(-steps, steps + 1)
-    rows, torques, joints = [], [], []
-    total = sum(block.y.size for block in blocks)
-    for stream, block in zip(streams, blocks, strict=True):
-        used = block.used & _inside(stream, _LARGEST_S)[:, None]
-        used[np.arange(len(used)) % max(total // _ROWS, 1) > 0] = False
-        sizes = np.maximum(std_of(block.y, used), 1e-12)
-        rows.append((block.x / sizes[:, None])[used])
-        torques.append(np.stack([(_torques(stream, lag) / sizes)[used] for lag in lags], axis=1))
-        joints.append(np.nonzero(used)[1])
-    x, y, joint = np.concatenate(rows), np.concatenate(torques), np.concatenate(joints)
-    if len(x) < 2 * x.shape[1]:
-        return None
-    directions = np.linalg.qr(x / np.maximum(np.linalg.norm(x, axis=0), 1e-12))[0]
-    left = (y - directions @ (directions.T @ y)) ** 2
-    # Negative log-likelihood, with a noise level per joint.
-    cost = np.zeros(len(lags))
-    for number in np.unique(joint):
-        rows_of_joint = joint == number
-        cost += rows_of_joint.sum() * np.log(np.maximum(left[rows_of_joint].sum(axis=0), 1e-12))
-    return float(lags[np.argmin(cost)])
 
 
 def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:

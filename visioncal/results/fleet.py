@@ -1,27 +1,15 @@
-"""Results of many sessions as rows, and outliers among them."""
+"""Results of many sessions as rows."""
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.number_format import figure
 from visioncal.results.result import Calibration
 
 State: TypeAlias = Literal["done", "kept", "failed"]
-
-# Smallest number of results that are compared with each other.
-FEWEST = 5
-# Robust standard score beyond which a value is an outlier (Iglewicz and Hoaglin 1993).
-_LIMIT = 3.5
-# Smallest standard deviations of logarithms in the score: of noise levels, and of focal lengths of
-# one type of lens.
-_SPREAD, _LENS_SPREAD = 0.2, 0.01
-# Ratio of standard deviation to median absolute deviation of a normal distribution.
-_MAD = 1.4826
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +47,6 @@ class FleetRow:
     focal_px: float | None = None  # Mean focal length [px].
     seconds: float | None = None  # Duration of the calibration [s].
     has_report: bool = False  # Whether its folder has a report.
-    score: float = 0.0  # Largest robust standard score among its fleet; 0 within the limit.
-    stands_out: str = ""  # What the score is of, in words.
-
-    @property
-    def group(self) -> str:
-        """Parent folder that it shares with other sessions, as those of one robot; or empty."""
-        return self.name.rpartition("/")[0]
 
 
 def row_of(name: str, session: str, calibration: Calibration, version: str) -> FleetRow:
@@ -108,52 +89,7 @@ def row_of(name: str, session: str, calibration: Calibration, version: str) -> F
     )
 
 
-# Figures that are compared among the sessions of a fleet, in words, with their units.
-_MEASURES = {
-    "noise_mm": ("noise of the robot", "mm"),
-    "noise_deg": ("noise of its rotation", "deg"),
-    "noise_px": ("noise of the corners", "px"),
-    "residual_mm": ("residual", "mm"),
-    "arm_mm": ("errors of the arm", "mm"),
-    "drift_mm": ("drift of the arm", "mm"),
-    "focal_px": ("focal length", "px"),
-}
-
-
-def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
-    """The rows with their outlier scores, largest scores first.
-
-    Sessions of one robot model are compared (lenses also of one image size): the score is that of
-    each figure's logarithm by median and median absolute deviation, robust to half of a fleet.
-    """
-    scores: dict[str, float] = defaultdict(float)
-    words: dict[str, list[str]] = defaultdict(list)
-    for name, score, sentence in _outliers(rows):
-        scores[name] = max(scores[name], score)
-        words[name].append(sentence)
-    scored = [replace(row, score=scores[row.name], stands_out="; ".join(words[row.name]))
-             for row in rows]  # fmt: skip
+def worst_first(rows: Iterable[FleetRow]) -> tuple[FleetRow, ...]:
+    """The rows by their verdicts, those without a result first, then by name."""
     order = {"": 0, "bad": 1, "check": 2, "good": 3}
-    return sorted(scored, key=lambda value: (-value.score, order.get(value.verdict, 0), value.name))
-
-
-def _outliers(rows: Sequence[FleetRow]) -> Iterator[tuple[str, float, str]]:
-    """Names of outlying rows with their scores, and what these are of, in words."""
-    for field, (words, unit) in _MEASURES.items():
-        is_lens, groups = field == "focal_px", defaultdict[tuple[str, str], list[FleetRow]](list)
-        for row in rows:
-            if (getattr(row, field) or 0.0) > 0.0:
-                groups[row.robot, row.camera if is_lens else ""].append(row)
-        for members in groups.values():
-            if len(members) < FEWEST:
-                continue
-            logs = np.log([getattr(row, field) for row in members])
-            median = float(np.median(logs))
-            spread = _MAD * float(np.median(np.abs(logs - median)))
-            scores = (logs - median) / max(spread, _LENS_SPREAD if is_lens else _SPREAD)
-            # Of noise and errors, only large ones are outliers.
-            for row, score in zip(members, (np.abs(scores) if is_lens else scores), strict=True):
-                if score > _LIMIT:
-                    value, usual = figure(getattr(row, field)), figure(math.exp(median))
-                    reason = f"{words} {value} {unit}, where {usual} {unit} is usual"
-                    yield row.name, float(score), reason
+    return tuple(sorted(rows, key=lambda row: (order.get(row.verdict, 0), row.name)))

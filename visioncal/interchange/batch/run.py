@@ -33,7 +33,7 @@ from visioncal.core.types import Progress
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
-from visioncal.results.fleet import FleetRow, row_of, with_outliers
+from visioncal.results.fleet import FleetRow, row_of, worst_first
 from visioncal.session import Session
 
 ROW = "row.json"
@@ -198,16 +198,15 @@ TABLE, PAGE = "batch.parquet", "index.html"
 class Batch:
     """Results of many sessions."""
 
-    rows: tuple[FleetRow, ...]  # One a session, the strongest outliers first.
+    rows: tuple[FleetRow, ...]  # One a session, the worst first.
     table: Path
     page: Path
 
     @property
     def counts(self) -> Counter[str]:
-        """Numbers of sessions by verdict or failure, and of kept and outlying ones."""
+        """Numbers of sessions by verdict or failure, and of kept ones."""
         counts = Counter(row.verdict or row.state for row in self.rows)
         counts["kept"] = sum(row.state == "kept" for row in self.rows)
-        counts["standing out"] = sum(row.score > 0.0 for row in self.rows)
         return counts
 
     @property
@@ -268,7 +267,7 @@ def batch(
     for row in _rows(jobs, workers, scheduler):
         rows.append(row)
         progress("batch", len(rows), len(jobs))
-    results = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
+    results = Batch(worst_first(rows), folder / TABLE, folder / PAGE)
     import pyarrow as pa
     from pyarrow import parquet
 
