@@ -35,11 +35,12 @@ _MIRRORED = Remedy(
     "convert with --guess --mirror-poses."
 )
 _UNRECORDED = Remedy(
-    "Look how the poses were recorded, and how they were paired with the images: a logger that "
-    "repeats one pose, or writes positions of 0, 0, 0 or rotations of 0, 0, 0, 1; files sorted by "
-    "name (10 before 2), rows sorted anew, views.csv of another run; and, where joint angles "
-    "become poses, whether [robot] model in session.toml is this arm. Write into column image "
-    "which file belongs to each row."
+    "Convert the recording itself again with --guess, if the session was made of one: angles that "
+    "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
+    "they were paired with the images: a logger that repeats one pose, or writes positions of 0, "
+    "0, 0 or rotations of 0, 0, 0, 1; files sorted by name (10 before 2), rows sorted anew, "
+    "views.csv of another run; and, where joint angles become poses, whether [robot] model in "
+    "session.toml is this arm. Write into column image which file belongs to each row."
 )
 
 

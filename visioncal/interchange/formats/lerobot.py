@@ -26,7 +26,7 @@ from visioncal.interchange.formats.foreign import (
     ImportOptions,
     frames_to_take,
 )
-from visioncal.robot import robot_names
+from visioncal.robot import read_robot_document, robot_names
 from visioncal.session.images import MemoryImages
 
 _STATE, _IMAGES = "observation.state", "observation.image"
@@ -141,6 +141,11 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     mount: Mount = "eye-in-hand" if any(at in key for at in _WRISTS) else "eye-to-hand"
     if arm is None and requested.robot_model is None:
         notes.append(f"Robot type {kind!r} is no built-in arm: name its model with --robot-model.")
+    if arm is not None and requested.robot_model is None:
+        tip = read_robot_document(arm)["tip"]
+        notes.append(
+            f"The flange is {tip} of the built-in model {arm}; --robot-model names another."
+        )
     notes += [
         how,
         f"The camera {key} is assumed to be mounted {mount}, by its name; --mount overrides it.",
