@@ -640,13 +640,6 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
     found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
     assert found == pytest.approx(values, abs=1e-5)
-    # The likelihood of levels that grow together is that of each.
-    likelihood = robot_likelihood(problem, fit.state, fit.noise)
-    scales = np.array([0.02, 0.5, 1.0, 8.0])
-    values = [likelihood.most_likely(scale * fit.noise.robots, fixed)[1] for scale in scales]
-    scaled = likelihood.scaled(0, fit.noise.robots, scales)
-    # The rounding of values of some hundreds, at a fiftieth of the noise some millions.
-    np.testing.assert_allclose(np.diff(scaled), np.diff(values), rtol=1e-7, atol=1e-7)
 
 
 def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():

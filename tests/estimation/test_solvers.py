@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.refusals import raised
 
-from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.closed_form import (
     SOLVERS,
@@ -422,20 +420,6 @@ def test_frames_may_be_turned_and_views_come_in_any_order(solver: Solver, seed: 
     ):
         assert turn_error(estimate, expected) < 1e-8
         assert shift_error(estimate, expected) < 1e-8
-
-
-@all_solvers
-def test_what_is_no_list_of_pairs_is_refused(solver: Solver):
-    problem = simulate(PRECISE, 0)
-    with pytest.raises(DegenerateError, match="1 view was given") as caught:
-        solver(problem.robot[:1], problem.camera[:1])
-    assert "tilted" in caught.value.next_step
-    with pytest.raises(DataError, match=r"\(20, 4, 4\).*\(19, 4, 4\)"):
-        solver(problem.robot, problem.camera[1:])
-    problem.camera[7, 1, 3] = np.nan
-    problem.robot[3, 0, 0] = np.inf
-    caught = raised(DataError, "rows 3, 7", solver, problem.robot, problem.camera)
-    assert caught.culprits == ("row 3", "row 7")
 
 
 def test_the_table_of_solvers_cannot_be_changed_and_pairs_are_limited():

@@ -25,8 +25,6 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.number_format import counted
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation, quaternions, skew
 from visioncal.core.types import FloatArray
 
@@ -393,44 +391,14 @@ def complete(
 
 
 def _solver(rotations: _Rotations) -> Solver:
-    """A solver of checked views, by its rotations.
-
-    It raises a DataError where shapes do not match or a pose has an entry that is not finite, and a
-    DegenerateError for fewer than two views.
-    """
+    """A solver of two views or more, by its rotations."""
 
     def solve(robot: FloatArray, camera: FloatArray) -> HandEye:
-        robot, camera = np.asarray(robot, dtype=float), np.asarray(camera, dtype=float)
-        _check(robot, camera)
         found = rotations(robot, camera)
-        if rotations in {_shah, _li}:
-            return complete(robot, camera, found[0], found[1])
-        return complete(robot, camera, found)
+        of_both = rotations in {_shah, _li}
+        return complete(robot, camera, *found) if of_both else complete(robot, camera, found)
 
     return solve
-
-
-def _check(robot: FloatArray, camera: FloatArray) -> None:
-    if robot.shape != camera.shape or robot.ndim < 3 or robot.shape[-2:] != (4, 4):
-        raise DataError(
-            f"hand-eye: robot poses of shape {robot.shape} and camera poses of shape "
-            f"{camera.shape} cannot be paired; both must be (views, 4, 4)."
-        )
-    views = robot.shape[-3]
-    if views < 2:
-        raise DegenerateError(
-            f"hand-eye: {counted(views, 'view', ('was', 'were'))} given; a relative motion needs "
-            "at least 2, and a full solution 3 with two different rotation axes.",
-            next_step="Add views that are tilted about different axes.",
-        )
-    finite = np.isfinite(robot + camera).all(axis=(-2, -1)).reshape(-1, views).all(axis=0)
-    if not finite.all():
-        rows = [str(row) for row in np.flatnonzero(~finite)]
-        raise DataError(
-            f"hand-eye: the poses in rows {', '.join(rows)} (counted from 0) are not finite.",
-            culprits=[f"row {row}" for row in rows],
-            next_step="Leave these views out, or mend their poses.",
-        )
 
 
 # Those for general motion, and the one for rotation about one axis.

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.mixed import SURPRISE_95, profile_interval
+from visioncal.estimation.mixed import LEAST_SIGMA, SURPRISE_95, profile_interval
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import (
@@ -15,9 +15,9 @@ from visioncal.estimation.robot_likelihood import (
     robot_likelihood,
 )
 
-# Logarithms of the integration's scales, from a hundredth, below which levels add nothing to a
-# variance, to nine: dense at one, as a level of thousands of stops is known to 1 %.
-_SCALES = 0.02 * np.sinh(np.linspace(-6.2, 5.4, 59))
+# Logarithms of the integration's ends, from a hundredth, below which levels add nothing to a
+# variance, to nine; and the number of steps between, short ones near the most likely level.
+_ENDS, _STEPS = (-4.6, 2.2), 25
 # Levels under a tenth of a micrometre or microradian count as zero. They are then integrated about
 # this one: arms repeat to some hundredths of a millimetre [m].
 _NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
@@ -45,15 +45,23 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
     likelihood = robot_likelihood(problem, state, noise)
     for robot in np.flatnonzero(likelihood.seen).tolist():
         rotation, translation = noise.robots[robot]
-        ratio = translation / rotation
+        ratio, middle, width = translation / rotation, float(translation), 1.0
+        at, mine = np.log(np.maximum(noise.robots, LEAST_SIGMA)).ravel(), 2 * robot + np.arange(2)
         if min(rotation, translation) < _NOTHING:
-            typical, width = TYPICAL_RATIO, np.exp(RATIO_LOG_SIGMA)
-            ratio = np.clip(ratio, typical / width, typical * width)
-        middle, levels = max(float(translation), _LEAST_MIDDLE_M), noise.robots.copy()
-        levels[robot] = middle / ratio, middle
-        values = likelihood.scaled(robot, levels, np.exp(_SCALES))
-        translations = middle * np.exp(_SCALES)
-        weights = np.exp(values.min() - values) * np.gradient(_SCALES)
+            factor = np.exp(RATIO_LOG_SIGMA)
+            ratio = np.clip(ratio, TYPICAL_RATIO / factor, TYPICAL_RATIO * factor)
+            middle = max(middle, _LEAST_MIDDLE_M)
+            at[mine] = np.log([middle / ratio, middle])
+        else:
+            curvature = likelihood.model.at(at).curvature[np.ix_(mine, mine)]
+            width = max(float(np.sum(curvature)), 1.0) ** -0.5
+        first, last = np.arcsinh(np.array(_ENDS) / width).tolist()
+        steps = width * np.sinh(np.linspace(first, last, _STEPS))
+        logs = np.tile(at, (_STEPS, 1))
+        logs[:, mine] += steps[:, None]
+        values = np.array([likelihood.model.at(row, is_sloped=False).value for row in logs])
+        translations = middle * np.exp(steps)
+        weights = np.exp(values.min() - values) * np.gradient(steps)
         expected = float(np.sqrt(weights @ translations**2 / weights.sum()))
         robots[robot] = np.maximum(robots[robot], [expected / ratio, expected])
     return robots

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.estimation.mixed import (
     LEAST_SIGMA,
     LITTLE,
@@ -175,44 +174,6 @@ class RobotLikelihood:
         places = 6 * slots[:, None, None] + np.arange(6)
         by_flange = np.take_along_axis(self.by_flanges[units], places, axis=2)
         return np.asarray(by_flange @ moves[self.stops[units]])
-
-    def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
-        """Negative log-likelihood, up to a constant, for scaled noise levels of one robot.
-
-        In each unit the total covariance and the robot's part of it are diagonalised together; only
-        their ratio then changes with the scale.
-
-        Args:
-            robot: Index of the robot.
-            levels: (r, 2) all robots' levels.
-            scales: (k,) factors of this robot's levels.
-
-        Returns:
-            (k,) values.
-        """
-        (units,), (known,) = self.model.units, self.model.common
-        total = units.total(np.log(np.maximum(levels.ravel(), LEAST_SIGMA)))
-        white = np.linalg.inv(np.linalg.cholesky(total))
-        own = (self.members == robot).any(axis=1)
-        added = np.repeat(np.where(self.members == robot, 1.0, 0.0), 6, axis=1)
-        added *= np.tile(np.repeat(levels[robot], 3), self.members.shape[1]) ** 2
-        shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
-        white = np.swapaxes(axes, 1, 2) @ white
-        jacobian, errors = white @ units.jacobian, (white @ units.residuals[..., None])[..., 0]
-        others, other_errors = jacobian[~own], errors[~own]
-        information = known.information + gram(others, others)
-        gradient = known.gradient + gram(others, other_errors)
-        jacobian, errors, values = jacobian[own], errors[own], np.empty(len(scales))
-        for index, scale in enumerate(scales.tolist()):
-            grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
-            weighted = errors / grown
-            half = jacobian / np.sqrt(grown)[..., None]
-            root = covariance_root(information + gram(half, half))
-            projected = root.T @ (gradient + gram(jacobian, weighted))
-            squares = float(np.sum(errors * weighted) - projected @ projected)
-            determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])
-            values[index] = 0.5 * (squares + determinants)
-        return values
 
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
