@@ -1,6 +1,6 @@
 """Facts and tables about a result, for pages and recordings."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import datetime
 
 import numpy as np
@@ -10,7 +10,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
 from visioncal.present.network_layout import pairs
 from visioncal.present.tables import Fact, Table, TableRow
-from visioncal.results import Calibration, CellResult, Edge, Rms
+from visioncal.results import Calibration, CellResult, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
@@ -63,21 +63,6 @@ def answering_solver(calibration: Calibration) -> str | None:
         ):
             return name
     return None
-
-
-def edge_table(edges: Mapping[str, Edge]) -> Table:
-    """Position, rotation and sigma of each transform."""
-    rows = []
-    for name, edge in edges.items():
-        position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
-        rotation, sigma = "not measured", f"{significant(edge.sigma_mm)} mm"
-        if edge.oriented:
-            degrees = edge.transform.rotation.as_rotvec(degrees=True)
-            rotation = ", ".join(f"{value:.3f}" for value in degrees)
-            sigma += f", {significant(edge.sigma_deg)} deg"
-        rows.append((name, position, rotation, sigma))
-    titles = ("transform", "x, y, z [mm]", "rotation vector [deg]", "sigma")
-    return Table.of(titles, rows, (0, 1, 2, 3))
 
 
 def solver_table(calibration: Calibration) -> Table | None:

@@ -66,16 +66,12 @@ def _named(things: Mapping[str, object]) -> WrittenForm:
     return WrittenForm(str, named)
 
 
-# Sources that another draw of the same cell changes, and those that another recording keeps.
-_DRAWN_ANEW = (
-    *(RandomStream.ARM, RandomStream.ROBOT, RandomStream.PIXELS),
-    *(RandomStream.ARMS, RandomStream.ROBOTS, RandomStream.CORNERS),
-)
+# Sources that another recording of the same cell keeps.
 _KEPT = (
     *(RandomStream.MOUNTING, RandomStream.ARM, RandomStream.LENS),
     *(RandomStream.MOUNTINGS, RandomStream.ARMS, RandomStream.LENS_VIEWS),
 )
-# Distinguishes a recording's randomness from a draw's.
+# Distinguishes a recording's randomness.
 _RECORDING = 1000
 
 
@@ -87,17 +83,14 @@ class DrawOptions:
     # Seed of everything random. Each source of randomness has its own stream, so that changing one
     # option does not change the draws of others.
     seed: int = 0
-    # Number of the draw of real arms and noise; the cell and the nominal postures are the same for
-    # all.
-    draw: int = 0
     # Number of the recording of the same cell and arms, with stops and noise of its own.
     recording: int = 0
 
     def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:
         """Generator of one source of randomness; `index` is of the thing or the view."""
-        extra = [self.draw] if self.draw and purpose in _DRAWN_ANEW else []
+        extra = []
         if self.recording and purpose not in _KEPT:
-            extra += [_RECORDING, self.recording]
+            extra = [_RECORDING, self.recording]
         return np.random.default_rng([self.seed, int(purpose), *extra, *index])
 
 

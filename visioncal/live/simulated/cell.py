@@ -146,13 +146,13 @@ class Bench:
         )
         self.views: list[tuple[TakenView, TrueState]] = []
 
-    def start(self, q: FloatArray, host: str | None = None) -> None:
+    def start(self, q: FloatArray) -> None:
         """Starts the controller, its arm at a posture [rad].
 
         Raises:
             DriverError: It does not start.
         """
-        self.controller = spawn(replace(self._options, q=tuple(q.tolist())), host)
+        self.controller = spawn(replace(self._options, q=tuple(q.tolist())))
 
     @contextmanager
     def connected(self) -> Iterator[LiveCell]:
