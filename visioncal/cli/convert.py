@@ -24,17 +24,16 @@ _AS_TYPED = (
 
 def convert_command(options: ConvertOptions) -> None:
     """Runs `visioncal convert`."""
-    written = options.written
     requested = replace(
-        import_options(written),
+        import_options(options),
         camera=PoseImportOptions(
-            written.camera_columns or (),
-            written.camera_form,
-            written.camera_unit,
-            written.camera_inverse,
+            options.camera_columns or (),
+            options.camera_form,
+            options.camera_unit,
+            options.camera_inverse,
         ),
-        image=written.image_column,
-        **{name: getattr(written, name) for name in _AS_TYPED},
+        image=options.image_column,
+        **{name: getattr(options, name) for name in _AS_TYPED},
     )
     choose = partial(_chosen, yes=options.yes) if options.guess else None
     # A choice shows its own progress.
@@ -43,7 +42,7 @@ def convert_command(options: ConvertOptions) -> None:
             options.source,
             options.dest,
             requested=replace(requested, progress=progress),
-            form=written.form,
+            form=options.form,
             force=options.force,
             choose=choose,
             mirrors_poses=options.mirror_poses,

@@ -78,15 +78,14 @@ from visioncal.session import STREAMS, Session, check_stream, save_stream
 
 def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     """Plans an exciting motion and sweeps, writes them into a folder, and reports them."""
-    motion, kept, limits = options.motion, options.kept, options.arm_options
     arm = load_robot(options.robot)
-    boxes = boxes_of(kept)
+    boxes = boxes_of(options)
     bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
-    if limits.tool is not None:
-        length, radius = (1e-3 * number for number in limits.tool)
+    if options.tool is not None:
+        length, radius = (1e-3 * number for number in options.tool)
         if min(length, radius) <= 0.0:
             raise DataError(
-                f"--tool is {limits.tool}; a length and a radius above zero [mm] are needed.",
+                f"--tool is {options.tool}; a length and a radius above zero [mm] are needed.",
                 culprits=["--tool"],
             )
         flange = arm.chain.placements[-1]
@@ -95,40 +94,40 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     allowed = motion_limits(
         arm,
         MotionMargins(
-            float(np.deg2rad(kept.margin_deg)),
-            limits.speed,
-            limits.acceleration,
-            limits.torque_margin,
-            1e-3 * kept.clearance_mm,
-            floor_of(kept),
+            float(np.deg2rad(options.margin_deg)),
+            options.speed,
+            options.acceleration,
+            options.torque_margin,
+            1e-3 * options.clearance_mm,
+            floor_of(options),
         ),
         missing=DefaultLimits(
             *(
                 None if degrees is None else math.radians(degrees)
-                for degrees in (limits.range_deg, limits.speed_deg, limits.acceleration_deg)
+                for degrees in (options.range_deg, options.speed_deg, options.acceleration_deg)
             )
         ),
         bodies=tuple(bodies),
-        payload=None if limits.payload is None else _payload(*limits.payload),
+        payload=None if options.payload is None else _payload(*options.payload),
     )
     request = ExcitationRequest(
-        motion.duration,
-        motion.harmonics,
-        _friction_terms(motion.friction, PLANNED_FRICTION),
-        motion.starts,
-        motion.seed,
-        seconds=np.inf if motion.seconds is None else motion.seconds,
+        options.duration,
+        options.harmonics,
+        _friction_terms(options.friction, PLANNED_FRICTION),
+        options.starts,
+        options.seed,
+        seconds=np.inf if options.seconds is None else options.seconds,
     )
     sweeps = None
     with shown_progress(quiet=options.as_json) as progress:
         # The sweeps first: they are quick, and fail for the same reasons.
-        if not motion.no_sweeps:
+        if not options.no_sweeps:
             sweeps = plan_sweeps(
-                allowed, SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
+                allowed, SweepRequest(speeds=options.sweep_speeds, seed=options.seed)
             )
         plan = MotionPlan(allowed, excite(allowed, request, progress), sweeps)
     document = motion_document(plan)
-    written = write_motions(options.out, plan, motion.rate_hz, document)
+    written = write_motions(options.out, plan, options.rate_hz, document)
     if options.as_json:
         print_json(document)
     else:

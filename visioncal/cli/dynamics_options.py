@@ -45,9 +45,14 @@ _missing = partial(option, panel="What its description lacks")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExcitationOptions:
-    """Options of the motion."""
+class DynamicsPlanOptions(ClearanceOptions):
+    """Plan the motions that determine an arm's inertias and friction.
 
+    Writes an exciting motion and sweeps as tables (.csv), plan.json and plan.rrd to look at.
+    Nothing is sent to a robot. Exit status 2: the limits allow none.
+    """
+
+    robot: str = argument("A built-in robot, or the path of a .urdf, .toml or .json.")
     duration: float = _motion("Duration of the exciting motion, in s.", default=20.0)
     harmonics: int = _motion("Harmonics of that period.", default=5)
     friction: str = _motion(
@@ -62,12 +67,6 @@ class ExcitationOptions:
     starts: int = _motion("Random motions to search from.", default=4)
     seconds: float | None = _motion("Longest search on one core (s).", min=1.0)
     seed: int = _motion("Random seed of the starts.", default=0, min=0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmOptions:
-    """Limits, payload and fixed joints of the arm."""
-
     speed: float = kept_option("Fraction of the maximum speeds.", default=0.9)
     acceleration: float = kept_option("Fraction of the maximum accelerations.", default=0.9)
     torque_margin: float = kept_option("Safety factor on nominal torques.", default=1.2)
@@ -86,20 +85,6 @@ class ArmOptions:
     acceleration_deg: float | None = _missing(
         "Largest acceleration, in deg/s^2.", min=1e-3, max=1e6
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DynamicsPlanOptions:
-    """Plan the motions that determine an arm's inertias and friction.
-
-    Writes an exciting motion and sweeps as tables (.csv), plan.json and plan.rrd to look at.
-    Nothing is sent to a robot. Exit status 2: the limits allow none.
-    """
-
-    robot: str = argument("A built-in robot, or the path of a .urdf, .toml or .json.")
-    motion: ExcitationOptions
-    kept: ClearanceOptions
-    arm_options: ArmOptions
     out: Path = out_folder(default=Path("motions"))
     as_json: bool = json_flag()
 

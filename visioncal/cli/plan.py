@@ -14,9 +14,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import (
     MOST_FOR_NEED,
     ClearanceOptions,
-    PlanCellOptions,
     PlanOptions,
-    StopOptions,
 )
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
@@ -75,30 +73,29 @@ class Source:
 
 def plan_command(options: PlanOptions) -> None:
     """Runs `visioncal plan`."""
-    sight, kept = options.sight, options.kept
     limits = Limits(
-        math.radians(kept.margin_deg),
-        sight.distance_m,
-        sight.focus_m,
-        math.radians(sight.tilt_deg),
-        sight.edge_px,
-        1e-3 * kept.clearance_mm,
-        floor_of(kept),
+        math.radians(options.margin_deg),
+        options.distance_m,
+        options.focus_m,
+        math.radians(options.tilt_deg),
+        options.edge_px,
+        1e-3 * options.clearance_mm,
+        floor_of(options),
     )
-    boxes = boxes_of(kept)
-    purpose_of(options.wanted.purpose, "--for")
-    start, words = chosen_part(find_source(options.source), options.words)
-    if options.wanted.to_verify:
+    boxes = boxes_of(options)
+    purpose_of(options.purpose, "--for")
+    start, words = chosen_part(find_source(options.source), options)
+    if options.to_verify:
         _plan_to_verify(options, start, words, (limits, boxes))
         return
     with shown_progress(quiet=options.as_json) as progress:
-        cell, begun = _begin(start, words, (limits, boxes), options.wanted, progress)
+        cell, begun = _begin(start, words, (limits, boxes), progress)
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
             warn(
                 "this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
             )
-        plan = make_plan(cell, _request(options.wanted, cell), begun=begun, progress=progress)
+        plan = make_plan(cell, _request(options, cell), begun=begun, progress=progress)
         progress("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(options.out, plan, document)
@@ -109,9 +106,7 @@ def plan_command(options: PlanOptions) -> None:
     report_written(written, quiet=options.as_json)
 
 
-def _plan_to_verify(
-    options: PlanOptions, start: Source, words: PlanCellOptions, kept: Kept
-) -> None:
+def _plan_to_verify(options: PlanOptions, start: Source, words: PlanOptions, kept: Kept) -> None:
     """Plans to stand again at stops of a calibration; their table alone if no way is known."""
     calibration = start.calibration
     if calibration is None:
@@ -120,7 +115,7 @@ def _plan_to_verify(
             culprits=["--verify"],
             next_step="Name an output folder of calibrate.",
         )
-    count = options.wanted.stops or CheckLimits.stops
+    count = options.stops or CheckLimits.stops
     spread = stops_to_repeat(calibration, start.session, count)
     fit, plan = calibration.joint_fit, None
     targets = {} if fit is None else fit.targets
@@ -129,7 +124,7 @@ def _plan_to_verify(
         with shown_progress(quiet=options.as_json) as progress:
             try:
                 cell = cell_of(start, words, kept)
-                request = replace(_request(options.wanted, cell), count=count)
+                request = replace(_request(options, cell), count=count)
                 plan = make_plan(cell, request, postures=more.q, progress=progress)
             except DataError as error:
                 warn(f"the way between calibrated stops is not planned: {error.message}")
@@ -152,7 +147,7 @@ def _plan_to_verify(
     report_written(written, quiet=options.as_json)
 
 
-def _request(stops: StopOptions, cell: PlanCell) -> PlanRequest:
+def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:
     """The request for the planner."""
     purpose = purpose_of(stops.purpose, "--for")
     form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
@@ -205,23 +200,22 @@ def _box_of(words: str) -> Box:
 
 def _begin(
     source: Source,
-    words: PlanCellOptions,
+    words: PlanOptions,
     kept: Kept,
-    wanted: StopOptions,
     progress: Progress,
 ) -> tuple[PlanCell, SessionStart | None]:
     """The cell, and the recorded session where stops are added to one."""
-    if wanted.add is not None and wanted.stops is not None:
+    if words.add is not None and words.stops is not None:
         raise DataError(
             "--add and --stops exclude each other: stops are added to what was recorded, or "
             "planned without it.",
             culprits=["--add", "--stops"],
             next_step="Leave one out.",
         )
-    if wanted.add is None and (source.session is None or source.calibration is not None):
+    if words.add is None and (source.session is None or source.calibration is not None):
         return cell_of(source, words, kept), None
     begun = begun_session(source, words, kept, progress)
-    return begun.cell, begun if wanted.add is not None else None
+    return begun.cell, begun if words.add is not None else None
 
 
 def _report(plan: Plan) -> None:
@@ -275,7 +269,7 @@ def find_source(name: str) -> Source:
         ) from error
 
 
-def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCellOptions]:
+def chosen_part(source: Source, words: PlanOptions) -> tuple[Source, PlanOptions]:
     """Extracts one camera, robot and target from a cell's source, as the options name them.
 
     Raises:
@@ -295,7 +289,7 @@ def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCel
 
 
 def begun_session(
-    source: Source, words: PlanCellOptions, kept: Kept, progress: Progress
+    source: Source, words: PlanOptions, kept: Kept, progress: Progress
 ) -> SessionStart:
     """The session to which stops are added.
 
@@ -320,7 +314,7 @@ def begun_session(
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
-def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
+def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
     """The cell of a new plan, from a calibration or from options.
 
     Raises:
@@ -378,7 +372,7 @@ def _with_robot(session: Session, name: str) -> Session:
 
 
 def _calibrated(
-    calibration: Calibration, session: Session | None, words: PlanCellOptions, kept: Kept
+    calibration: Calibration, session: Session | None, words: PlanOptions, kept: Kept
 ) -> PlanCell:
     if words.target is not None:
         target = target_named(words.target)
@@ -406,7 +400,7 @@ def _calibrated(
     )
 
 
-def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
+def _with_noise(cell: PlanCell, words: PlanOptions) -> PlanCell:
     sigma_rad, sigma_m = cell.noise.robots[0].tolist()
     sigma_m = sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
     sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))

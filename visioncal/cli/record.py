@@ -9,7 +9,7 @@ from typing import Any
 
 from visioncal.cli.console import asked, print_json, say
 from visioncal.cli.parsing import refuse_given
-from visioncal.cli.session_options import RecordCellOptions, RecordOptions
+from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import signals_as_interrupts
@@ -37,7 +37,7 @@ from visioncal.robot import load_robot
 def record_command(options: RecordOptions) -> None:
     """Runs `visioncal record`."""
     plan = None if options.plan is None else read_plan(options.plan)
-    recorded = _recorded(plan, options.described)
+    recorded = _recorded(plan, options)
     drives = not options.follow and options.arm.partition(":")[0] != "manual"
     if drives and plan is None:
         raise DataError(
@@ -48,11 +48,10 @@ def record_command(options: RecordOptions) -> None:
     if not drives:
         is_dry = {"--dry-run": options.dry_run or None}
         refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
-    takes = options.takes
     taking = CaptureOptions(
-        speed=takes.speed,
-        frames=takes.frames,
-        still=Stillness(image_px=takes.still_px, quiet_s=takes.settle_s),
+        speed=options.speed,
+        frames=options.frames,
+        still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
     with signals_as_interrupts(), _opened(options, is_moved=drives and not options.dry_run) as cell:
@@ -79,7 +78,7 @@ def record_command(options: RecordOptions) -> None:
     _finish(journal, steps, as_json=options.as_json)
 
 
-def _recorded(plan: PlanFile | None, described: RecordCellOptions) -> RecordedCell:
+def _recorded(plan: PlanFile | None, described: RecordOptions) -> RecordedCell:
     """What is recorded, by the plan or by options."""
     target, robot, mount = described.target, described.robot, described.mount
     if plan is not None:
@@ -130,10 +129,10 @@ def _guided(capture: Capture, views: int, ask: Callable[[str], str] | None) -> l
 @contextmanager
 def _opened(options: RecordOptions, *, is_moved: bool) -> Iterator[LiveCell]:
     """Opens both devices, and closes them at the end of the block."""
-    device = options.device
-    requested = DeviceSetup(device.resolution, device.exposure_us, device.gain, device.focus)
-    form = options.described.pose_form
-    opened = open_arm(options.arm, asked, form, moves=is_moved, answers=sys.stdin.isatty())
+    requested = DeviceSetup(options.resolution, options.exposure_us, options.gain, options.focus)
+    opened = open_arm(
+        options.arm, asked, options.pose_form, moves=is_moved, answers=sys.stdin.isatty()
+    )
     with closing(opened) as arm:
         if is_moved and not isinstance(arm, MovingArm):
             raise DriverError(

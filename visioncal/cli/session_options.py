@@ -177,9 +177,30 @@ class TargetCheckOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StopOptions:
-    """What is planned."""
+class ClearanceOptions:
+    """Clearances that the arm must keep in any motion."""
 
+    boxes: list[str] | None = kept_option(
+        "Obstacles in the base, in mm.", "--box", metavar="NAME:X,Y,Z:SX,SY,SZ"
+    )
+    floor: str = kept_option("Height of the floor in the base.", default="0", metavar="Z|none")
+    clearance_mm: float = kept_option(
+        "Distance of the arm from floor, board, boxes and itself.", default=30.0, min=0.0, max=1e3
+    )
+    margin_deg: float = kept_option(
+        "Distance of joints from their limits.", default=3.0, min=0.0, max=90.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(ClearanceOptions):
+    """Propose the most informative robot stops, or those to add to a session.
+
+    Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
+    a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
+    """
+
+    source: str = argument("A robot, a session, or an output folder of calibrate.")
     add: int | None = _what("How many stops to add to a recorded session.", min=1, max=500)
     to_verify: bool = flag(
         "Calibrated stops to repeat for visioncal verify, five by default.", "--verify"
@@ -197,12 +218,6 @@ class StopOptions:
     )
     candidates: int = _what("Number of candidate stops.", default=1500, min=12, max=20000)
     seed: int = _what("Random seed of the candidate stops.", default=0, min=0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanCellOptions:
-    """Options of the cell; None for those that were not given."""
-
     robot: str | None = _cell("The robot, where a session names none.")
     target: str | None = _cell(_BOARD)
     camera: str | None = _cell("Numbers [px], or a file of the lens.", metavar="FX,FY,CX,CY | FILE")
@@ -221,32 +236,6 @@ class PlanCellOptions:
     noise_deg: float | None = _certainty(
         "Its rotation's; else 0.003, or as recorded.", min=0.0, max=1e3
     )
-
-    def options(self, *names: str) -> dict[str, object]:
-        """Some options by their names; None for those that were not given."""
-        return {f"--{name}": getattr(self, name) for name in names}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClearanceOptions:
-    """Clearances that the arm must keep in any motion."""
-
-    boxes: list[str] | None = kept_option(
-        "Obstacles in the base, in mm.", "--box", metavar="NAME:X,Y,Z:SX,SY,SZ"
-    )
-    floor: str = kept_option("Height of the floor in the base.", default="0", metavar="Z|none")
-    clearance_mm: float = kept_option(
-        "Distance of the arm from floor, board, boxes and itself.", default=30.0, min=0.0, max=1e3
-    )
-    margin_deg: float = kept_option(
-        "Distance of joints from their limits.", default=3.0, min=0.0, max=90.0
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SightOptions:
-    """Conditions that the camera must keep."""
-
     tilt_deg: float = kept_option(
         "Largest tilt of the board to the sight.", default=50.0, min=5.0, max=80.0
     )
@@ -255,59 +244,12 @@ class SightOptions:
         "Camera's from the board; else as it fills the image.", "--distance-mm"
     )
     focus_m: tuple[float, float] | None = _span("Depths at which images are sharp.", "--focus-mm")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanOptions:
-    """Propose the most informative robot stops, or those to add to a session.
-
-    Writes stops.csv, plan.json, plan.rrd to look at, and plan.script for a UR. Nothing is sent to
-    a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
-    """
-
-    source: str = argument("A robot, a session, or an output folder of calibrate.")
-    wanted: StopOptions
-    words: PlanCellOptions
-    kept: ClearanceOptions
-    sight: SightOptions
     out: Path = out_folder(default=Path("plan"))
     as_json: bool = json_flag()
 
-
-@dataclass(frozen=True, kw_only=True)
-class RecordCellOptions:
-    """The cell, where there is no plan."""
-
-    target: str | None = _record_cell(_BOARD)
-    robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
-    mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
-    pose_form: str | None = _record_cell(
-        "How poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class TakingOptions:
-    """How views are taken."""
-
-    frames: int = _taking("Frames a view.", default=3, min=1, max=100)
-    still_px: float = _taking(
-        "Largest motion of a still image.", default=Stillness.image_px, min=0.01, max=10.0
-    )
-    settle_s: float = _taking(
-        "How long all must be still.", default=Stillness.quiet_s, min=0.0, max=30.0
-    )
-    speed: float = _moving("Speed of the fastest joint, in rad/s; at most 1.5.", default=PLAN_SPEED)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeviceOptions:
-    """Camera settings."""
-
-    resolution: tuple[int, int] | None = _device("Size of the images in pixels.", **SIZE)
-    exposure_us: int | None = _device("Exposure time in microseconds.")
-    gain: int | None = _device("ISO, or the device's own unit.")
-    focus: int | None = _device("Lens position, in the device's own unit.")
+    def options(self, *names: str) -> dict[str, object]:
+        """Some options by their names; None for those that were not given."""
+        return {f"--{name}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,9 +265,24 @@ class RecordOptions:
         "A UR by its address, or typed poses.", default=REQUIRED, metavar="ur:HOST|manual"
     )
     camera: str = option("OAK, webcam or stream.", default=REQUIRED, metavar="oak|uvc:N|uvc:URL")
-    described: RecordCellOptions
-    takes: TakingOptions
-    device: DeviceOptions
+    target: str | None = _record_cell(_BOARD)
+    robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
+    mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
+    pose_form: str | None = _record_cell(
+        "How poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
+    )
+    frames: int = _taking("Frames a view.", default=3, min=1, max=100)
+    still_px: float = _taking(
+        "Largest motion of a still image.", default=Stillness.image_px, min=0.01, max=10.0
+    )
+    settle_s: float = _taking(
+        "How long all must be still.", default=Stillness.quiet_s, min=0.0, max=30.0
+    )
+    speed: float = _moving("Speed of the fastest joint, in rad/s; at most 1.5.", default=PLAN_SPEED)
+    resolution: tuple[int, int] | None = _device("Size of the images in pixels.", **SIZE)
+    exposure_us: int | None = _device("Exposure time in microseconds.")
+    gain: int | None = _device("ISO, or the device's own unit.")
+    focus: int | None = _device("Lens position, in the device's own unit.")
     plan: Path | None = option("What visioncal plan wrote: a folder, or its plan.json.")
     follow: bool = flag("Move nothing: take a view whenever the arm, guided by hand, rests.")
     views: int = option("With --follow or a manual arm: end after this number.", default=0, min=0)
@@ -355,9 +312,15 @@ class RobotPoseOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForeignOptions(RobotPoseOptions):
-    """Options for a foreign recording."""
+class ConvertOptions(RobotPoseOptions):
+    """Write a session as a folder or a recording, or make one of another program's.
 
+    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
+    nothing was written, and the message says what is missing or wrong.
+    """
+
+    source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
+    dest: Path = argument("An .rrd, or the folder to write.")
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
     mount: CameraMount | None = _recording("Where the camera is.")
     target: str | None = _recording(f"{_BOARD}, charuco_5x7_36.2mm_18.3mm_DICT_6X6_250.")
@@ -377,19 +340,6 @@ class ForeignOptions(RobotPoseOptions):
     )
     intrinsics: str | None = _camera("A file of any form, or `estimate` to ignore the source's.")
     resolution: tuple[int, int] | None = _camera("Size of the images in pixels.", **SIZE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertOptions:
-    """Write a session as a folder or a recording, or make one of another program's.
-
-    Between our own forms nothing is lost, which digests prove. Exit status 0: it is written; 2:
-    nothing was written, and the message says what is missing or wrong.
-    """
-
-    source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
-    dest: Path = argument("An .rrd, or the folder to write.")
-    written: ForeignOptions
     force: bool = force_flag()
     guess: bool = _doubt("Try other readings, and print them.", "--guess", default=False)
     yes: bool = _doubt("Take one that stands out.", "--yes", default=False, needs="guess")
