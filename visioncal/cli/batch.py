@@ -23,8 +23,8 @@ def batch_command(options: BatchOptions) -> None:
             workers=options.workers,
             scheduler=options.scheduler,
             level=options.level,
-            need_mm=options.need.need_mm,
-            need_deg=options.need.need_deg,
+            need_mm=options.need_mm,
+            need_deg=options.need_deg,
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
             progress=progress,
         )

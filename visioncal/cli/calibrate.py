@@ -15,10 +15,10 @@ from visioncal.session import Session
 
 def calibrate_command(options: CalibrateOptions) -> None:
     """Runs `visioncal calibrate`."""
-    session, need = options.session, options.need
+    session = options.session
     with with_run_paths(session, options.out):
         loaded = Session.load(session).needing(
-            need.need_mm, need.need_deg, corrected=options.corrected
+            options.need_mm, options.need_deg, corrected=options.corrected
         )
         if options.views is not None:
             loaded = loaded.only(options.views)
@@ -26,9 +26,9 @@ def calibrate_command(options: CalibrateOptions) -> None:
         solver=options.solver,
         level=options.level,
         convention=options.convention,
-        threads=options.work.threads,
+        threads=options.threads,
         dense=options.dense,
-        pictures=options.work.images == "thumbnail" and not options.work.no_recording,
+        pictures=options.images == "thumbnail" and not options.no_recording,
     )
     left = frames_to_keep(options.out)
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
@@ -38,7 +38,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
         if left is not None:
             left.keep()
         written = write_outputs(
-            options.out, loaded, result, without=options.work.left_out, images=options.work.images
+            options.out, loaded, result, without=options.left_out, images=options.images
         )
     if options.as_json:
         typer.echo(result.calibration.text)

@@ -49,7 +49,7 @@ def correct_command(options: CorrectOptions) -> None:
     # None where the table is printed.
     file = None if options.out == Path("-") else options.out
     needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
-    loaded = load_calibration(options.calibration, options.part.choice, needs)
+    loaded = load_calibration(options.calibration, options.choice, needs)
     bad = check_usable(loaded.verdict, "the calibration", force=options.force)
     calibration = _at_temperatures(loaded, options.temperatures)
     arm = CalibratedArm.of(calibration)

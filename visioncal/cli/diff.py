@@ -16,9 +16,9 @@ def diff_command(options: DiffOptions) -> None:
     comparison = compare(
         load_result(options.first),
         load_result(options.second),
-        camera=options.part.camera,
-        robot=options.part.robot,
-        target=options.part.target,
+        camera=options.camera,
+        robot=options.robot,
+        target=options.target,
     )
     if options.as_json:
         print_json(to_document(comparison))

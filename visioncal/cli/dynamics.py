@@ -202,7 +202,7 @@ def _requested(streams: StreamOptions) -> IdentificationRequest:
 def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
     """Identifies the dynamics from a session's streams, and writes and reports them."""
     request = replace(
-        _requested(options.streams),
+        _requested(options),
         validate_on=options.validate_on or "",
         rotors=options.rotors,
         options=Options(
@@ -226,7 +226,7 @@ def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
 def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
     """Predicts the torques of a session's streams, and prints the prediction errors."""
     identified = Identified.load(options.against)
-    request = _requested(options.streams)
+    request = _requested(options)
     predictions = validate_session(Session.load(options.session), identified, request)
     if options.as_json:
         documents = []
@@ -289,9 +289,7 @@ def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
 def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
     """Estimates the payload, and prints it."""
     identified = Identified.load(options.against)
-    loaded = conditioned_streams(
-        Session.load(options.session), identified, _requested(options.streams)
-    )
+    loaded = conditioned_streams(Session.load(options.session), identified, _requested(options))
     payload = estimate_payload(
         identified,
         loaded,

@@ -105,7 +105,7 @@ class DynamicsRecordOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynamicsIdentifyOptions:
+class DynamicsIdentifyOptions(StreamOptions):
     """Identify an arm's inertias and friction from the torques of its motions.
 
     Exit status 0: there is a result to use; 3: its verdict is bad; 2: there is none, for the reason
@@ -113,7 +113,6 @@ class DynamicsIdentifyOptions:
     """
 
     session: Path = motions_argument()
-    streams: StreamOptions
     validate_on: str | None = option("A stream to predict; else the end of the fastest.")
     output: Path | None = out_folder(f"A folder for {DYNAMICS_FILE} and report.", "-o", "--output")
     friction: str = option(
@@ -128,27 +127,25 @@ class DynamicsIdentifyOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynamicsValidateOptions:
+class DynamicsValidateOptions(StreamOptions):
     """Predict the torques of other motions, and say how near that comes.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
 
     session: Path = motions_argument()
-    streams: StreamOptions
     against: Path = against_option()
     as_json: bool = json_flag()
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynamicsPayloadOptions:
+class DynamicsPayloadOptions(StreamOptions):
     """Weigh what the arm carries, by how much more its drives gave than without it.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
 
     session: Path = motions_argument()
-    streams: StreamOptions
     against: Path = against_option()
     same_friction: bool = flag("Friction is as it was without the payload, however it presses.")
     gains_sigma: float = option("Sigma of --gains, in %.", default=100.0 * GAIN_SIGMA, min=0.0)

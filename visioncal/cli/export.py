@@ -24,7 +24,7 @@ def export_command(options: ExportOptions) -> None:
     load = None
     if options.mass_kg is not None and options.cog_mm is not None:
         load = Load(options.mass_kg, options.cog_mm)
-    given = {**vars(options), **vars(options.part), "load": load}
+    given = {**vars(options), "load": load}
     selection = Selection(**{field.name: given[field.name] for field in fields(Selection)})
     written = document(load_exportable(options.source), options.to, selection)
     bad = check_usable(written.verdict, "what is exported", force=options.force)

@@ -11,7 +11,7 @@ from visioncal.cli.console import answer, exit_status, print_json, report_writte
 from visioncal.cli.convert import import_options
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions, TouchOptions
+from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
@@ -136,7 +136,7 @@ def _keep_and_report(place: _Place, frame: Frame, source: Path, *, as_json: bool
 
 def place_frame(
     kind: FrameKind,
-    request: TcpOptions | FixtureOptions,
+    request: FrameOptions,
     by_touches: Callable[[Path, Calibration | None], Frame],
     cad: Path | None = None,
     tool: str | None = None,
@@ -154,7 +154,7 @@ def place_frame(
         DataError: The source cannot be read or does not show what is needed, or options contradict
             each other.
     """
-    part, source = request.part, request.touches
+    source = request.touches
     if source is None:
         command = "tcp" if kind == "tool" else "fixture"
         raise DataError(
@@ -162,19 +162,21 @@ def place_frame(
             culprits=["TOUCHES"],
             next_step=f"Name them: visioncal {command} TOUCHES -c OUT.",
         )
-    session = _image_session(source, {"--cad": cad, "--tool": tool, **request.written.given()})
+    session = _image_session(source, {"--cad": cad, "--tool": tool, **request.for_touches()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": request.point}, f"touches say where {origin} is")
-        refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
+        unneeded = {"--camera": request.camera, "--target": request.target}
+        refuse_given(unneeded, "touches need no camera")
         robots = robots_of(source)
-        if request.goes.calibration is None and not robots and tool in (None, "none"):
-            refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
+        if request.calibration is None and not robots and tool in (None, "none"):
+            named = {"--robot": request.robot}
+            refuse_given(named, "neither touches nor a calibration name robots")
         touched_by = robots[0] if len(robots) == 1 else None
-        place = _place(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
+        place = _place(request, kind, Choice(robot=request.robot), ARM, touched_by)
         frame = by_touches(source, place.calibration)
     else:
-        place = _place(request.goes, kind, replace(part.choice, target=None), EYE)
+        place = _place(request, kind, replace(request.choice, target=None), EYE)
         if place.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
@@ -183,7 +185,7 @@ def place_frame(
                 next_step="Name the output folder of visioncal calibrate.",
             )
         if has_several(session):
-            session = select(session, part.choice, robot_between=False)
+            session = select(session, request.choice, robot_between=False)
         point_m = np.array(request.point or np.zeros(3))
         with shown_progress(quiet=request.as_json) as progress:
             frame = seen_frame(session, place.calibration, kind, point_m, progress=progress)
@@ -214,9 +216,9 @@ def tcp_command(options: TcpOptions) -> None:
     """Runs `visioncal tcp`."""
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
-        written = options.written
-        rows = read_touches(source, import_options(written), options.part.robot)
-        return touched_tool(rows, calibration, _model(written), touch_noise_m=written.noise_m)
+        rows = read_touches(source, import_options(options), options.robot)
+        model, noise_m = _model(options), options.noise_m
+        return touched_tool(rows, calibration, model, touch_noise_m=noise_m)
 
     place_frame("tool", options, by_touches)
 
@@ -226,17 +228,17 @@ def fixture_command(options: FixtureOptions) -> None:
     drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
-        written, robot = options.written, options.part.robot
+        robot = options.robot
         tool = _tool(options.tool, calibration, robot)
-        rows = read_touches(source, import_options(written), robot, positions=tool is None)
-        noise_m, model = written.noise_m, _model(written)
+        rows = read_touches(source, import_options(options), robot, positions=tool is None)
+        noise_m, model = options.noise_m, _model(options)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
     place_frame("fixture", options, by_touches, options.cad, options.tool)
 
 
-def _model(written: TouchOptions) -> Robot | None:
-    return None if written.robot_model is None else load_robot(written.robot_model)
+def _model(options: FrameOptions) -> Robot | None:
+    return None if options.robot_model is None else load_robot(options.robot_model)
 
 
 def _tool(option: str | None, calibration: Calibration | None, robot: str | None) -> Tool | None:

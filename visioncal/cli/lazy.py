@@ -3,12 +3,12 @@
 import inspect
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, Field, fields
 from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -79,9 +79,9 @@ class PlainCommand(TyperCommand):
             if record := param.get_help_record(ctx):
                 named = getattr(param, "rich_help_panel", None)
                 panels[named or f"{param.param_type_name.capitalize()}s"].append(record)
-        for name, records in panels.items():
+        for name in sorted(panels, key=lambda panel: panel != "Arguments"):
             with formatter.section(name):
-                formatter.write_dl(records)
+                formatter.write_dl(panels[name])
 
 
 class LazyGroup(TyperGroup):
@@ -147,12 +147,10 @@ class LazyGroup(TyperGroup):
 
 
 def _flattened(record: type) -> Iterator[inspect.Parameter]:
-    """Command-line parameters of a record's fields (`cli.options`), at any depth."""
+    """Command-line parameters of a record's fields (`cli.options`)."""
     hints = get_type_hints(record)
     for field in fields(record):
         kind = hints[field.name]
-        if is_dataclass(kind):
-            yield from _flattened(cast(type, kind))
         for form, (words, names, attributes) in field.metadata.items():
             stated = {key: value for key, value in attributes.items() if key not in _OWN}
             stated |= {"help": words, "rich_help_panel": attributes.get("panel")}
@@ -176,10 +174,8 @@ def _gathered(record: Any, values: Mapping[str, Any], given: frozenset[str]) -> 
     Raises:
         DataError: A value cannot be parsed, or an option goes with another that is not given.
     """
-    hints, content = get_type_hints(record), {"given": given, **values}
+    content = {"given": given, **values}
     for field in fields(record):
-        if is_dataclass(hints[field.name]):
-            content[field.name] = _gathered(hints[field.name], values, given)
         for _, _, attributes in field.metadata.values():
             option, value = _option_of(field), content[field.name]
             needs = attributes.get("needs")

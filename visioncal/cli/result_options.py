@@ -1,8 +1,7 @@
 """Records of the commands that make and use results: their options, and their help."""
 
 import math
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import get_args
 
@@ -46,7 +45,7 @@ def _show_formats(wanted: bool) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateOptions:
+class CalibrateOptions(NeedOptions, WorkOptions):
     """Turn a session into a hand-eye calibration, with reasons to trust it or not.
 
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
@@ -59,8 +58,6 @@ class CalibrateOptions:
     """
 
     session: Path = argument("A session's folder, or its .rrd recording.")
-    need: NeedOptions
-    work: WorkOptions
     out: Path = out_folder(default=Path("out"))
     views: tuple[int, ...] | None = option("These views alone.", metavar="1-12,14", parse=views_in)
     solver: SolverName = option("The joint fit, or a closed form.", default="joint")
@@ -78,7 +75,7 @@ class CalibrateOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions:
+class BatchOptions(NeedOptions):
     """Calibrate many sessions at once, and report which stand out of their fleet.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
@@ -88,7 +85,6 @@ class BatchOptions:
     """
 
     out: Path = out_folder(default=REQUIRED)
-    need: NeedOptions
     sessions: list[str] | None = argument(
         "Sessions, recordings, their folders, or globs.", default=None
     )
@@ -123,14 +119,13 @@ class ShowOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyOptions:
+class VerifyOptions(PartOptions):
     """Check whether a calibration still holds, and what has changed if it does not.
 
     Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
     """
 
     session: Path = argument("Five stops or more of the same cell: a folder or an .rrd.")
-    part: PartOptions
     against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
@@ -139,7 +134,7 @@ class VerifyOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiffOptions:
+class DiffOptions(PartOptions):
     """Show what changed between two calibrations, and what is only noise.
 
     Exit status 0, changed or not: `is_change` in the JSON says which; 2: one cannot be read.
@@ -147,12 +142,11 @@ class DiffOptions:
 
     first: Path = argument("An output folder, its calibration.json, or a recording (.rrd).")
     second: Path = argument("The one to compare with it.")
-    part: PartOptions
     as_json: bool = json_flag()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
+class ExportOptions(PartOptions):
     """Write a result, or the calibrated arm, in another program's or robot's format.
 
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
@@ -161,7 +155,6 @@ class ExportOptions:
 
     source: Path = argument("An output folder, its .json, a recording, or a file of frames.")
     to: str = option("A format, as ros or ur; see --list.", default=REQUIRED, metavar="FORMAT")
-    part: PartOptions
     out: Path | None = out_file()
     edge: str | None = option("The transform; of a cell any frame from any other, or all.")
     inverse: bool = flag("Write the inverse of it.")
@@ -179,7 +172,7 @@ class ExportOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectOptions:
+class CorrectOptions(PartOptions):
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit
@@ -188,7 +181,6 @@ class CorrectOptions:
 
     targets: Path = argument("A table with the columns of views.csv; others are kept.")
     calibration: Path = against_option("-c", "--against", "--calibration")
-    part: PartOptions
     out: Path | None = out_file()
     tool: str | None = option("Frame of the targets: a tool, or cam; else the flange.")
     seed_joints: str | None = option("Joints [rad] near the first target's.", metavar="Q1,Q2,...")
@@ -207,49 +199,42 @@ class CorrectOptions:
     as_json: bool = json_flag()
 
 
-point_option = partial(
-    numbers_option,
-    "For images: the frame's origin in the target's frame, such as the tool's tip.",
-    "--point-mm",
-    form="x,y,z",
-    scale=1e-3,
-)
-
-
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions:
-    """Destination and name of a frame."""
+class FrameOptions(RobotPoseOptions, PartOptions):
+    """What places a frame, and where it goes."""
 
+    touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
     calibration: Path | None = option(
         "An output folder, which the frame joins.", "-c", "--calibration"
     )
     out: Path | None = option("A file of frames (.json) to put it into, instead.", "-o", "--out")
     name: str | None = option("Name of the frame: gripper, jig_2.")
     force: bool = force_flag()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TouchOptions(RobotPoseOptions):
-    """Convention and repeatability of touches."""
-
     touch_noise: float | None = option(
         "Sigma of touches, per axis.", "--touch-noise-mm", min=1e-4, max=1e3
     )
+    point: tuple[float, float, float] | None = numbers_option(
+        "For images: the frame's origin in the target's frame, such as the tool's tip.",
+        "--point-mm",
+        form="x,y,z",
+        scale=1e-3,
+    )
+    as_json: bool = json_flag()
 
     @property
     def noise_m(self) -> float | None:
         """Repeatability of a touch [m]."""
         return None if self.touch_noise is None else 1e-3 * self.touch_noise
 
-    def given(self) -> dict[str, object]:
-        """The options by their names; None for those that were not given."""
-        own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
-        named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
+    def for_touches(self) -> dict[str, object]:
+        """Options of touches by their names; None for those that were not given."""
+        names = [field.name for field in fields(RobotPoseOptions) if field.name != "joint_unit"]
+        named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
         return {**named, "--touch-noise-mm": self.touch_noise}
 
 
 @dataclass(frozen=True, kw_only=True)
-class TcpOptions:
+class TcpOptions(FrameOptions):
     """Find a tool's tip, and its rotation, from touches of fixed points; or from images.
 
     A touch of kind point has the tip at the point; of kind z, the point lies on the tool's positive
@@ -258,18 +243,9 @@ class TcpOptions:
     given; 3: the tool is bad, and joins no calibration.
     """
 
-    goes: FrameOptions
-    written: TouchOptions
-    part: PartOptions
-    touches: Path | None = argument(
-        "A table of touches, or a session that shows the tool.", default=None
-    )
-    point: tuple[float, float, float] | None = point_option()
-    as_json: bool = json_flag()
-
 
 @dataclass(frozen=True, kw_only=True)
-class FixtureOptions:
+class FixtureOptions(FrameOptions):
     """Find a fixture in the base, from touches of it or of a drawing's points.
 
     A touch of kind origin is at the fixture's origin; of kind x, on its positive x axis; of kind
@@ -279,15 +255,9 @@ class FixtureOptions:
     fixture is bad, and joins no calibration.
     """
 
-    goes: FrameOptions
-    written: TouchOptions
-    part: PartOptions
-    touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
     cad: Path | None = option("Points of the drawing: point, x_mm, y_mm, z_mm, sigma_mm.")
     cad_unit: str | None = option("What x, y, z in it are in.", metavar="|".join(UNITS_M))
     tool: str | None = option("A tool of the calibration or of a file, or none: poses of the tip.")
-    point: tuple[float, float, float] | None = point_option()
-    as_json: bool = json_flag()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -144,7 +144,7 @@ class BoardOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TargetMakeOptions:
+class TargetMakeOptions(BoardOptions):
     """Draw a board as NAME.pdf, NAME.svg and NAME.png at its exact size, with its NAME.toml.
 
     Rulers along both axes show whether the printer kept the size. Exit status 0: all files are
@@ -158,7 +158,6 @@ class TargetMakeOptions:
     page: str | None = option("A5 to A0, letter, legal, tabloid, or 500x300 (mm); else as it fits.")
     landscape: bool | None = option("Left out: as the board fits.", "--landscape/--portrait")
     dpi: float = option("Resolution of the PNG, in pixels per inch.", default=300.0)
-    board: BoardOptions
     force: bool = flag("Replace files that are there.")
 
 

@@ -34,13 +34,13 @@ _PAGES = ("A4", "A3", "A2", "A1", "A0")
 
 def target_make_command(options: TargetMakeOptions) -> None:
     """Runs `visioncal target make`."""
-    kind = options.board.kind
+    kind = options.kind
     if (options.target is None) == (kind is None):
         raise DataError(
             "Name a board, or describe one by --kind: one of both is needed.",
             next_step=f"The boards are {', '.join(target_names())}.",
         )
-    board = {field.name: getattr(options.board, field.name) for field in fields(options.board)}
+    board = {field.name: getattr(options, field.name) for field in fields(BoardOptions)}
     _refuse_unused(kind, board)
     request = None
     if kind is not None:

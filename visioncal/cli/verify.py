@@ -29,7 +29,7 @@ def verify_command(options: VerifyOptions) -> None:
     if options.output is not None:
         refuse_calibration(options.output)
     loaded, calibration = select_matching(
-        Session.load(options.session), load_result(against), options.part.choice
+        Session.load(options.session), load_result(against), options.choice
     )
     with shown_progress(quiet=options.as_json) as progress:
         check = verify(
