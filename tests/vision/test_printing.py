@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ from visioncal.vision.boards import DetectedCorners, find_target
 from visioncal.vision.boards.kind import BoardRequest
 from visioncal.vision.printing.drawing import to_png, to_svg
 from visioncal.vision.printing.page import EDGE_MM, arrange, pages_named
-from visioncal.vision.printing.pattern import draw_pattern, outlines
+from visioncal.vision.printing.pattern import draw_pattern
 from visioncal.vision.printing.request import requested_target
 from visioncal.vision.targets import corner_positions, load_target, target_names
 
@@ -129,25 +128,6 @@ def test_nothing_is_printed_where_printers_do_not_reach_or_finders_need_white(ta
     ring = image[low[1] : high[1], low[0] : high[0]].copy()
     ring[in_low[1] - low[1] : in_high[1] - low[1], in_low[0] - low[0] : in_high[0] - low[0]] = 255
     assert ring.min() == 255
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_outlines_enclose_the_dark_cells_and_share_no_side(seed):
-    dark = np.random.default_rng(seed).random((7, 9)) < 0.6
-    loops = outlines(dark)
-    area = 0.0
-    sides = []
-    for loop in loops:
-        after = np.roll(loop, -1, axis=0)
-        area += 0.5 * float(np.sum(loop[:, 0] * after[:, 1] - after[:, 0] * loop[:, 1]))
-        for (x, y), (far_x, far_y) in zip(loop.astype(int), after.astype(int), strict=True):
-            assert (x == far_x) != (y == far_y)
-            steps = max(abs(far_x - x), abs(far_y - y))
-            along = np.linspace([x, y], [far_x, far_y], steps + 1)
-            sides += [frozenset(map(tuple, pair)) for pair in pairwise(along)]
-    # Whole numbers: holes count negative.
-    assert area == dark.sum()
-    assert len(sides) == len(set(sides))
 
 
 @pytest.mark.parametrize(
