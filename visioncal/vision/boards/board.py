@@ -75,7 +75,7 @@ class Board(BoardKind):
 
     def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
         refined = self.refine(image, target, seen.ids, seen.px)
-        fitted = np.array([not reason for reason in refined.reasons])
+        fitted = refined.fitted
         if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
             return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
         return DetectedCorners(

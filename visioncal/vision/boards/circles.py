@@ -158,7 +158,7 @@ class CircleGrid(Board):
             if scale * target.diameter_m > 2 * _MOST_RADIUS_PX:
                 # Half of the size has edges of enough pixels.
                 half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
-                return Refined(2 * half.px + 0.5, 2 * half.sigma_px, half.reasons, 2 * half.blur_px)
+                return Refined(2 * half.px + 0.5, 2 * half.sigma_px, 2 * half.blur_px)
         return super().refine(image, target, ids, px)
 
     def search(

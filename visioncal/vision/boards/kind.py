@@ -155,7 +155,7 @@ class BoardKind(ABC):
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected corners [px] with these (n,) ids by the template."""
         del image, target, ids
-        return unrefined(px, "no template fits corners of this kind")
+        return unrefined(px)
 
     def document(self, target: Target) -> dict[str, Any]:
         """The target as the content of a `.toml` that `read` can read."""

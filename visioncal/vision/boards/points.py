@@ -184,7 +184,7 @@ class Rig(PointsKind):
         else:
             parts = [refine_tags(image, count, np.array(list(quads.values())), places)]
         points = np.concatenate([corner_ids[quad] for quad in quads])
-        fitted = np.array([not reason for part in parts for reason in part.reasons]) & (points >= 0)
+        fitted = np.concatenate([part.fitted for part in parts]) & (points >= 0)
         if not fitted.any():
             return NotFound("no corner of the tags seen is like the print")
         px = np.concatenate([part.px for part in parts])[fitted]

@@ -121,11 +121,14 @@ class Refined:
     # (n,) standard deviation of a coordinate, from the residuals; too large where the image has
     # content that is not in the template; NaN where the fit failed [px].
     sigma_px: FloatArray
-    # (n,) why the fit of a corner failed, in words; empty if it succeeded.
-    reasons: tuple[str, ...]
     # (2,) edge widths between neighbours along x and along y, as sigmas; NaN if no corner was
     # fitted [px].
     blur_px: FloatArray
+
+    @property
+    def fitted(self) -> Mask:
+        """(n,) corners whose fit succeeded."""
+        return np.isfinite(self.sigma_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,8 +353,8 @@ def refine_tags(
         for white in _TAG_WHITE:
             printed = replace(pattern, outside=white * module, clear=clear)
             fits.append(refine(image, printed, positions, start))
-        best = min(fits, key=lambda fit: (sum(map(bool, fit.reasons)), np.nansum(fit.sigma_px**2)))
-        if not any(best.reasons):
+        best = min(fits, key=lambda fit: (np.sum(~fit.fitted), np.nansum(fit.sigma_px**2)))
+        if best.fitted.all():
             break
     return best
 
@@ -381,12 +384,12 @@ def refine(image: Image, pattern: Print, board: FloatArray, px: FloatArray) -> R
         if len(px) >= MIN_CORNERS and spans_plane and part.size:
             refined = _refine_corners(part, pattern, board, px - low, axis)
             return replace(refined, px=refined.px + low)
-    return unrefined(px, "the corners found are too few, or lie as no board's do")
+    return unrefined(px)
 
 
-def unrefined(px: FloatArray, reason: str) -> Refined:
-    """The detector's corners, where none was fitted, and why."""
-    return Refined(px, np.full(len(px), np.nan), (reason,) * len(px), np.full(2, np.nan))
+def unrefined(px: FloatArray) -> Refined:
+    """The detector's corners, where none was fitted."""
+    return Refined(px, np.full(len(px), np.nan), np.full(2, np.nan))
 
 
 def _refine_corners(
@@ -412,9 +415,7 @@ def _refine_corners(
         first = _step(windows, pattern, no_shift, blur_px)
         shift, step = _fit_positions(windows, pattern, blur_px, None, first, tolerances_px[0])
         refined_px = windows.shifted(shift)
-        good = np.array(
-            [not reason for reason in _reasons(windows, step, refined_px - px, last_px[0])]
-        )
+        good = _accepted(windows, step, refined_px - px, last_px[0])
         refined_px = np.where(good[:, None], refined_px, px)
         change_px = np.abs(refined_px - windows.px).max()
         windows = _Windows.cut(smooth, board, refined_px, good, indices, pattern, axis)
@@ -428,14 +429,12 @@ def _refine_corners(
     first.replace(unlit, without_gradients.at(unlit))
     shift, step = _fit_positions(windows, pattern, blur_px, gradients, first, tolerances_px[1])
     refined_px = windows.shifted(shift)
-    reasons = _reasons(windows, step, refined_px - px, last_px[1])
-    good = np.array([not reason for reason in reasons])
+    good = _accepted(windows, step, refined_px - px, last_px[1])
     covariance = windows.jacobian @ step.covariance @ windows.jacobian.transpose(0, 2, 1)
     sigma_px = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     return Refined(
         np.where(good[:, None], refined_px, px),
         np.where(good, sigma_px, np.nan),
-        reasons,
         np.sqrt(np.maximum(blur_px**2 - _SMOOTH_PX**2, 0.0)) if good.any() else np.full(2, np.nan),
     )
 
@@ -677,31 +676,23 @@ def _erf(t: _Float32Array, gaussian: _Float32Array) -> _Float32Array:
     return np.copysign(total, t, out=total)
 
 
-def _reasons(
+def _accepted(
     windows: _Windows, step: _GaussNewtonStep, moved_px: FloatArray, last_px: float
-) -> tuple[str, ...]:
-    """(n,) why corners are rejected, in words; empty if accepted."""
-    last = windows.length_px(step.shift)
+) -> Mask:
+    """(n,) corners that converged near where they were found, and look like the print."""
     shift_squares = np.linalg.norm(moved_px, axis=1) * windows.widths.max(axis=1)
     contrast = step.levels[:, 1] * np.sign(_median(step.levels[:, 1]))
-    share = np.sum(windows.within & windows.inside, axis=(1, 2)) / np.sum(
-        windows.within, axis=(1, 2)
-    )
+    within = np.sum(windows.within, axis=(1, 2))
+    inside = np.sum(windows.within & windows.inside, axis=(1, 2))
+    most_misfit = min(_MISFIT_TIMES * _median(step.misfit) + _MISFIT_MORE, _MOST_MISFIT)
     # Written so that NaN fails.
-    checks = (
-        ("cut off by the edge of the image", share >= _LEAST_INSIDE),
-        ("without the board's contrast", contrast > _LEAST_CONTRAST * _median(contrast)),
-        ("no place fits best", last < last_px),
-        ("the place that fits best is far from where it was found", shift_squares < _MOST_SHIFT),
-        (
-            "unlike the print",
-            step.misfit < min(_MISFIT_TIMES * _median(step.misfit) + _MISFIT_MORE, _MOST_MISFIT),
-        ),
+    return np.asarray(
+        (inside >= _LEAST_INSIDE * within)
+        & (contrast > _LEAST_CONTRAST * _median(contrast))
+        & (windows.length_px(step.shift) < last_px)
+        & (shift_squares < _MOST_SHIFT)
+        & (step.misfit < most_misfit)
     )
-    reasons = np.full(len(last), "", dtype=object)
-    for words, holds in checks:
-        reasons[(reasons == "") & ~holds] = words
-    return tuple(reasons.tolist())
 
 
 def _median(values: FloatArray) -> float:
