@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -35,12 +34,11 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import distances, find_inlier_groups
-from visioncal.estimation.numbering import find_numbering
 from visioncal.estimation.pivot import fit_pivot, tool_problem
 from visioncal.estimation.pointfit import PointPairs, fit_features, fit_points, fixture_problem
 from visioncal.estimation.points import Groups, Placement, fit_groups
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.procrustes import align, procrustes_residual
+from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import small_sets
 
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])
@@ -479,46 +477,6 @@ def test_the_frame_moves_with_each_point_as_it_says():
     assert np.abs(found - expected).max() < 1e-4
 
 
-def measured(nominal, order, rng, noise_m=NOISE_M):
-    points = placed(some_frame(rng), nominal[order])
-    return points + noise_m * rng.normal(size=points.shape)
-
-
-ORDERS = {
-    "swapped": (lambda n: [1, 0, *range(2, n)], "P0 and P1 are exchanged"),
-    "shifted": (lambda n: [*range(1, n), 0], "points are exchanged: P0 is P1"),
-    "reversed": (lambda n: [*range(n)][::-1], "points are exchanged: P0 is P"),
-    "anyhow": (lambda n: [2, 0, 1, *range(4, n), 3], "points are exchanged: P0 is P2, P1 is P0"),
-}
-
-
-@pytest.mark.parametrize("count", [5, 7, 12, 30])
-@pytest.mark.parametrize("order", ORDERS)
-def test_a_wrong_order_is_found_and_named(order, count):
-    rng = np.random.default_rng(count)
-    nominal, (make, words) = some_drawing(rng, count), ORDERS[order]
-    found = find_numbering(measured(nominal, make(count), rng), nominal)
-    assert found.is_wrong
-    assert found.equally_good == 1
-    assert found.assignment.tolist() == make(count)
-    assert found.words(NAMES[:count]).startswith(words)
-    # Root mean square over three coordinates of noise that the fit has taken a part of.
-    assert found.rms_m < 2 * NOISE_M < found.stated_rms_m
-
-
-def test_triangles_find_what_trying_all_orders_finds():
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        nominal = some_drawing(rng, 6)
-        points = measured(nominal, rng.permutation(6), rng, 1e-3)
-        tried = find_numbering(points, nominal)
-        best = min(
-            permutations(range(6)),
-            key=lambda permutation: procrustes_residual(points, nominal[list(permutation)]),
-        )
-        assert tried.assignment.tolist() == list(best)
-
-
 def rejected(fit):
     return np.flatnonzero(~fit.agreement.mask).tolist()
 
@@ -599,26 +557,3 @@ def test_exact_touches_give_the_exact_tool(job):
     assert fit.oriented == fit.covariance[:3].any() == (job.axes > 0)
     assert fit.agreement.mask.all()
     assert not fit.looks_inverse
-
-
-def test_a_right_order_is_left_alone_and_a_symmetrical_one_cannot_be_told():
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        nominal = some_drawing(rng, 3 + seed % 10)
-        found = find_numbering(measured(nominal, np.arange(len(nominal)), rng), nominal)
-        assert not found.is_wrong
-        assert not len(found.moved)
-        assert found.words(NAMES[: len(nominal)]) == ""
-    # A square fits in any order that is a symmetry, so that nothing speaks against the stated one.
-    square = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]])
-    for order, count in (([3, 0, 1, 2], 0), ([1, 0, 2, 3], 2)):
-        found = find_numbering(measured(square, order, rng), square)
-        # The orders that move the fewest: it may as well be the other two.
-        assert (found.is_wrong, len(found.moved)) == (count > 0, count)
-        assert found.equally_good == 8
-    # What is known of the noise counts in its favour: exchanged, nearly equal sides fit to 0.6 mm.
-    nearly = 0.2 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0]])
-    nearly += 1e-3 * np.random.default_rng(3).normal(size=(3, 3))
-    points = measured(nearly, [1, 0, 2], rng, 0.0)
-    assert find_numbering(points, nearly).is_wrong
-    assert not find_numbering(points, nearly, noise_m=1e-3).is_wrong

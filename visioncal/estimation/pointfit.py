@@ -5,11 +5,10 @@ noise level, which is estimated. All three coordinates of a drawn point are stat
 feature those that are zero: x, y and z of the origin, y and z on the x axis, z in the xy plane.
 There the others only matter by their side, which is positive.
 
-The scale of a drawing is estimated separately, never absorbed. A left-handed drawing is found
-before the fit: no selection of points would correct it.
+The scale of a drawing is estimated separately, never absorbed.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, TypeAlias
@@ -18,11 +17,10 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, some_of
-from visioncal.core.quantiles import FALSE_REJECTION, f_limit, t_chance
+from visioncal.core.quantiles import FALSE_REJECTION, t_chance
 from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
-from visioncal.estimation.numbering import Numbering, find_numbering, misfit_by_noise
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
 from visioncal.estimation.points import (
@@ -32,11 +30,7 @@ from visioncal.estimation.points import (
     PointProblem,
     fit_groups,
 )
-from visioncal.estimation.procrustes import (
-    align,
-    procrustes_residual,
-    spreads,
-)
+from visioncal.estimation.procrustes import align, spreads
 from visioncal.estimation.robust import SETS, small_sets
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
@@ -48,6 +42,8 @@ _STATED = {
     "x": (False, True, True),
     "xy": (False, False, True),
 }
+# Points within so many sigmas of a plane lie in it.
+_FLAT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +57,6 @@ class PointPairs:
     nominal: FloatArray  # (n, 3) in the fixture's frame [m].
     # (n,) tolerance of the part to its drawing, per axis, as a sigma [m].
     nominal_sigma_m: FloatArray
-    spare_labels: tuple[str, ...] = ()  # (k,) names of drawn points that were not measured.
-    spare: FloatArray | None = None  # (k, 3) their coordinates in the fixture's frame [m].
     kinds: tuple[FeatureKind, ...] = ()  # (n,) the touched features; empty for drawn points.
 
     def __len__(self) -> int:
@@ -76,33 +70,6 @@ class PointPairs:
     def rows(self, kind: FeatureKind) -> IntArray:
         """Rows of the touches of a kind."""
         return np.array([i for i, name in enumerate(self.kinds) if name == kind], dtype=np.int64)
-
-    def merged(self) -> "PointPairs":
-        """Returns each point once: the median of its measurements, with their mean covariance."""
-        names = tuple(dict.fromkeys(self.labels))
-        if len(names) == len(self.labels):
-            return self
-        labels = np.array(self.labels)
-        rows = [np.flatnonzero(labels == name) for name in names]
-        first = np.array([row[0] for row in rows])
-        return replace(
-            self,
-            labels=names,
-            measured=np.array([np.median(self.measured[row], axis=0) for row in rows]),
-            covariances=np.array([self.covariances[row].mean(axis=0) for row in rows]),
-            nominal=self.nominal[first],
-            nominal_sigma_m=self.nominal_sigma_m[first],
-        )
-
-    @property
-    def drawn(self) -> FloatArray:
-        """(n + k, 3) all drawn points, the measured ones first [m]."""
-        return self.nominal if self.spare is None else np.vstack([self.nominal, self.spare])
-
-    @property
-    def drawn_labels(self) -> tuple[str, ...]:
-        """(n + k,) their names."""
-        return self.labels + self.spare_labels
 
     @property
     def known(self) -> FloatArray:
@@ -120,24 +87,6 @@ class PointPairs:
         return float(np.sqrt(np.trace(self.known, axis1=1, axis2=2).mean() / 3.0))
 
 
-def _hand(
-    measured: FloatArray, nominal: FloatArray, noise_m: float, misfit_m2: float | None = None
-) -> int:
-    """1 for points as drawn, -1 for their mirror image, 0 where both fit alike.
-
-    `misfit_m2` is the squared misfit of the points as drawn, where it is known.
-    Coplanar points have no handedness: mirrored they are the same points seen from behind, with the
-    frame's z axis reversed.
-    """
-    freedom, floor = 3.0 * len(measured) - 6.0, misfit_by_noise(len(measured), noise_m)
-    if misfit_m2 is None:
-        misfit_m2 = float(procrustes_residual(measured, nominal))
-    as_drawn = misfit_m2 + floor
-    flipped = float(procrustes_residual(measured, nominal * [-1.0, 1.0, 1.0])) + floor
-    limit = float(f_limit(FALSE_REJECTION, freedom, freedom))
-    return int(flipped > limit * as_drawn) - int(as_drawn > limit * flipped)
-
-
 @dataclass(frozen=True)
 class Scale:
     """Scale of the measured part relative to the drawing, if left free."""
@@ -153,12 +102,8 @@ class DrawingFit:
 
     agreement: GroupInliers  # The inlier points and their fit, without any scale.
     scale: Scale  # The scale if it were free.
-    # The order in which the points fit the drawing best; repeated measurements count once, at their
-    # first place.
-    numbering: Numbering
-    # Whether mirrored points would have been found: coplanar points leave the sign of the fixture's
-    # z axis open.
-    hand_known: bool
+    # Whether the points lie in one plane: a mirrored drawing would fit them as well.
+    is_flat: bool
 
 
 def fixture_problem(pairs: PointPairs, *, scaled: bool = False) -> PointProblem:
@@ -262,34 +207,18 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
             None where unknown.
 
     Raises:
-        DataError: Too few points, mirrored or wrongly numbered points, or points that
-            do not fit the drawing at all.
+        DataError: Too few points, or points that do not fit the drawing at all.
         DegenerateError: The points are collinear, or nearly so.
     """
-    points = pairs.merged()
-    if len(points) < FEWEST_POINTS:
+    names = tuple(dict.fromkeys(pairs.labels))
+    if len(names) < FEWEST_POINTS:
         raise DataError(
-            f"fixture: {len(points)} measured points with coordinates in the drawing, at least "
+            f"fixture: {len(names)} measured points with coordinates in the drawing, at least "
             f"{FEWEST_POINTS} are needed.",
-            culprits=points.labels,
+            culprits=names,
             next_step="Measure more points, not all on one line.",
         )
-    noise = float(np.hypot(pairs.known_noise_m, expected_noise_m or 0.0))
-    numbering = find_numbering(points.measured, points.drawn, noise)
-    # Names that are exchanged may explain more than a mirror.
-    in_order = len(points) * numbering.rms_m**2
-    if _hand(points.measured, points.nominal, noise, in_order) < 0:
-        raise DataError(
-            f"fixture: the measured points are the mirror image of the drawing: as they are they "
-            f"fit to {figure(1e3 * numbering.stated_rms_m)} mm only (root mean square).",
-            culprits=points.labels,
-            next_step="Look for a coordinate of the wrong sign or two exchanged axes, in the "
-            "drawing's table or in the measured one: a robot's frames are right-handed.",
-        )
     agreement, scale = _fit_inliers(pairs, expected_noise_m)
-    _check_numbering(
-        points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.mask)}
-    )
     fit, agrees = agreement.fit, agreement.mask
     extents = spreads(pairs.nominal[agrees])[0]
     level_m = float(np.hypot(fit.sigma, pairs.known_noise_m))
@@ -302,8 +231,7 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
         f" The part is {scale.value:.4g} times as large as drawn." if scale.differs else "",
     )
-    hand = _hand(pairs.measured[agrees], pairs.nominal[agrees], noise)
-    return DrawingFit(agreement, scale, numbering, hand > 0)
+    return DrawingFit(agreement, scale, float(extents[2]) < _FLAT_SIGMAS * level_m)
 
 
 def _fit_inliers(pairs: PointPairs, expected_noise_m: float | None) -> tuple[GroupInliers, Scale]:
@@ -330,21 +258,6 @@ def _scale_of(fit: GroupFit) -> Scale:
     return Scale(value, sigma, value > 0.0 and chance < FALSE_REJECTION)
 
 
-def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:
-    """Refuses a wrong order, unless the points out of order were rejected anyway."""
-    moved = [pairs.labels[at] for at in numbering.moved]
-    if not numbering.is_wrong or not any(value in agree for value in moved):
-        return
-    raise DataError(
-        f"fixture: as they are numbered the points fit the drawing to "
-        f"{figure(1e3 * numbering.stated_rms_m)} mm, in another order to "
-        f"{figure(1e3 * numbering.rms_m)} mm (root mean square): "
-        f"{numbering.words(pairs.drawn_labels)}.",
-        culprits=moved,
-        next_step="Correct the points' names.",
-    )
-
-
 def _refuse_poor(
     pairs: PointPairs, fit: GroupFit, centre: FloatArray, cause: str, next_step: str, hint: str = ""
 ) -> None:
@@ -360,8 +273,8 @@ def _refuse_poor(
         f"fixture: the {fault}: they are {1e3 * np.sqrt(np.mean(off_m**2)):.3g} mm off (root mean "
         f"square), most of all {pairs.labels[farthest]} with {1e3 * off_m[farthest]:.3g} mm.{hint}",
         culprits=[pairs.labels[farthest]],
-        next_step="Check the points' names or kinds, the drawing's coordinates and units, and how "
-        "they were measured.",
+        next_step="Check the points' names or kinds (are two exchanged?), the drawing's numbers, "
+        "signs and units, and how they were measured.",
     )
     lost = [name for name, stays in zip(pairs.labels, fit.used, strict=True) if not stays]
     without = f"without {some_of(lost)}, off the others, " if lost else ""

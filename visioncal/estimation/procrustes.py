@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.core.transforms import apply, compose, nearest_rotation
+from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray
 
 
@@ -23,12 +23,6 @@ def align(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     centred_a, centred_b = measured - centre_a[..., None, :], nominal - centre_b[..., None, :]
     rotation = nearest_rotation(np.swapaxes(centred_a, -1, -2) @ centred_b)
     return compose(rotation, centre_a - (rotation @ centre_b[..., None])[..., 0])
-
-
-def procrustes_residual(measured: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Sums (...,) of squared distances [m^2] after the best rigid alignment."""
-    residuals = measured - apply(align(measured, nominal), nominal)
-    return np.asarray(np.sum(residuals**2, axis=(-1, -2)))
 
 
 def spreads(points: FloatArray) -> tuple[FloatArray, FloatArray]:

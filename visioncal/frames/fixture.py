@@ -36,10 +36,10 @@ from visioncal.frames.touches import (
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
-# End of the reason of an outlier that fits by another name, and its remedy.
-RENAMED = ": is its name exchanged?"
-_RENAME = "Correct the names of what is named; where they are right, touch it once more."
-_TOUCH_AGAIN = "Touch what is named once more, and write the new poses in its rows."
+_TOUCH_AGAIN = (
+    "Correct the names of what is named; where they are right, touch it once more, and write the "
+    "new poses in its rows."
+)
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
@@ -151,9 +151,8 @@ class PointsFit:
             for name, place in zip(self.names, self.places, strict=True)
         ]
         for at in np.flatnonzero(~self.agrees).tolist():
-            renamed = reasons[at].endswith(RENAMED)
-            words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
-            yield Finding("left_out", words, Remedy(_RENAME if renamed else _TOUCH_AGAIN, AGAIN))
+            words = f"{names[at]} was left out: {reasons[at]}."
+            yield Finding("left_out", words, Remedy(_TOUCH_AGAIN, AGAIN))
         if self.agreement.doubtful.any():
             some = some_of([names[at] for at in np.flatnonzero(self.agreement.doubtful).tolist()])
             words = f"{some} contradict each other, and which is wrong is not known: all are used."
@@ -368,30 +367,20 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
     pairs = drawing.beside(measured.names, measured.points, measured.scattered)
     fit = fit_points(pairs, setting.touch_noise_m)
     # Probable cause if a point is an outlier.
-    causes = dict.fromkeys(pairs.labels, "it was missed, or the part is not there as drawn")
-    if fit.numbering.is_wrong:
-        points = pairs.merged()
-        for at in fit.numbering.moved.tolist():
-            other = points.drawn_labels[fit.numbering.assignment[at]]
-            causes[points.labels[at]] = f"it is where {other} is drawn{RENAMED}"
+    cause = "it was missed, or named as another, or the part is not there as drawn"
     centre = np.asarray(pairs.nominal[fit.agreement.mask].mean(axis=0))
-    fitted = _fitted(
-        fit.agreement, pairs, measured, [causes[label] for label in pairs.labels], centre, setting
-    )
+    fitted = _fitted(fit.agreement, pairs, measured, [cause] * len(pairs), centre, setting)
     count = len(set(pairs.labels))
     several = f"{len(measured)} touches of " if count < len(measured) else ""
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
     share = "" if used == count else f"{used} of "
-    spare = {"spare_points": list(pairs.spare_labels)} if pairs.spare_labels else {}
     return fitted.frame(
         f"best fit of {several}{share}{count} points to {drawing.source}",
         tuple(_drawing_findings(fit, fitted, measured, pairs, used, setting)),
         {
             "scale": {"value": fit.scale.value, "sigma": fit.scale.sigma},
-            "coplanar": not fit.hand_known,
-            "equal_orders": fit.numbering.equally_good,
+            "coplanar": fit.is_flat,
             **_worst_details(fitted),
-            **spare,
         },
         setting,
     )
@@ -422,7 +411,7 @@ def _drawing_findings(
             f"{figure(1e3 * extent_m)} mm, which the frame does not take in: {cause}",
             is_fatal=deviation > _WARM * 10,
         )
-    if not fit.hand_known:
+    if fit.is_flat:
         normal = spreads(pairs.nominal[fitted.agrees])[1][2]
         cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
         # The side of the touches determines the handedness of points in the drawing's xy plane.
@@ -438,16 +427,6 @@ def _drawing_findings(
                 "and a mirrored drawing would fit them as well, turned to the other side.",
                 "Check to which side its axes point, or measure a point beside the plane.",
             )
-    if fit.numbering.equally_good > 1:
-        yield Finding(
-            "symmetric",
-            f"The pattern of the points is symmetric: they fit the drawing in "
-            f"{fit.numbering.equally_good} orders alike, and exchanged names would not be noticed.",
-            Remedy(
-                f"Check that {pairs.labels[0]} is where the drawing has it, or measure one more "
-                "point that breaks the symmetry."
-            ),
-        )
     if used < setting.fewest:
         yield Finding(
             "few_points",

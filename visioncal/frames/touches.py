@@ -434,13 +434,10 @@ class NominalPoints:
                 next_step=did_you_mean(unknown[0], self.names) or "Correct the points' names.",
             )
         rows = np.array([index_of[name] for name in names], dtype=np.int64)
-        spare = np.setdiff1d(np.arange(len(self.names)), rows)
         return PointPairs(
             tuple(self.names[index] for index in rows),
             measured,
             covariances,
             self.positions[rows],
             self.sigma_m[rows],
-            tuple(self.names[index] for index in spare),
-            self.positions[spare],
         )

@@ -32,8 +32,6 @@ _LABELS = {
     "scale.value": "scale of the drawing",
     "scale.sigma": "its sigma",
     "coplanar": "all points in one plane",
-    "equal_orders": "orders that fit equally well",
-    "spare_points": "drawn points that were not measured",
 }
 # Ratios near one: their last digits matter.
 _RATIOS = {"scale.value"}
