@@ -41,12 +41,7 @@ _WHOLE_POSES = (6, 7, 12, 16)
 
 def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads one file with a row a view, or the only one in a folder of images."""
-    file = _pose_file(path)
-    if file is None:
-        raise DataError(
-            f"{path}: one file of poses ({', '.join(ENDINGS)}) is needed.", culprits=[str(path)]
-        )
-    fields = read_fields(file)
+    fields = read_fields(_pose_file(path) or path)
     if requested.camera_file is None:
         return foreign_from(fields, requested, images=path if path.is_dir() else None)
     return with_camera_file(fields, read_fields(requested.camera_file), requested)

@@ -160,7 +160,7 @@ def _kinematic_file(path: Path) -> Path | None:
 def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads cal_data.yaml with a pose file and an image in each row."""
     # Poses are of the robot's flange in its base; `static_camera` gives the mount.
-    file = _required(_hand_eye_file(path), path, "a cal_data.yaml with pose and image rows")
+    file = _hand_eye_file(path) or path
     document = mapping(read_yaml(file), str(file))
     rows = document.get("data")
     if not isinstance(rows, list) or not rows:
@@ -238,7 +238,7 @@ def _integer(value: object, where: str) -> int:
 
 def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads kinematic measurements: cam_from_target with the joints of either chain."""
-    file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
+    file = _kinematic_file(path) or path
     document = mapping(read_yaml(file), str(file))
     fields = fields_of_document(document, file)
     chains = ("camera_joints", "target_joints")
@@ -256,12 +256,6 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",
         columns={"source_row": tuple(map(str, document))},
     )
-
-
-def _required(path: Path | None, source: Path, needed: str) -> Path:
-    if path is None:
-        raise DataError(f"{source} has not {needed}.", culprits=[str(source)])
-    return path
 
 
 HAND_EYE = ForeignFormat(

@@ -191,12 +191,12 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
             next_step=did_you_mean(form, names),
         )
     for candidate in FOREIGN_FORMATS:
-        if candidate.name == form or (form is None and candidate.recognises(source)):
+        if form in (None, candidate.name) and candidate.recognises(source):
             return candidate
-    words = "; ".join(foreign_format.words for foreign_format in FOREIGN_FORMATS)
+    words = "; ".join(each.words for each in FOREIGN_FORMATS if form in (None, each.name))
     contents = ", ".join(path.name for path in files_in(source)[:8]) if source.is_dir() else ""
     raise DataError(
-        f"{source} is no session and in no format that is known: {words}."
+        f"{source} is no session and in no format that is asked for: {words}."
         + (f" It holds {contents}." if contents else ""),
         culprits=[str(source)],
         next_step="Write the poses into a CSV with a header, a row a view.",

@@ -299,21 +299,14 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
     cells = {
         view.number: {name: view.cell(name) for name in session.columns} for view in session.views
     }
-    for view in (first, second):
-        if view not in cells:
-            raise DataError(
-                f"There is no view {view} in session {session.name!r}; it has views "
-                f"{min(cells, default=0)} to {max(cells, default=0)}.",
-                culprits=["--exchange"],
-            )
-    first_cells, second_cells = cells[first], cells[second]
+    first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
     differing = [
         name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
     ]
-    if first == second or differing:
-        what = f"are of another {' and '.join(differing)}" if differing else "are the same view"
+    if first == second or differing or not (first_cells and second_cells):
         raise DataError(
-            f"Views {first} and {second} {what}: two views that see the same are exchanged.",
+            f"Views {first} and {second} of session {session.name!r} are not two views that see "
+            f"the same{': another ' * bool(differing)}{' and '.join(differing)}.",
             culprits=["--exchange"],
         )
     for name in {*_OBSERVED} & {*session.columns}:

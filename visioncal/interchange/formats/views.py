@@ -13,7 +13,6 @@ from typing import Any
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.tables import is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
-from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside
 from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import foreign_from
@@ -46,18 +45,20 @@ _CAMERA_POSE_NAME = re.compile(r".*pose_cPo_[0-9]+\.ya?ml", re.IGNORECASE)
 _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 
 
-def _zivid_files(path: Path) -> tuple[Path, ...]:
-    if not path.is_dir():
-        return ()
-    named = tuple(file for file in files_in(path) if _ZIVID_NAME.fullmatch(file.name))
-    return named if named and re.search("FloatMatrix|PoseState", head(named[0])) else ()
+def _named(path: Path, name: re.Pattern[str]) -> tuple[Path, ...]:
+    """Files of a folder whose names match; none of another path."""
+    files = files_in(path) if path.is_dir() else ()
+    return tuple(file for file in files if name.fullmatch(file.name))
+
+
+def _is_zivid(path: Path) -> bool:
+    first = next(iter(_named(path, _ZIVID_NAME)), None)
+    return first is not None and bool(re.search("FloatMatrix|PoseState", head(first)))
 
 
 def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads pos01.yaml ... (Zivid SDK, Matrix4x4; older samples, OpenCV's `PoseState`)."""
-    files = _zivid_files(path)
-    if not files:
-        raise DataError(f"{path} has no files like pos01.yaml.", culprits=[str(path)])
+    files = _named(path, _ZIVID_NAME)
     records = []
     for file in files:
         content = mapping(read_yaml(file), str(file))
@@ -76,24 +77,16 @@ def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
 ZIVID = ForeignFormat(
     "zivid",
     "Zivid's pos01.yaml ... in millimetres",
-    lambda path: bool(_zivid_files(path)),
+    _is_zivid,
     _read_zivid,
 )
 
 
-def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, ...]:
-    if not path.is_dir():
-        return ()
-    return tuple(file for file in files_in(path) if name.fullmatch(file.name))
-
-
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
-    files = _pose_files(path)
-    if not files:
-        raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
+    files = _named(path, _POSE_NAME)
     views = tuple(number_in(file.name) or 0 for file in files)
-    cameras = {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
+    cameras = {number_in(file.name): file for file in _named(path, _CAMERA_POSE_NAME)}
     records = [
         {
             name: as_numbers(mapping(read_yaml(at), str(at)).get("data"), f"{at}: data").reshape(-1)
@@ -144,7 +137,7 @@ def _target(path: Path) -> dict[str, Any] | None:
 VISP = ForeignFormat(
     "visp",
     "ViSP's poses (*_pose_rPe_1.yaml) with images and a camera XML, or with pose_cPo_1.yaml",
-    lambda path: bool(_pose_files(path)),
+    lambda path: bool(_named(path, _POSE_NAME)),
     _read,
 )
 
@@ -174,9 +167,7 @@ def _view_folder(path: Path) -> Path | None:
 
 def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a folder with one file a view, or several kinds of file a view."""
-    folder = _view_folder(path)
-    if folder is None:
-        raise DataError(f"{path} has no files like pose_01.json.", culprits=[str(path)])
+    folder = _view_folder(path) or path
     families = _families(folder)
     records: dict[int, dict[str, object]] = {}
     places: dict[int, list[str]] = defaultdict(list)
