@@ -369,7 +369,7 @@ CSV_REFUSALS = [
     ("holdout", "test", 'line 3, column role: \'test\' is no role; "fit", "holdout"'),
     ("0.6,0,0.3", '0.6,"0,1",0.3', "line 3, column y_m: '0,1' .*such as -1234.5"),
     (",0.10,", ",1e308,", r"1e\+308 s is no time of a recording"),
-    ("0.6,0,0.3", "0.6,,0.3", r"line 3, column y_m: it is empty while x_m is filled"),
+    ("0.6,0,0.3", "0.6,,0.3", r"line 3, column x_m \.\.\. qw: some are empty"),
     ("0.6,0,0,0.8", "0.6,0,0,0.9", r"line 3, column qx \.\.\. qw: .*norm is 1\.08167, but must"),
     ("0.6,0,0,0.8,", "0.6,0,0,0.8", "line 3: it has 12 fields, but the header has 13 columns"),
     ("images\\b 2.png", "..\\b.png", "line 3, column image: the path .* leaves the session"),

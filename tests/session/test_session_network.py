@@ -227,7 +227,7 @@ def test_robots_of_six_and_of_seven_joints_share_columns(tmp_path):
     assert any("robots.b.model" in warning for warning in session.warnings)
     assert list(session.robot_documents) == ["a"]
     (tmp_path / "views.csv").write_text(f"{header}\n{rows.replace('0,a,,1,2,', '0,a,,1,,')}")
-    raised(DataError, "column q2_rad: it is empty while q1_rad is filled", Session.load, tmp_path)
+    raised(DataError, "q1_rad ... q7_rad: some are empty", Session.load, tmp_path)
 
 
 def test_points_are_on_what_moves_while_they_are_read(tmp_path):

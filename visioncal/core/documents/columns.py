@@ -90,17 +90,12 @@ class NumberChecks:
             if not names:
                 continue
             there = np.isfinite([self.values[name] for name in names]).T
-            counts = there.sum(axis=1)
-            wanted = counts if group is first_only else np.where(counts > 0, len(names), 0)
-            short = ~there & (np.arange(len(names)) < wanted[:, None])
-            for row in np.flatnonzero(short.any(axis=1) & ~wrong).tolist():
-                other = names[0] if there[row, 0] else names[int(np.argmax(there[row]))]
-                self.report(
-                    row,
-                    names[int(np.argmax(short[row]))],
-                    f"it is empty while {other} is filled; a row fills all of "
-                    f"{names[0]} ... {names[-1]} or none",
-                )
+            is_ragged = (
+                there[:, 1:] > there[:, :-1] if group is first_only else there != there[:, :1]
+            )
+            for row in np.flatnonzero(is_ragged.any(axis=1) & ~wrong).tolist():
+                words = "some are empty and others filled; a row fills all of them or none"
+                self.report(row, f"{names[0]} ... {names[-1]}", words)
 
     def unit(self, names: Sequence[str]) -> None:
         """Checks that quaternions, in four columns, are of unit length."""
