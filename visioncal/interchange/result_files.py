@@ -68,75 +68,60 @@ def load_result(path: Path) -> Calibration:
     Raises:
         DataError: There is none, or it cannot be read.
     """
-    if path.suffix.lower() != ".rrd":
-        folder = path.parent if path.name == _SESSION else path
-        calibrated = path == folder and (folder / CALIBRATION).exists()
-        if not calibrated and (folder / _SESSION).is_file():
-            raise _uncalibrated(folder, "a session")
-        try:
-            return Calibration.load(path)
-        except DataError as error:
-            if _holds_frames(path):
-                raise DataError(
-                    f"{path} holds frames of tools and fixtures, and no calibration.",
-                    culprits=[str(path)],
-                    next_step="Name the calibration's folder or its calibration.json.",
-                ) from error
-            raise
-    # The codec takes half a second to import, which a calibration.json need not wait for.
-    from visioncal.present.recording import read_calibration
-
-    calibration = read_calibration(path)
-    if calibration is None:
-        raise _uncalibrated(path, "the recording of a session")
-    return calibration
+    found = load_exportable(path)
+    if not isinstance(found, Calibration):
+        what = "frames of tools and fixtures" if isinstance(found, FrameFile) else "dynamics"
+        raise DataError(
+            f"{path} holds {what}, and no calibration.",
+            culprits=[str(path)],
+            next_step="Name the calibration's folder or its calibration.json.",
+        )
+    return found
 
 
 def load_result_or_frames(path: Path, robot: str | None = None) -> Calibration | FrameFile:
-    """Loads a result, or a file of frames.
-
-    Args:
-        path: As for `load_calibration`, or a file of frames, recognised by its content, or a folder
-            with one and no calibration.json.
-        robot: Which robot of a cell is meant.
+    """Loads a result, of a cell the part of one robot, or a file of frames; see `load_exportable`.
 
     Raises:
         DataError: There is neither, or it cannot be read.
     """
-    return _frames_at(path) or load_calibration(path, Choice(robot=robot), ARM)
-
-
-def _frames_at(path: Path) -> FrameFile | None:
-    """The file of frames of a path, or in a folder without a calibration.json; None for another."""
-    alone = path.is_dir() and not (path / CALIBRATION).exists()
-    file = path / FRAMES if alone else path
-    return FrameFile.load(file) if _holds_frames(file) else None
+    found = load_exportable(path)
+    return (
+        found if isinstance(found, FrameFile) else load_calibration(path, Choice(robot=robot), ARM)
+    )
 
 
 def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
     """Loads anything that can be exported: a result, frames, or an arm's dynamics.
 
     Args:
-        path: As there, or a dynamics.json, recognised by its content, a folder
-            with one and no calibration.json, or the recording of a cell.
+        path: An output folder, a recording with a result, or a file, known by its content.
 
     Raises:
         DataError: There is none of them, or it cannot be read.
     """
-    alone = path.is_dir() and not (path / CALIBRATION).exists()
-    # Half a second to import, which loading a calibration need not wait for.
-    from visioncal.dynamics import Identified
+    if path.suffix.lower() == ".rrd":
+        # The codec takes half a second to import, which a calibration.json need not wait for.
+        from visioncal.present.recording import read_calibration
 
-    file = path / DYNAMICS_FILE if alone and (path / DYNAMICS_FILE).is_file() else path
-    if "base" in content_of(file) and "transforms" not in content_of(file):
+        calibration = read_calibration(path)
+        if calibration is None:
+            raise _uncalibrated(path, "the recording of a session")
+        return calibration
+    names = (path / name for name in (CALIBRATION, DYNAMICS_FILE, FRAMES))
+    file = next((name for name in names if name.is_file()), path)
+    folder = path.parent if path.name == _SESSION else path
+    if file == path and (folder / _SESSION).is_file():
+        raise _uncalibrated(folder, "a session")
+    content = content_of(file)
+    if "frames" in content and "transforms" not in content:
+        return FrameFile.load(file)
+    if "base" in content and "transforms" not in content:
+        # Half a second to import, which loading a calibration need not wait for.
+        from visioncal.dynamics import Identified
+
         return Identified.load(file)
-    return _frames_at(path) or load_result(path)
-
-
-def _holds_frames(path: Path) -> bool:
-    """Whether a file has frames but no transforms, which every calibration has."""
-    document = content_of(path)
-    return "frames" in document and "transforms" not in document
+    return Calibration.load(path)
 
 
 def content_of(path: Path) -> dict[str, object]:
@@ -162,12 +147,13 @@ def _uncalibrated(path: Path, what: str) -> DataError:
 def load_stored(path: Path) -> Stored:
     """Loads a result with its session and evidence, from the recording or the one beside it.
 
+    A recording beside a calibration.json that is missing, damaged or of another result is noted.
+
     Args:
         path: An output folder, its calibration.json, or a recording with a result.
 
     Raises:
-        DataError: There is no result, or it cannot be read. A recording beside a calibration.json
-            that is missing, damaged or of another result is no error but noted.
+        DataError: There is no result, or it cannot be read.
     """
     calibration = load_result(path)
     if path.suffix.lower() == ".rrd":
