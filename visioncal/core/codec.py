@@ -23,16 +23,7 @@ _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true o
 
 @contextmanager
 def reading(label: str, what: str, next_step: str) -> Iterator[None]:
-    """Turns all errors of reading a file into DataErrors that name the file.
-
-    Args:
-        label: The file.
-        what: Its expected content, such as `a calibration`.
-        next_step: How to create it again.
-
-    Raises:
-        DataError: The content is not that.
-    """
+    """Turns errors of reading a file (`label`) into DataErrors: it is not `what`; `next_step`."""
     try:
         yield
     except DataError as error:
@@ -168,12 +159,7 @@ def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
 
 
 def read(cls: type[_T], document: object, path: str) -> _T:
-    """Reads a dataclass from JSON of `write`.
-
-    Args:
-        cls: The dataclass.
-        document: The JSON.
-        path: Path of the document in the file, for messages.
+    """Reads a dataclass from JSON of `write`; `path` is that of the document in the file.
 
     Raises:
         DataError: A value is missing or of another type; the message names its path.

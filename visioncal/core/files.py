@@ -28,13 +28,8 @@ def sha256(data: bytes) -> str:
 def write_atomically(path: Path | str, data: bytes | str) -> None:
     """Writes a file atomically: readers see the old content or the new one, never a part.
 
-    The data goes to a temporary file in the same folder, is flushed to the disk, and replaces
-    `path` by a rename. If the process is killed, the temporary file stays until the next write in
-    that folder.
-
-    Args:
-        path: The file to write; its folder must exist.
-        data: Its content; text is written as UTF-8 with unchanged line ends.
+    Text is written as UTF-8 with unchanged line ends. If the process is killed, a temporary file
+    stays in the folder until the next write there.
 
     Raises:
         DataError: The folder is missing or cannot be written.
@@ -313,14 +308,10 @@ def find_described(
     suffixes: tuple[str, ...],
     folder: Path | None,
 ) -> Path:
-    """Finds the file that describes a board or a robot.
+    """Finds the file that describes a board or a robot (`what`, for messages).
 
-    Args:
-        name_or_path: A built-in name, or a path that ends in one of `suffixes`.
-        what: The kind of description, for messages: `target`, `robot`.
-        shipped: Built-in files by name.
-        suffixes: Suffixes that distinguish paths from names.
-        folder: Relative paths start here; the working directory where None.
+    It is a built-in one of `shipped`, or a path that ends in one of `suffixes`, relative to the
+    folder or, where None, to the working directory.
 
     Raises:
         DataError: The name is unknown or the file does not exist.

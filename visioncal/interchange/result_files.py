@@ -60,10 +60,7 @@ def load_calibration(
 
 
 def load_result(path: Path) -> Calibration:
-    """Loads a result, of one camera and one robot or of a cell.
-
-    Args:
-        path: As for `load_calibration`.
+    """Loads a result, of one camera and one robot or of a cell; see `load_exportable`.
 
     Raises:
         DataError: There is none, or it cannot be read.

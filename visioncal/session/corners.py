@@ -160,13 +160,7 @@ def write_corners(table: CornerTable) -> str:
 def with_corners(
     columns: tuple[str, ...], views: Sequence[View], table: CornerTable, names: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[View, ...], CornerTable]:
-    """Marks the views that have corners; splits those that show several targets.
-
-    Args:
-        columns: The columns of views.csv.
-        views: Its rows.
-        table: The corners.
-        names: Names of the session's targets; empty where there is only one.
+    """Marks the views that have corners; splits those that show several targets, with names.
 
     Returns:
         Columns, rows with those for further targets appended, and the corners with their view

@@ -261,12 +261,9 @@ class Declaration(TableModel):
 def read_declaration(
     document: Mapping[str, Any], label: str, *, observed: bool = True
 ) -> Declaration:
-    """Checks the content of a session.toml.
+    """Checks the content of a session.toml, named `label` in messages.
 
-    Args:
-        document: The content, as TOML or JSON gives it.
-        label: The file's name, for messages.
-        observed: Whether there are views, which need something that observed them.
+    `observed` says whether there are views, which need something that observed them.
 
     Raises:
         DataError: A field is missing, of another type, out of range, or contradicts another; the

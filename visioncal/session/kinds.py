@@ -181,17 +181,10 @@ def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[
 def read_robots(
     declaration: Declaration, folder: Path | None, document: Mapping[str, Any] | None
 ) -> tuple[Mapping[str, Any] | None, list[str]]:
-    """Reads the models of the robots that a session declares.
+    """Models of the declared robots, of several by name, and messages for what cannot be read.
 
-    Args:
-        declaration: The typed session.toml.
-        folder: Base of relative paths; the working directory where None.
-        document: Content of the robot's file, if already read; with several robots, contents by
-            name.
-
-    Returns:
-        The model, with several robots the models by name, or None; and messages for models that
-        could not be read.
+    Relative paths are below the folder or, where None, the working directory; `document` has the
+    models in the same form, if they are read already.
     """
     if document is not None:
         return document, []
@@ -219,17 +212,10 @@ COLUMN = "target"
 def read_targets(
     declaration: Declaration, folder: Path | None, document: Mapping[str, Any] | None
 ) -> tuple[dict[str, Target], Mapping[str, Any] | None]:
-    """Reads the targets that a session declares.
+    """Declared targets by name, empty for the only one, and their document, of several by name.
 
-    Args:
-        declaration: The typed session.toml.
-        folder: Base of relative paths; the working directory where None.
-        document: Content of the target's file, if already read; with several targets, contents by
-            name.
-
-    Returns:
-        The targets by name, which is empty for the only one, and their document in the form of the
-        argument; None without targets.
+    Relative paths are below the folder or, where None, the working directory; `document` has the
+    contents in the same form, if they are read already.
 
     Raises:
         DataError: There is no such target, or its description is wrong.

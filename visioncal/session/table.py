@@ -160,11 +160,7 @@ def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
 
 
 def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, ...]:
-    """Reads and checks views.
-
-    Args:
-        table: The columns and rows.
-        with_corners: Whether there is a corners.csv.
+    """Reads and checks views; `with_corners` says whether there is a corners.csv.
 
     Raises:
         DataError: Rows are wrong; it lists up to ten problems.

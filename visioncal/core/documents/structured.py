@@ -167,13 +167,7 @@ _MATRICES = ("opencv-matrix", "opencv-nd-matrix")
 
 
 def read_opencv(path: Path) -> Mapping[str, Any]:
-    """Reads a file of OpenCV's FileStorage, matrices as arrays.
-
-    Args:
-        path: A `.yaml`, `.yml`, `.json` or `.xml`.
-
-    Returns:
-        The values by their names: numbers, text, lists, mappings and (rows, cols) arrays.
+    """Values by name of a file of OpenCV's FileStorage (YAML, JSON or XML), matrices as arrays.
 
     Raises:
         DataError: It has another format, or a matrix in it is incomplete.

@@ -44,15 +44,11 @@ class TextTable:
 
 
 def parse_table(text: str, label: str) -> TextTable:
-    """Splits a table with a header row; blank lines are skipped.
+    """Splits a table with a header row; blank lines are skipped. `label` is its name in messages.
 
     Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
     commas are read as points, as many spreadsheets write them. Empty columns at the end are
     dropped. Rows may differ in length; an empty text has no columns.
-
-    Args:
-        text: The text.
-        label: Its name, for messages.
 
     Raises:
         DataError: Its quotes do not close.

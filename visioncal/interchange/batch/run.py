@@ -310,16 +310,11 @@ DIED, LOST = "WorkerDied", "SchedulerLost"
 def rows_of(
     jobs: Sequence[Job], workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[FleetRow]:
-    """The rows of all jobs, in the order in which they finish.
+    """The rows of all jobs, in the order in which they finish; see `batch`.
 
     If a local process dies, the jobs that were running are run again, each in a pool of its own:
-    a session on which it dies again has a row that says so, and all others go on.
-
-    Args:
-        jobs: The jobs.
-        workers: Number of local processes; None for one a core.
-        scheduler: The address of a Dask scheduler whose workers are used; they must see the same
-            files by the same paths. If it goes away, the remaining rows say so.
+    a session on which it dies again has a row that says so, and all others go on. If a scheduler
+    goes away, the remaining rows say so.
 
     Raises:
         DataError: The scheduler does not answer.

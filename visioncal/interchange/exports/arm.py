@@ -274,16 +274,7 @@ _OF_INERTIAS = ("robot-urdf", "robot-json")
 
 
 def write_dynamics(identified: Identified, to: str, selection: Selection) -> str:
-    """Writes an arm with the identified inertias of its links.
-
-    Args:
-        identified: The result.
-        to: `robot-urdf`: its own URDF, or a small one; `robot-json`: a chain, which a session may
-            name as its robot.
-        selection: The user's selection, which must be empty.
-
-    Returns:
-        The text.
+    """An arm with the identified inertias of its links, as `robot-urdf` or `robot-json`.
 
     Raises:
         DataError: The format holds no inertias, an option does not apply to it, or no inertias were

@@ -277,15 +277,7 @@ class Format(Generic[_T]):
     warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
 
     def check(self, selection: Selection, also: Collection[str] = ()) -> None:
-        """Refuses options that do not apply to the format.
-
-        Args:
-            selection: The user's selection.
-            also: Options that apply beside `takes`.
-
-        Raises:
-            DataError: An option does not apply.
-        """
+        """Refuses options that are neither in `takes` nor in `also`; raises DataError."""
         given = [name for name, option in vars(selection).items() if option not in (None, False)]
         unused = [name for name in given if name not in (*self.takes, *also, *_PARTS)]
         if unused:

@@ -38,13 +38,7 @@ FORMS = (
 
 
 def read_target_description(words: str) -> Mapping[str, Any]:
-    """Reads the description of a target.
-
-    Args:
-        words: A shipped name, the path of a `.toml`, or a one-word description as in `FORMS`.
-
-    Returns:
-        The content of its `.toml`.
+    """Content of the `.toml` of a target: a shipped name, a path, or a word as in `FORMS`.
 
     Raises:
         DataError: It is none of these, or describes no target.
