@@ -263,7 +263,7 @@ def test_a_plan_for_another_arm_is_not_driven(plan):
     state, offset = moved.state, compose(np.eye(3), np.array([0.3, 0.0, 0.0]))
     moved.state = lambda: replace(said := state(), base_from_flange=offset @ said.base_from_flange)
     with pytest.raises(DataError, match=r"its flange is 300 mm and 0 deg from where the model"):
-        motion_summary(LiveCell(moved, (camera,), arm.clock), plan, (), QUICK)
+        motion_summary(LiveCell(moved, camera, arm.clock), plan, (), QUICK)
 
 
 def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():
@@ -422,7 +422,7 @@ def test_ctrl_c_ends_a_guided_recording(plan, tmp_path):
 
 def _capture(folder, plan, arm, camera):
     journal = Journal.begin(folder, facts_of(plan, arm, camera), arm.clock.unix_offset_s(), 0)
-    cell = LiveCell(arm, (camera,), arm.clock)
+    cell = LiveCell(arm, camera, arm.clock)
     planned = plan.cell
     return Capture(cell, planned.target, planned.robot, camera.lens, journal, QUICK, None)
 

@@ -23,7 +23,7 @@ QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
 def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> CaptureFacts:
     """What is written of a fake cell."""
     recorded = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
-    return CaptureFacts.of(LiveCell(arm, (camera,)), name, recorded, plan)
+    return CaptureFacts.of(LiveCell(arm, camera), name, recorded, plan)
 
 
 def recorded(
@@ -40,7 +40,7 @@ def recorded(
     begin = Journal.resume if resume else Journal.begin
     facts = facts_of(plan, arm, camera)
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
-    cell = LiveCell(arm, (camera,), arm.clock)
+    cell = LiveCell(arm, camera, arm.clock)
     return record(cell, plan, journal, options, Consent(None), watch)
 
 

@@ -1,9 +1,9 @@
 """`visioncal locate`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import typer
@@ -35,13 +35,8 @@ _NORM_TOLERANCE = 1e-3
 _LEAD = "base_from_"
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """One located point, with its label in words and in JSON."""
-
-    words: str
-    document: Mapping[str, Any]
-    located: Located
+# A located point, with its label in words and in JSON.
+_Point: TypeAlias = tuple[str, Mapping[str, Any], Located]
 
 
 def locate_command(options: LocateOptions) -> None:
@@ -84,14 +79,12 @@ def locate_command(options: LocateOptions) -> None:
         declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)
         sigma_px = options.sigma_px
         places = locate(calibrated, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
-        points = tuple(
-            _Point(
-                f"pixel ({u:g}, {v:g})",
-                {"pixel": [u, v]},
-                replace(place, warnings=(*place.warnings, note)) if note else place,
-            )
+        if note:
+            places = tuple(replace(at, warnings=(*at.warnings, note)) for at in places)
+        points: list[_Point] = [
+            (f"pixel ({u:g}, {v:g})", {"pixel": [u, v]}, place)
             for (u, v), place in zip(px.tolist(), places, strict=True)
-        )
+        ]
     else:
         needless = {"--plane": options.plane, "--plane-sigma-mm": options.plane_sigma}
         refuse_given(needless, "it is for --pixel")
@@ -213,7 +206,7 @@ def _by_views(
     calibration: Calibration,
     target: Target | None,
     point_m: FloatArray,
-) -> tuple[_Point, ...]:
+) -> list[_Point]:
     # Imported late, as a pixel is placed in a millisecond without it.
     from visioncal.calibration.stages.observed import by_reason
     from visioncal.frames.session_observations import locate_views
@@ -233,9 +226,7 @@ def _by_views(
         )
     for words in (*by_reason(picks.lost), *picks.warnings):
         say(words)
-    return tuple(
-        _Point(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
-    )
+    return [(f"view {view}", {"view": view}, located) for view, located in picks.found.items()]
 
 
 def _by_image(
@@ -244,7 +235,7 @@ def _by_image(
     target: Target | None,
     point_m: FloatArray,
     flange: FloatArray | None,
-) -> tuple[_Point, ...]:
+) -> list[_Point]:
     source = options.source
     if source is None:
         raise DataError(
@@ -261,7 +252,7 @@ def _by_image(
     located = locate_target(
         calibration, image, target, flange, point_m, sigma_px=options.sigma_px, label=name
     )
-    return (_Point(name, {"image": name}, located),)
+    return [(name, {"image": name}, located)]
 
 
 def _target(words: str, result: Calibration) -> Target:
@@ -272,28 +263,22 @@ def _target(words: str, result: Calibration) -> Target:
 
 def _report(points: Sequence[_Point], *, as_json: bool) -> None:
     if as_json:
-        print_json([_document(point) for point in points])
+        print_json([{**document, **_document(located)} for _, document, located in points])
         return
-    for point in points:
-        typer.echo(f"{point.words}: {_line(point.located)}")
-        for warning in point.located.warnings:
-            warn(warning if warning.startswith(point.words) else f"{point.words}: {warning}")
+    for words, _, located in points:
+        place = ", ".join(f"{value:.2f}" for value in 1e3 * located.p_base)
+        sigmas = ", ".join(figure(float(value)) for value in located.sigma_mm)
+        largest_mm = figure(located.budget_mm[located.largest])
+        typer.echo(
+            f"{words}: ({place}) mm, sigma ({sigmas}) mm, 95 % within "
+            f"{figure(located.radius95_mm)} mm; largest source: {located.largest}, {largest_mm} mm"
+        )
+        for warning in located.warnings:
+            warn(warning if warning.startswith(words) else f"{words}: {warning}")
 
 
-def _line(located: Located) -> str:
-    place = ", ".join(f"{value:.2f}" for value in 1e3 * located.p_base)
-    sigmas = ", ".join(figure(float(value)) for value in located.sigma_mm)
-    largest_mm = figure(located.budget_mm[located.largest])
-    return (
-        f"({place}) mm, sigma ({sigmas}) mm, 95 % within {figure(located.radius95_mm)} mm; "
-        f"largest source: {located.largest}, {largest_mm} mm"
-    )
-
-
-def _document(point: _Point) -> dict[str, Any]:
-    located = point.located
+def _document(located: Located) -> dict[str, Any]:
     return {
-        **point.document,
         "p_base_m": located.p_base.tolist(),
         "covariance": located.covariance.tolist(),
         "sigma_mm": located.sigma_mm.tolist(),

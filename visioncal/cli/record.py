@@ -141,7 +141,7 @@ def _opened(options: RecordOptions, *, is_moved: bool) -> Iterator[LiveCell]:
                 next_step="Guide it by hand: --follow.",
             )
         with closing(open_camera(options.camera, requested)) as camera:
-            yield LiveCell(arm, (camera,), HostClock())
+            yield LiveCell(arm, camera, HostClock())
 
 
 def say_line(step: CaptureEvent) -> None:

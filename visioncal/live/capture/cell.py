@@ -52,16 +52,11 @@ class HostClock:
 
 @dataclass(frozen=True, eq=False)
 class LiveCell:
-    """An arm, the cameras beside it, and the clock by which they stamp."""
+    """An arm, the camera on it or beside it, and the clock by which they stamp."""
 
     arm: Arm
-    cameras: tuple[CameraDevice, ...] = ()  # None where the arm is driven without looking.
+    camera: CameraDevice
     clock: Clock = field(default_factory=HostClock)
-
-    @property
-    def camera(self) -> CameraDevice:
-        """The camera that is recorded."""
-        return self.cameras[0]
 
     def state(self) -> ArmState:
         """Reads the arm's state.

@@ -165,7 +165,7 @@ class Bench:
             self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=_RATE_HZ
         )
         with closing(UrArm(self.controller.host)) as arm:
-            yield LiveCell(arm, (camera,))
+            yield LiveCell(arm, camera)
 
     def close(self) -> None:
         """Ends the controller."""
