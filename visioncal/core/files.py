@@ -29,10 +29,7 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
     """Writes a file atomically: readers see the old content or the new one, never a part.
 
     Text is written as UTF-8 with unchanged line ends. If the process is killed, a temporary file
-    stays in the folder until the next write there.
-
-    Raises:
-        DataError: The folder is missing or cannot be written.
+    stays in the folder until the next write there. Raises DataError.
     """
     with replacing_file(Path(path)) as aside, aside.open("wb") as file:
         file.write(data.encode("utf-8") if isinstance(data, str) else data)
@@ -308,13 +305,10 @@ def find_described(
     suffixes: tuple[str, ...],
     folder: Path | None,
 ) -> Path:
-    """Finds the file that describes a board or a robot (`what`, for messages).
+    """Finds the file that describes a board or a robot (`what`, for messages); raises DataError.
 
     It is a built-in one of `shipped`, or a path that ends in one of `suffixes`, relative to the
     folder or, where None, to the working directory.
-
-    Raises:
-        DataError: The name is unknown or the file does not exist.
     """
     if name_or_path.lower().endswith(suffixes):
         path = Path(name_or_path.replace("\\", "/"))

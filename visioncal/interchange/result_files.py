@@ -180,14 +180,10 @@ def rewrite_result(folder: Path, calibration: Calibration) -> Written:
 
     Session and evidence come from the recording in the folder, whose images are kept byte for byte.
     Without a recording that belongs to the result, none is written, and the report says what is
-    missing.
+    missing. Raises DataError.
 
     Returns:
         The files that were written: without the recording where there was none to extend.
-
-    Raises:
-        DataError: The folder has no result, one of another session, or cannot be written; the files
-            in it are unchanged.
     """
     stored = load_stored(folder)
     if stored.calibration.session_sha256 != calibration.session_sha256:
@@ -240,10 +236,7 @@ class EndangeredFrames:
 def frames_to_keep(folder: Path) -> EndangeredFrames | None:
     """Finds the frames that a new result in a folder would lose; None where there are none.
 
-    An unreadable result is no error: it has nothing to lose.
-
-    Raises:
-        DataError: The file of frames there cannot be read, nor be replaced.
+    An unreadable result is no error: it has nothing to lose. Raises DataError.
     """
     file = folder / CALIBRATION
     try:

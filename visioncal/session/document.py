@@ -261,13 +261,9 @@ class Declaration(TableModel):
 def read_declaration(
     document: Mapping[str, Any], label: str, *, observed: bool = True
 ) -> Declaration:
-    """Checks the content of a session.toml, named `label` in messages.
+    """Checks the content of a session.toml, named `label` in messages; raises DataError.
 
     `observed` says whether there are views, which need something that observed them.
-
-    Raises:
-        DataError: A field is missing, of another type, out of range, or contradicts another; the
-            message names all of them by their dotted paths.
     """
     hints: list[str] = []
     try:

@@ -49,16 +49,13 @@ def robots_of(
 def resolve_frames(
     declaration: Declaration, views: Sequence[View], robots: Iterable[str]
 ) -> dict[str, str]:
-    """Determines the parent of each frame.
+    """Determines the parent of each frame; raises DataError.
 
     Fixtures and other frames without own motion are skipped: parents are flanges, bases or the
     cell.
 
     Returns:
         The parent of every frame but `cell`, by the frame's name.
-
-    Raises:
-        DataError: The declaration contradicts itself, or a parent is neither declared nor inferred.
     """
     return _DeclaredTree(declaration, tuple(views), tuple(robots)).resolved()
 

@@ -215,10 +215,7 @@ def read_targets(
     """Declared targets by name, empty for the only one, and their document, of several by name.
 
     Relative paths are below the folder or, where None, the working directory; `document` has the
-    contents in the same form, if they are read already.
-
-    Raises:
-        DataError: There is no such target, or its description is wrong.
+    contents in the same form, if they are read already. Raises DataError.
     """
     paths = _declared_targets(declaration)
     is_only = len(paths) == 1

@@ -48,10 +48,7 @@ def parse_table(text: str, label: str) -> TextTable:
 
     Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
     commas are read as points, as many spreadsheets write them. Empty columns at the end are
-    dropped. Rows may differ in length; an empty text has no columns.
-
-    Raises:
-        DataError: Its quotes do not close.
+    dropped. Rows may differ in length; an empty text has no columns. Raises DataError.
     """
     header = text.lstrip().partition("\n")[0]
     separator = next((name for name in ";\t" if name in header and "," not in header), ",")
@@ -100,11 +97,7 @@ def read_table(path: Path) -> TextTable:
     Without a header row, a comment right before the first row is the header if it has one word per
     column after any colon; a first line such as `sep=;` declares the separator. With semicolons or
     tabs, decimal commas are read as points. Rows may be lists in brackets, with a name before them.
-    Empty rows and empty trailing columns are ignored.
-
-    Raises:
-        DataError: It is missing, no text, too large, empty, its rows differ in length, or two
-            columns have the same name.
+    Empty rows and empty trailing columns are ignored. Raises DataError.
     """
     text, where = read_plain_text(path), str(path)
     if sum(map(text.count, ";\t,\n\r ")) > MAX_VALUES:

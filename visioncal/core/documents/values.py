@@ -21,10 +21,7 @@ _SHOWN = 60  # characters of a value in a message
 def read_plain_text(path: Path) -> str:
     """Reads a bounded text file in UTF-8, UTF-16 with its mark, or otherwise Windows-1252.
 
-    Numbers read the same in Windows-1252 and similar encodings of spreadsheets.
-
-    Raises:
-        DataError: As `read_bytes`, or it has NUL bytes, as binary files do.
+    Numbers read the same in Windows-1252 and similar encodings of spreadsheets. Raises DataError.
     """
     data = read_bytes(path)
     if data.startswith(UTF16_MARKS):
@@ -84,14 +81,11 @@ def mapping(value: object, where: str) -> Mapping[str, Any]:
 
 
 def matrix_from(value: object, where: str) -> FloatArray:
-    """Builds a matrix from OpenCV's rows, cols (or sizes), dt and data.
+    """Builds a matrix from OpenCV's rows, cols (or sizes), dt and data; raises DataError.
 
     Returns:
         (rows, cols) numbers, (rows, cols, channels) where dt names several channels, or an array
         of the stated sizes.
-
-    Raises:
-        DataError: A field is missing, or the number of data does not match the size.
     """
     content = mapping(value, where)
     data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)

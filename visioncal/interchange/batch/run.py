@@ -61,15 +61,12 @@ class Job:
 
 
 def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list[Job]:
-    """One job a session, in their natural order.
+    """One job a session, in their natural order; raises DataError.
 
     Sessions are folders, recordings, folders of sessions, or globs.
 
     Returns:
         The jobs, named by their paths below the folder that all sessions share.
-
-    Raises:
-        DataError: There are no sessions, a glob finds none, or two would have one name.
     """
     by_argument = {str(session): [*_sessions_of(str(session))] for session in sessions}
     empty = [name for name, found in by_argument.items() if not found]

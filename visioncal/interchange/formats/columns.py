@@ -61,10 +61,7 @@ def foreign_from(
 ) -> ForeignRecording:
     """Builds a recording from rows of named values, by their names or the user's options.
 
-    `images` is the folder of the images, where the source is one.
-
-    Raises:
-        DataError: It has neither poses nor joint angles.
+    `images` is the folder of the images, where the source is one. Raises DataError.
     """
     unnamed = unnamed_columns(fields)
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)

@@ -63,11 +63,8 @@ def images_named(
 ) -> tuple[Path | None, ...]:
     """(n,) paths of the images that rows name; of a missing image the one that the source states.
 
-    Names are relative to `base`, or to the folder `images` in it; in `folder`, if given, images
-    are matched by their names, else by the numbers in these.
-
-    Raises:
-        DataError: A name leaves the folder, or is not an image's.
+    Names are relative to `base`, or to the folder `images` in it; in `folder`, if given, images are
+    matched by their names, else by the numbers in these. Raises DataError.
     """
     images = () if folder is None else _images_in(folder)
     by_name = {item.stem: item for item in images} | {item.name: item for item in images}
@@ -113,10 +110,7 @@ def images_beside(
     """Pairs rows with the images of `chosen`, else with any in `folder`, and notes assumptions.
 
     With `numbered` the rows' numbers are from the source's names, as are the images'; otherwise
-    both are paired in natural order, and their counts must agree.
-
-    Raises:
-        DataError: `chosen` has no images, or not as many as there are rows.
+    both are paired in natural order, and their counts must agree. Raises DataError.
     """
     if chosen is None and not any(is_image_name(path.name) for path in files_in(folder)):
         return (), ()

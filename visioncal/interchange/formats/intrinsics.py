@@ -90,7 +90,7 @@ _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "br
 
 
 def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Reads the intrinsics of a camera.
+    """Reads the intrinsics of a camera; raises DataError.
 
     Supports ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
     ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
@@ -98,9 +98,6 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
 
     Returns:
         model, matrix, distortion, and resolution where the file has it; and notes on assumptions.
-
-    Raises:
-        DataError: It is none of these, or has an unknown lens model.
     """
     if path.suffix.lower() == ".npz":
         return intrinsics_from(read_arrays(path), str(path))

@@ -200,10 +200,7 @@ def pose_names(
     """Full names of the fields with the poses of the `robot` or `camera`; empty where none fit.
 
     They are those that the user gives, else the `unnamed` columns of a table without a header, else
-    fields with a known name that are not `taken`.
-
-    Raises:
-        DataError: The user names a field that does not exist.
+    fields with a known name that are not `taken`. Raises DataError.
     """
     if given:
         return tuple(fields.find(name) for name in given)
@@ -220,10 +217,8 @@ def poses_from(
 
     16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 are its
     upper three rows, or a position and a rotation by rows, whichever gives rotations; otherwise a
-    position of three numbers and a rotation, ordered as names such as rvec and tvec show.
-
-    Raises:
-        DataError: There are no such fields, or their numbers are no poses.
+    position of three numbers and a rotation, ordered as names such as rvec and tvec show. Raises
+    DataError.
     """
     if whose == "robot" and fields.form:
         # The rows themselves state the form of their poses.
@@ -330,12 +325,9 @@ def joints_from(
 def check_radians(
     poses: PoseNumbers, requested: PoseImportOptions, whose: str, *, guesses: bool = True
 ) -> None:
-    """Checks that angles of unstated unit can be radians.
+    """Checks that angles of unstated unit can be radians; raises DataError.
 
     `guesses` says whether the command can try other readings, which the message then suggests.
-
-    Raises:
-        DataError: An angle exceeds one turn.
     """
     there, rotation = poses.present, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")

@@ -125,12 +125,9 @@ def convert(
 def read_foreign(
     source: Path, requested: ImportOptions, form: str | None = None
 ) -> ForeignRecording:
-    """Reads a foreign recording with the user's options applied.
+    """Reads a foreign recording with the user's options applied; raises DataError.
 
     Its format is recognised unless `form` names it.
-
-    Raises:
-        DataError: Its format is unknown, or something in it is wrong.
     """
     # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)

@@ -88,10 +88,7 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
     """Loads a session for rereading, even where its poses or its board's size are invalid.
 
     A board too large for metres is read in millimetres; positions and rotations may be in columns
-    or forms that sessions do not have.
-
-    Raises:
-        DataError: It is no session.
+    or forms that sessions do not have. Raises DataError.
     """
     plain, robot = _other_columns(path) or (None, None)
     file = path / "session.toml"
@@ -157,11 +154,7 @@ def reread(
 ) -> Session:
     """Applies a candidate reading to a session's poses; everything else stays the same.
 
-    The session notes the changes in `corrected`.
-
-    Raises:
-        DataError: The resulting session is invalid; or the reading changes the robot's poses where
-            only joint angles are recorded, or mirrors them without permission.
+    The session notes the changes in `corrected`. Raises DataError.
     """
     session = doubtful.session
     changes: tuple[str, ...] = ()
