@@ -79,9 +79,17 @@ _MATRIX_KEYS = (
     *("K", "k", "mtx", "M1", "intrinsic"),
 )
 _DISTORTION_KEYS = (
-    *("distortion_coefficients", "dist_coeffs", "distCoeffs", "distortion", "dist"),
+    *(
+        "distortion_coefficients",
+        "distortion_coeffs",
+        "dist_coeffs",
+        "distCoeffs",
+        "distortion",
+        "dist",
+    ),
     *("D", "d", "D1"),
 )
+_FOUR = ("fx", "fy", "cx", "cy")
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 # Largest skew relative to the focal length; more is another camera model.
 _MOST_SKEW = 1e-6
@@ -111,39 +119,38 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
 def intrinsics_from(
     content: Mapping[str, Any], where: str
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Reads the intrinsics from a document, as `read_intrinsics` does from a file.
-
-    Raises:
-        DataError: It has none.
-    """
+    """Reads the intrinsics from a document, as `read_intrinsics` does from a file."""
     if "cam0" in content:
-        return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
+        where = f"{where}: cam0"
+        content = mapping(content["cam0"], where)
     inner = content.get("intrinsics")
     if isinstance(inner, Mapping):
         return intrinsics_from(inner, f"{where}: intrinsics")
-    if {"fx", "fy", "cx", "cy"} <= content.keys():
-        values = [number(content[name], f"{where}: {name}") for name in ("fx", "fy", "cx", "cy")]
-        return _lens("brown", values, [], content, where), ()
     key = next((key for key in _MATRIX_KEYS if key in content), None)
-    if key is None:
+    if {*_FOUR} <= content.keys():
+        matrix = [number(content[name], f"{where}: {name}") for name in _FOUR]
+    elif key is not None:
+        k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
+        matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+    else:
+        # Kalibr's camchain (Kalibr wiki, "Yaml formats").
+        matrix = as_numbers(inner or [], f"{where}: intrinsics").reshape(-1).tolist()
+    if len(matrix) != 4 or content.get("camera_model", "pinhole") != "pinhole":
         raise DataError(
-            f"{where} has no camera matrix; it has {', '.join(map(str, list(content)[:20]))}.",
+            f"{where}: the camera matrix of a pinhole is needed; there are "
+            f"{', '.join(map(str, list(content)[:20]))}.",
             culprits=[where],
             next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
         )
-    k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
     coefficients: object = next((content[key] for key in _DISTORTION_KEYS if key in content), [])
-    flat = _array(coefficients, f"{where}: distortion").reshape(-1)
+    flat = _array(coefficients, f"{where}: distortion").reshape(-1).tolist()
     notes: tuple[str, ...] = ()
     if len(flat) == 4 and "distortion_model" not in content:
         notes = (
             f"{where}: four distortion coefficients without a model are taken for k1, k2, p1, p2; "
             "OpenCV's fisheye model has four as well.",
         )
-    model = _model(str(content.get("distortion_model", "plumb_bob")), where)
-    matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
-    lens = _lens(model, matrix, list(flat), content, where)
-    return lens, notes
+    return _lens(matrix, flat, content, where), notes
 
 
 def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
@@ -171,37 +178,6 @@ def _array(value: object, where: str) -> FloatArray:
     return as_numbers(value, where)
 
 
-def _model(name: str, where: str) -> str:
-    if name.lower() in _FISHEYE:
-        return "fisheye"
-    if name.lower() in _BROWN:
-        return "brown"
-    raise DataError(
-        f"{where}: the lens model {name[:40]!r} is not known; {', '.join(_BROWN + _FISHEYE)} are.",
-        culprits=[where],
-        next_step="Leave it out with --intrinsics estimate.",
-    )
-
-
-def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Reads Kalibr's camchain (Kalibr wiki, "Yaml formats"): pinhole with radtan or equidistant."""
-    if content.get("camera_model", "pinhole") != "pinhole":
-        raise DataError(
-            f"{where}: the camera model {str(content['camera_model'])[:40]!r} is not known; "
-            "pinhole is needed.",
-            culprits=[where],
-        )
-    values = as_numbers(content.get("intrinsics"), f"{where}: intrinsics").reshape(-1)
-    if len(values) != 4:
-        raise DataError(
-            f"{where}: intrinsics has {len(values)} numbers; fu, fv, pu, pv are needed.",
-            culprits=[where],
-        )
-    flat = as_numbers(content.get("distortion_coeffs", []), f"{where}: distortion_coeffs")
-    model = _model(str(content.get("distortion_model", "none")), where)
-    return _lens(model, list(values), list(flat.reshape(-1)), content, where)
-
-
 def _visp(root: Element, where: str) -> dict[str, Any]:
     """Reads ViSP's camera XML (ViSP, vpCameraParameters)."""
     # Its k_ud maps undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
@@ -224,35 +200,29 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
 
     values = [read(model, name) for name in ("px", "py", "u0", "v0")]
     size = {"width": read(camera, "image_width", 0.0), "height": read(camera, "image_height", 0.0)}
-    return _lens("brown", values, [read(model, "kud", 0.0)], size if size["width"] else {}, where)
+    return _lens(values, [read(model, "kud", 0.0)], size if size["width"] else {}, where)
 
 
 def _lens(
-    model: str,
-    matrix: list[float],
-    coefficients: list[float],
-    content: Mapping[str, Any],
-    where: str,
+    matrix: list[float], coefficients: list[float], content: Mapping[str, Any], where: str
 ) -> dict[str, Any]:
-    if not (matrix[0] > 0 and matrix[1] > 0):
-        raise DataError(
-            f"{where}: the focal lengths are {matrix[0]:g} and {matrix[1]:g} px; both must be "
-            "above 0.",
-            culprits=[where],
-        )
+    name = str(content.get("distortion_model", "none")).lower()
+    model = "fisheye" if name in _FISHEYE else "brown"
     count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
-    beyond = [coefficient for coefficient in coefficients[count:] if coefficient]
-    values = np.array([*matrix, *coefficients])
-    if not np.isfinite(values).all() or beyond:
-        what = f"{len(coefficients)} coefficients" if beyond else "a number that is not finite"
-        raise DataError(
-            f"{where}: {what}; up to {count} of the {model} model are known here.", culprits=[where]
-        )
-    padded = (coefficients + [0.0] * count)[:count]
+    fault = ""
+    if name not in (*_FISHEYE, *_BROWN):
+        fault = f"the lens model {name[:40]!r} is not known; {', '.join(_BROWN + _FISHEYE)} are"
+    elif any(coefficients[count:]) or not np.isfinite([*matrix, *coefficients]).all():
+        fault = f"{len(coefficients)} coefficients; up to {count} finite ones are known here"
+    elif not (matrix[0] > 0 and matrix[1] > 0):
+        fault = f"the focal lengths are {matrix[0]:g} and {matrix[1]:g} px; both must be above 0"
+    if fault:
+        step = "Leave it out with --intrinsics estimate."
+        raise DataError(f"{where}: {fault}.", culprits=[where], next_step=step)
     lens: dict[str, Any] = {
         "model": model,
         "matrix": [float(value) for value in matrix],
-        "distortion": [float(value) for value in padded],
+        "distortion": [float(value) for value in (coefficients + [0.0] * count)[:count]],
     }
     size = _size(content, where)
     return lens | ({"resolution": list(size)} if size else {})

@@ -304,22 +304,20 @@ def joints_from(
     """
     joints = np.hstack([fields.column(name) for name in names])
     bad = ~np.isfinite(joints).all(axis=1)
-    if bad.any():
+    ends, largest = (
+        [name.rsplit(".", 1)[-1].lower() for name in names],
+        np.abs(joints).max(initial=0),
+    )
+    is_named = degrees or all(any(unit in end for unit in _DEGREES) for end in ends)
+    is_large = not is_named and bool(largest > _MOST_TURNS_RAD)
+    fault = "a joint angle is missing or infinite" if bad.any() else ""
+    if is_large and any("rad" in end for end in ends):
+        fault = f"joint angles up to {largest:.0f} are no radians: say --joint-unit deg"
+    if fault:
         place = fields.places[int(np.argmax(bad))]
-        raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
-    ends = [name.rsplit(".", 1)[-1].lower() for name in names]
-    if degrees or all(any(unit in end for unit in _DEGREES) for end in ends):
-        return np.deg2rad(joints), ()
-    if (largest := np.abs(joints).max(initial=0.0)) > _MOST_TURNS_RAD:
-        words = f"Joint angles up to {largest:.0f} are no radians"
-        if any("rad" in end for end in ends):
-            raise DataError(
-                f"{fields.name}: {words.lower()}.",
-                culprits=list(names),
-                next_step="Say --joint-unit deg.",
-            )
-        return np.deg2rad(joints), (f"{words}, and are taken for degrees.",)
-    return joints, ()
+        raise DataError(f"{place}: {fault}.", culprits=[place])
+    note = f"Joint angles up to {largest:.0f} are no radians, and are taken for degrees."
+    return np.deg2rad(joints) if is_named or is_large else joints, (note,) if is_large else ()
 
 
 def check_radians(
@@ -337,11 +335,10 @@ def check_radians(
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
     if is_degrees or largest[row] > _MOST_RAD:
-        what = "angles in degrees" if is_degrees else f"an angle of {largest[row]:.4g}"
+        size = "in degrees" if is_degrees else "too large for radians"
         raise DataError(
-            f"{poses.places[row]}: the {whose}'s rotation has {what}"
-            + ("" if is_degrees else ", too large for radians")
-            + ("." if requested.form else ", and the source does not say what it is."),
+            f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
+            f"{size}, and its form is needed.",
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
             "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
