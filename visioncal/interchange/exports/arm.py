@@ -5,6 +5,7 @@ What a format cannot hold of the arm is said in its comments and warnings.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,11 +59,18 @@ class ArmContent:
         """The arm whose links and offsets are written."""
         return self.robot if self.links is None else self.links[0]
 
-    @property
+    @cached_property
     def omitted(self) -> tuple[str, ...]:
-        """Bending and thermal drift that no file holds, with their size."""
-        omitted, source = [], self.calibration
-        if (sag_mm := _sag_mm(source)) and self.links is None:
+        """What the file leaves out of the arm, with its size."""
+        omitted, source, sag_mm = [], self.calibration, _sag_mm(self.calibration)
+        if self.links is not None:
+            missing = [*unexportable_functions(self.robot)]
+            missing += ["its joints bend under its own weight, and under a load"] * bool(sag_mm)
+            omitted.append(
+                f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
+                f"Its links and offsets are those that leave the least of that: {self.links[1]}"
+            )
+        elif sag_mm:
             omitted.append(
                 "its joints bend under load, which has no place in it: this is the arm without "
                 f"weight. Under its own it stands off by up to {sag_mm:.2g} mm (visioncal correct "
@@ -82,7 +90,7 @@ class ArmContent:
 
     @property
     def notes(self) -> list[str]:
-        """Comment lines: origin, quality, and what the arm belongs to."""
+        """Comment lines: origin, quality, what the arm belongs to, and what is left out."""
         source = self.calibration
         quality = f"verdict {source.verdict.status}"
         sigma_mm = None if source.arm is None else source.arm.workspace_sigma_mm
@@ -98,11 +106,6 @@ class ArmContent:
         ]
 
     @property
-    def all_notes(self) -> list[str]:
-        """Comment lines, with what links and offsets leave out."""
-        return [*self.notes, *filter(None, [self.left_out])]
-
-    @property
     def nominal_table(self) -> DHTable:
         """Joint table of the nominal arm, whose free choices that of the calibrated arm keeps."""
         if "convention" in self.nominal.document:
@@ -116,19 +119,6 @@ class ArmContent:
         if form is None:
             form = "hayati" if parallel_axes(self.nominal).any() else nominal.convention
         return table_of(without_functions(self.written), form, like=nominal)
-
-    @property
-    def left_out(self) -> str:
-        """What links and offsets alone leave out, with the resulting error; empty for nothing."""
-        if self.links is None:
-            return ""
-        missing = [*unexportable_functions(self.robot)]
-        if _sag_mm(self.calibration):
-            missing.append("its joints bend under its own weight, and under a load")
-        return (
-            f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. Its "
-            f"links and offsets are those that leave the least of that: {self.links[1]}"
-        )
 
 
 @dataclass(frozen=True)
@@ -202,8 +192,8 @@ _NO_HASH = "calib_visioncal"
 def _write_urdf(content: ArmContent) -> str:
     if "urdf" in content.nominal.document:
         robot = without_functions(content.written)
-        return corrected_urdf(content.nominal, robot, content.all_notes)
-    return small_urdf(without_functions(content.written), content.all_notes)
+        return corrected_urdf(content.nominal, robot, content.notes)
+    return small_urdf(without_functions(content.written), content.notes)
 
 
 def _warn_urdf(content: ArmContent) -> Iterator[str]:
@@ -245,7 +235,7 @@ ARMS = (
         "robot-dh",
         "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati "
         "[m, rad]",
-        lambda content: table_toml(content.table, "visioncal", content.all_notes),
+        lambda content: table_toml(content.table, "visioncal", content.notes),
         takes=frozenset({"convention"}),
     ),
     ArmFormat(
@@ -256,7 +246,7 @@ ARMS = (
             without_functions(content.written),
             calibration_hash=content.calibration_hash or _NO_HASH,
             like=content.nominal_table,
-            notes=content.all_notes,
+            notes=content.notes,
         ),
         takes=frozenset({"calibration_hash"}),
         warn=_warn_ur,

@@ -88,7 +88,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     source, selection = _robot_part(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
-        omitted = (f"{words}." for words in (arm.left_out, *arm.omitted) if words)
+        omitted = (f"{words}." for words in arm.omitted)
         return Document(form.write(arm), arm.calibration.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
         available = placements(source, selection.camera)
