@@ -197,7 +197,7 @@ def test_pictures_that_were_stored_anew_are_copies():
     found = calibrate(replace(session, views=views, corner_table=again))
     (finding,) = (one for one in found.verdict.findings if one.kind == "repeated_views")
     assert finding.views == tuple(range(6, 12))
-    assert finding.words.startswith("Views 6 to 11 repeat 0 to 5: ")
+    assert finding.words.startswith("Views 6-11 repeat 0-5: ")
 
 
 @pytest.mark.parametrize("seed", [0, slow(3)])

@@ -1,12 +1,13 @@
 """Calibrates a session, of one camera and robot or of a whole cell: the whole path, as a page."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Unpack
 
 from visioncal.calibration.pipeline.assessment import assess_fit
-from visioncal.calibration.pipeline.judging import check_answer, findings_of
+from visioncal.calibration.pipeline.explaining import explained
+from visioncal.calibration.pipeline.judging import check_answer, judge_run
 from visioncal.calibration.pipeline.reading import (
     check_joint_angles,
     put_on_one_clock,
@@ -22,7 +23,7 @@ from visioncal.calibration.pipeline.run_state import (
 from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.suspects.judge import judge
+from visioncal.calibration.suspects.misread_poses import with_open_chains
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.errors import VisioncalError
@@ -146,13 +147,6 @@ def _examine(state: RunState) -> RunState:
     return state.noting(Rejection(view.view, view.reason) for view in rejected)
 
 
-def _judge(state: RunState) -> RunState:
-    """Ranks the causes of what is unexplained, and compares picks with the need."""
-    findings = findings_of(state)
-    state = replace(state, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
-    return replace(state, findings=findings, verdict=judge(findings))
-
-
 STAGES: tuple[Stage, ...] = (
     Stage("robot", read_cell_inputs),
     Stage("detect", lambda state: detect_targets(state, state.given_corners)),
@@ -163,7 +157,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("joints", check_joint_angles),
     Stage("solve", _fit),
     Stage("examine", _examine),
-    Stage("judge", _judge),
+    Stage("judge", judge_run),
 )
 
 
@@ -172,27 +166,20 @@ def stages_before(name: str) -> tuple[Stage, ...]:
     return STAGES[: [stage.name for stage in STAGES].index(name)]
 
 
-def run_stages(state: RunState) -> RunState:
-    """Runs all stages; an error is raised with its likeliest cause where that is known."""
-    # Why a run fails is sought with the stages of other runs.
-    from visioncal.calibration.pipeline.explaining import (
-        explained,
-        sought_misreading,
-        with_likely_causes,
-    )
-
-    sought = None
+def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
+    """Runs stages; an error is raised with its likeliest cause where that is known."""
+    are_located = False
     with one_blas_thread():
-        for index, stage in enumerate(STAGES):
+        for index, stage in enumerate(stages):
             if state.progress is not None:
-                state.progress(stage.name, index, len(STAGES))
+                state.progress(stage.name, index, len(stages))
             try:
                 state = stage.run(state)
             except VisioncalError as error:
-                likely = explained(error, state, stage.name, sought)
+                likely = explained(error, state, stage.name, are_located=are_located)
                 if likely is error:
                     raise
                 raise likely from error
             if stage.name == "joints":
-                state, sought = sought_misreading(state)
-        return with_likely_causes(state, sought)
+                state, are_located = with_open_chains(state), True
+        return state

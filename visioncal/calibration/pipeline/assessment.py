@@ -180,7 +180,7 @@ def assess_fit(
         if not arm.is_modelled and arm.errors
     }
     steps: tuple[Step, ...] = ()
-    if not observed.is_misread:
+    if not observed.misread:
         converged = fit if is_fit else fit_problem(part, fit.state)
         steps = likely_steps(part, converged, errors, joint_offsets(cell_fit.arms))
         cell_fit = replace(cell_fit, arms=with_errors_beside_step(cell_fit.arms, part, fit, steps))

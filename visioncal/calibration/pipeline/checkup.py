@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.calibration.pipeline.misread_poses import misreadings, turned_boards
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.run import stages_before
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
+from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import counted, some_of

@@ -4,11 +4,7 @@ import numpy as np
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.clocks import waits_for_clock
-from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -75,24 +71,6 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     cells = [[view.numbers.get(name, np.nan) for name in columns] for view in session.views]
     numbers = np.array(cells, dtype=float)
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places_of(session))
-
-
-def with_camera_poses(run: RunState) -> RunState:
-    """Runs the stages that the camera's poses need, whatever the robot's poses are."""
-    names = {"detect", "intrinsics", "pnp"}
-    if waits_for_clock(run.session):
-        # The offset of a stream's clock is found by rotation angles, which no reading changes.
-        names |= {"robot", "clock"}
-    for stage in STAGES:
-        if stage.name in names:
-            try:
-                run = stage.run(run)
-            except VisioncalError as error:
-                cause = unseen_cause(run)
-                if cause is None:
-                    raise
-                raise because(error, cause) from error
-    return run
 
 
 def _camera_numbers(run: RunState) -> PoseNumbers:

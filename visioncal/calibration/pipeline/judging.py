@@ -11,13 +11,16 @@ from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.need import PickInputs, predict_picks
+from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import (
     Findings,
     JudgedArm,
     JudgedPair,
     Sensor,
 )
+from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
 from visioncal.calibration.suspects.registry import found_in
+from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of
@@ -36,6 +39,21 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
+
+
+def judge_run(state: RunState) -> RunState:
+    """Ranks the causes of what is unexplained, and compares picks with the need."""
+    findings = findings_of(state)
+    verdict = judge(findings)
+    # Exchanged rows show themselves; other poses that are misread explain what follows.
+    if verdict.status != "good" and [cause.kind for cause in verdict.causes[:1]] != [EXCHANGED]:
+        state = with_misreading(state)
+        if state.misread:
+            rest = (found for found in findings.warnings if found.kind not in BY_CHAIN)
+            findings = replace(findings, warnings=(*state.misread, *rest))
+            verdict = judge(findings)
+    state = replace(state, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
+    return replace(state, findings=findings, verdict=verdict)
 
 
 def findings_of(run: RunState) -> Findings:
@@ -249,7 +267,7 @@ def check_answer(run: RunState) -> None:
         DegenerateError: A direction of a frame is undetermined, or its predicted sigma exceeds the
             limit.
     """
-    if run.is_misread and poor_motion(run) is None:
+    if run.misread and poor_motion(run) is None:
         # With misread poses, sigmas predicted at their fit say nothing of the motion.
         return
     part, fit, seen = run.cell_fit.inlier_problem, run.cell_fit.inlier_fit.fit, None

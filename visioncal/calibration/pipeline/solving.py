@@ -87,7 +87,7 @@ def solve(
         cell_fit = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
-        if start.cell.mount is not None and not observed.is_misread:
+        if start.cell.mount is not None and not observed.misread:
             noise = starting_noise(start.problem)
             words = chain_words(start.problem, start.cell.mount)
             check_determined(start.problem, start.state, noise, words, only_open=True)
@@ -98,7 +98,7 @@ def solve(
 def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
-    misread = observed.is_misread
+    misread = observed.misread
     inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
     initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)

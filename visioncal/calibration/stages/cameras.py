@@ -11,10 +11,10 @@ from visioncal.calibration.stages.detect import Detections, detect, image_of
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
-from visioncal.calibration.stages.repeats import listed, with_stop_means, without_repeats
+from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import VisioncalError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Corners, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.results import CameraResult
@@ -114,7 +114,7 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         for view, at in found.items()
     }
     note = (
-        f"The corners of view {listed(tuple(found))} are by all pixels of their images (--dense), "
+        f"The corners of view {ranges(found)} are by all pixels of their images (--dense), "
         "as these are blurred."
     )
     dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))

@@ -66,9 +66,9 @@ class Observed:
     dense: "Mapping[int, DenseCorners] | None" = None
     pictures: bool = False  # Whether faint copies of the images are kept.
     searches: Mapping[int, Searched] = field(default_factory=dict)  # Of each image, by view.
-    # Whether robots' poses are clearly misread, so that they determine nothing of lenses and
-    # boards.
-    is_misread: bool = False
+    # How robots' poses are misread, so that they determine nothing of lenses and boards; None where
+    # this was not sought.
+    misread: tuple[Finding, ...] | None = None
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""

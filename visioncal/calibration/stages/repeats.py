@@ -3,7 +3,6 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy.spatial import cKDTree
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import ranges
 from visioncal.core.types import Corners, FloatArray
 from visioncal.core.verdict import LEAST_NEED_MM, Finding, Remedy
 from visioncal.session import Session, View
@@ -44,7 +43,7 @@ def without_repeats(seen: T) -> T:
     for frame, look in seen.cameras.items():
         unique = {view: px for view, px in look.corners.items() if view not in repeated}
         seen = seen.with_camera(frame, replace(look, corners=unique))
-    views, originals = listed([*repeated]), listed([*dict.fromkeys(repeated.values())])
+    views, originals = ranges(repeated), ranges(dict.fromkeys(repeated.values()))
     # Readings may be of another time that is not stated.
     finding = Finding(
         "repeated_views" if seen.corners else "repeated_readings",
@@ -190,10 +189,3 @@ def _others(row: View) -> frozenset[tuple[str, float]]:
         for name, value in row.numbers.items()
         if name not in compared and not name.startswith("meas_")
     )
-
-
-def listed(views: Sequence[int]) -> str:
-    """View numbers in words; consecutive ones as a range."""
-    if len(views) > 2 and all(after == before + 1 for before, after in pairwise(views)):
-        return f"{views[0]} to {views[-1]}"
-    return some_of([str(view) for view in views])

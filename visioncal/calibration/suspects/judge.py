@@ -9,7 +9,6 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.judged import Findings
 from visioncal.calibration.suspects.limits import (
     collect_findings,
-    is_scattered,
     remedy_for_uncertainty,
 )
 from visioncal.calibration.suspects.ranking import correcting, is_negligible, rank_causes
@@ -69,7 +68,6 @@ def judge(findings: Findings) -> Verdict:
                 met,
                 more=remedy_for_uncertainty(findings),
                 left_out_mm=findings.held_out.mm,
-                is_scattered=is_scattered(findings),
             )
         ]
     if met is not None:

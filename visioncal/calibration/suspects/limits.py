@@ -52,11 +52,6 @@ def collect_findings(judged: Findings) -> list[Finding]:
     ]
 
 
-def is_scattered(judged: Findings) -> bool:
-    """Whether views disagree with each other by more than in a sound cell."""
-    return any(_scatter(judged))
-
-
 def _ratio(first: Rms, second: Rms) -> float:
     """The largest ratio of two residuals, of position and of rotation; 0 where all are rounding."""
     pairs = [(first.mm, second.mm), (first.deg or 0.0, second.deg or 0.0)]
@@ -255,18 +250,21 @@ def _lost_views(sensor: Sensor) -> Iterator[Finding]:
     count, (check, bad) = len(sensor.lost), _LIMITS.lost_share
     total = sensor.used + sensor.spared + count
     share = count / max(total, 1)
-    if share <= check:
-        return
-    others = [rejection for rejection in sensor.lost if rejection.view not in sensor.outliers]
-    words, step = f"{count} of {total} views {'is' if count == 1 else 'are'} not used.", None
     # Outliers have a finding of their own.
-    if others:
-        words += f" The first but for outliers: view {others[0].view}, {others[0].reason}."
-        advice = "Correct the first of them and those like it, or repeat what is missing."
-        step = Remedy(advice, look_at(others[0].view))
-    kind = "lost_views" if others else "left_out"
-    views = tuple(rejection.view for rejection in sensor.lost)
-    yield Finding(kind, words, step, views, is_fatal=share > bad)
+    others = [rejection for rejection in sensor.lost if rejection.view not in sensor.outliers]
+    if share <= check or not others:
+        return
+    yield Finding(
+        "lost_views",
+        f"{count} of {total} views {'is' if count == 1 else 'are'} not used. The first but for "
+        f"outliers: view {others[0].view}, {others[0].reason}.",
+        Remedy(
+            "Correct the first of them and those like it, or repeat what is missing.",
+            look_at(others[0].view),
+        ),
+        tuple(rejection.view for rejection in sensor.lost),
+        is_fatal=share > bad,
+    )
 
 
 def _corner_noise(sensor: Sensor) -> Iterator[Finding]:

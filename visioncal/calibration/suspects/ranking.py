@@ -26,11 +26,11 @@ from scipy.special import expit, log_ndtr, logit
 from visioncal.calibration.stages.need import CONTROLLER, Picks
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.registry import SUSPECTS
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, EXCHANGED, FACT, UNEXPLAINED
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, FACT, UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Need
-from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy, Verdict
+from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy
 from visioncal.results import NeedMet
 
 # Least logarithm of a false-alarm probability.
@@ -98,25 +98,6 @@ def add_views_remedy(words: str, *, modelled: bool, purpose: str = "", count: in
     return Remedy(f"{words} {model}")
 
 
-def explained_by(verdict: Verdict, found: Finding) -> Verdict:
-    """Verdict in which a cause comes first that explains others: misread poses, another board."""
-    if verdict.causes and verdict.causes[0].kind == EXCHANGED:
-        # The views themselves show the exchange; the finding's command undoes it.
-        return verdict
-    suspect = SUSPECTS[found.kind]
-    log_odds = _log_odds(Finding(found.kind, ""))
-    rest = [finding for finding in verdict.findings if finding.kind not in suspect.hides]
-    if suspect.chance > FACT:
-        # What the views show otherwise may be due to it, too.
-        rest = [
-            replace(finding, probability=finding.probability * expit(-log_odds), do=None)
-            for finding in rest
-            if finding.words not in found.words
-        ]
-    cause = replace(found, probability=float(expit(log_odds)), by_limit=True)
-    return replace(verdict, findings=(cause, *rest))
-
-
 def rank_causes(
     doubts: Sequence[Finding],
     picks: Sequence[Picks],
@@ -124,7 +105,6 @@ def rank_causes(
     *,
     more: Remedy | None = None,
     left_out_mm: float = 0.0,
-    is_scattered: bool = False,
 ) -> tuple[Finding, ...]:
     """Ranks findings by their probability of being the cause, and adds too large error sources.
 
@@ -134,7 +114,6 @@ def rank_causes(
         met: The required accuracy and the probability of meeting it; None where none is stated.
         more: Remedy that makes the calibration less uncertain.
         left_out_mm: Disagreement of left-out views [mm].
-        is_scattered: Whether that is more than in a sound cell.
 
     Raises:
         KeyError: A kind is not in the catalogue.
@@ -147,7 +126,7 @@ def rank_causes(
     decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
     too_large = any(pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks)
-    is_sized = is_scattered or any(doubt.until_mm == 0.0 for doubt in doubts)
+    is_sized = any(doubt.until_mm == 0.0 or doubt.kind == UNEXPLAINED for doubt in doubts)
     if picks and not decides and (unmet or (met is None and too_large and is_sized)):
         causes = {finding.kind for finding in found if finding.probability}
         known = causes.union(*(SUSPECTS[kind].inflates for kind in causes))

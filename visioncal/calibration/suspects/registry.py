@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.priors import components
 from visioncal.calibration.suspects import (
     arm,
@@ -12,6 +13,7 @@ from visioncal.calibration.suspects import (
     growing,
     lens,
     mirrored_cell,
+    misread_poses,
     rounded_poses,
     steps,
 )
@@ -21,6 +23,8 @@ from visioncal.calibration.suspects.suspect import (
     EXCHANGED,
     FACT,
     REMARK,
+    SOURCES,
+    STEPS,
     UNEXPLAINED,
     Suspect,
 )
@@ -54,20 +58,11 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
             yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
-# Sources of the errors of picks, whose probability is their share.
-SOURCES = (
-    "calibration",
-    "unmeasured_board",
-    "robot_noise",
-    "robot_noise_of_pick",
-    "uncorrected_targets",
-)
-_STEPS = ("moved_at_once", "joint_slipped", "board_changed")
-# Findings measured through the robot, which mean nothing where its poses are misread.
-_BY_CHAIN = (
-    *("good_for", *SOURCES, *_STEPS, ARM_ERRORS, "prior"),
-    *("board_size", "board_shape", "lens", "lens_field", "corner_noise"),
-)
+def _unseen(run: RunState) -> Iterator[Finding]:
+    cause = unseen_cause(run) if run.reasons else None
+    if cause is not None and cause.kind == "other_board":
+        yield cause
+
 
 _ENTRIES: tuple[Suspect, ...] = (
     # Views.
@@ -100,20 +95,20 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("repeated_views", chance=FACT),
     Suspect("corner_numbers", chance=FACT),
     Suspect("rig_points", chance=FACT),
-    Suspect("other_board", chance=FACT, hides=("lost_views",)),
+    Suspect("other_board", _unseen, FACT, hides=("lost_views",)),
     Suspect("other_lens", chance=FACT),
     Suspect("lost_views", chance=REMARK),
-    *map(Suspect, ("left_out", "remark", "unused")),
+    *map(Suspect, ("remark", "unused")),
     Suspect("weak_lens", chance=REMARK),
     Suspect("corner_noise", chance=1e-4),
     # Conventions, clocks, joints.
-    Suspect("misread_poses", None, 1e-3, True, hides=_BY_CHAIN),
+    misread_poses.MISREAD_POSES,
     Suspect("misread_joints", None, 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     # The frames are by the poses, which a wrong model does not change.
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     *map(Suspect, ("contradicting_joints", "base_link", "tool_frame", "level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.
-    Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *_STEPS, ARM_ERRORS)),
+    Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *STEPS, ARM_ERRORS)),
     # The size of errors.
     Suspect(UNEXPLAINED, None, REMARK, True, size=3, order=1),
     Suspect("too_few_stops", chance=FACT),

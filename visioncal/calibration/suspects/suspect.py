@@ -13,6 +13,15 @@ if TYPE_CHECKING:
 ARM_ERRORS, EXCHANGED, UNEXPLAINED = "arm_errors", "exchanged_views", "unexplained"
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"
+STEPS = ("moved_at_once", "joint_slipped", "board_changed")
+# Sources of the errors of picks, whose probability is their share.
+SOURCES = (
+    "calibration",
+    "unmeasured_board",
+    "robot_noise",
+    "robot_noise_of_pick",
+    "uncorrected_targets",
+)
 # False-alarm probabilities of remarks, which no test is behind, and of facts.
 REMARK, FACT = 0.36787944117144233, 1e-12
 # What a change during the session inflates: errors by posture and time correlate before and after

@@ -13,9 +13,10 @@ from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
     numbers_in,
-    with_camera_poses,
 )
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES, run_stages
+from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError
@@ -80,7 +81,12 @@ class DoubtfulSession:
             DegenerateError: Too few views have both poses.
             ConvergenceError: The intrinsics do not converge.
         """
-        run = with_camera_poses(RunState(self.session, progress))
+        # What the camera's poses need, whatever the robot's are. The offset of a stream's clock is
+        # found by rotation angles, which no reading changes.
+        by_clock = {"robot", "clock"} if waits_for_clock(self.session) else set()
+        names = {"detect", "intrinsics", "pnp"} | by_clock
+        stages = [stage for stage in STAGES if stage.name in names]
+        run = run_stages(RunState(self.session, progress), stages)
         return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
 
 

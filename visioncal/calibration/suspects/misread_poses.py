@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -12,13 +13,13 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 
-_MISREAD = "misread_poses"
 # Robot and camera turn alike between two views where the angles differ by less [rad]; a robot that
 # moves by less stood still [m].
 _ALIKE_RAD, _STILL_M = 0.05, 1e-3
@@ -41,6 +42,21 @@ _UNRECORDED = Remedy(
     "views.csv of another run; and, where joint angles become poses, whether [robot] model in "
     "session.toml is this arm. Write into column image which file belongs to each row."
 )
+
+
+def with_misreading(run: RunState) -> RunState:
+    """The run with the likeliest misreading of its poses, once they are read; none where unlikely.
+
+    Misread joints were reported before: they would mislead this search.
+    """
+    return run if run.misread is not None else replace(run, misread=(*islice(misreadings(run), 1),))
+
+
+def with_open_chains(run: RunState) -> RunState:
+    """Looks for misread poses before the fit where chains do not close; notes turned boards."""
+    if run.mount is None or not closes(run):
+        run = with_misreading(run)
+    return run if run.misread else run.noting((), turned_boards(run))
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
@@ -79,7 +95,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         return
     if guess.stands_out:
         step = _MIRRORED if guess.best.hypothesis.robot.mirrored else READ_AGAIN
-        yield Finding(_MISREAD, guess.sentence, step)
+        yield Finding("misread_poses", guess.sentence, step)
     elif not guess.declared.fit.closes:
         yield from _unrecorded(run)
 
@@ -104,7 +120,7 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
         )
     else:
         return
-    yield Finding(_MISREAD, words, _UNRECORDED)
+    yield Finding("misread_poses", words, _UNRECORDED)
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:
@@ -164,3 +180,11 @@ def _both_sides(
     views = [view for view in sorted(seen) if view in base_from_flange]
     both = [(base_from_flange[view], seen[view].cam_from_target[0]) for view in views]
     return np.array(both).reshape(-1, 2, 4, 4)
+
+
+# Findings measured through the robot, which mean nothing where its poses are misread.
+BY_CHAIN = (
+    *(*STEPS, ARM_ERRORS, "prior"),
+    *("board_size", "board_shape", "lens", "lens_field", "corner_noise"),
+)
+MISREAD_POSES = Suspect("misread_poses", None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)
