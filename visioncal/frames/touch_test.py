@@ -47,8 +47,6 @@ class TouchTargets:
 
     points: tuple[TouchPoint, ...]
     board: Frame  # The board in the base, its z into it.
-    # (k, 3) all that is known beyond the flange, in its frame, the tip first [m].
-    parts_m: FloatArray
 
     def above(self, point: TouchPoint, height_m: float) -> FloatArray:
         """(4, 4) flange pose with the tip `height_m` above a point along the board's normal."""
@@ -92,7 +90,7 @@ def touch_targets(
         DataError: No image is usable; there is neither a tool nor a clearance; or something that is
             known on the flange would be in the board when the tip touches it.
     """
-    parts_m, extent_m = flange_extent(calibration, tool)
+    extent_m = flange_extent(calibration, tool)[1]
     if tool is None and clearance_m is None:
         raise DataError(
             "touch-test: which tool touches is not known, and without one the flange itself, with "
@@ -136,8 +134,7 @@ def touch_targets(
         flange = placed @ invert(tip.matrix)
         radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
-    carried_m = np.vstack([tip.matrix[None, :3, 3], parts_m])
-    return TouchTargets(tuple(points), frame, carried_m)
+    return TouchTargets(tuple(points), frame)
 
 
 def evaluate_gaps(

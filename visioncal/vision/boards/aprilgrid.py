@@ -36,10 +36,8 @@ _MIN_TAGS, _MOST_SPACING, _MOST_BORDER, _USUAL_SPACING = 1, 1.0, 2, 0.3
 # this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
 # images of little contrast.
 _DARKER, _LITTLE, _ENLARGED = 25.0, 7.0, 2
-# Share of read tags at which their border is as stated.
+# Share of read tags at which no other copy is searched.
 _MANY = 0.5
-# Factor of tags read by which another border is the right one.
-_MORE = 1.25
 # Minimum number of tags to check a homography.
 _LEAST_TAGS = 2
 # Half-widths of the windows of corner refinement, as a share of the gap between tags, and bounds
@@ -160,17 +158,13 @@ class AprilGrid(Board):
     ) -> DetectedCorners | NotFound:
         """Corners of the tags in a (h, w) grey image, or why there are none."""
         del quick
-        expected = _MANY * target.columns * target.rows
-        ids, px = _grid_tags(image, target.dictionary, target.border, expected)
-        border = NotFound(
-            f"the tags have a border of {3 - target.border} modules, and the target says border = "
-            f"{target.border}",
-            misfit=True,
-        )
-        if len(ids) < expected and _has_other_border(image, target, ids):
-            return border
+        enough = _MANY * target.columns * target.rows
+        ids, px = _grid_tags(image, target.dictionary, target.border, enough)
         if not len(ids):
-            return NotFound(f"no board: no tag of {target.dictionary} is seen")
+            return NotFound(
+                f"no board: no tag of {target.dictionary} with a border of {target.border} modules "
+                "is seen"
+            )
         numbers = ids - target.marker_id
         own = (numbers >= 0) & (numbers < target.columns * target.rows)
         if own.sum() <= 0.5 * len(own):
@@ -192,8 +186,6 @@ class AprilGrid(Board):
         px = _refined_tags(image, px, target.spacing)
         spacing = _measured_spacing(target, numbers, px)
         if abs(spacing - target.spacing) > _SPACING:
-            if _has_other_border(image, target, ids):
-                return border
             return NotFound(
                 f"the tags are {spacing:.2f} of their side apart, and the target says spacing = "
                 f"{target.spacing:g}",
@@ -271,13 +263,6 @@ def _ordered_tags(
     places = _tag_corners(target, numbers[own])
     misfits = [layout_misfit(places, array[own]) for array in rotated]
     return rotated[int(np.argmin(misfits))], min(misfits)
-
-
-def _has_other_border(image: Image, target: Target, ids: IntArray) -> bool:
-    """Whether many more tags are read with the other border; a wrong one reads some."""
-    expected = max(_MORE * len(ids), _MANY * target.columns * target.rows)
-    other_ids = _grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
-    return len(other_ids) >= expected
 
 
 def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:

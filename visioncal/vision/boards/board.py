@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar
 
-import cv2
 import numpy as np
 
-from visioncal.core.types import Corners, FloatArray, Image, IntArray, Target
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.template import Print, Refined, refine
@@ -52,9 +51,7 @@ class Board(BoardKind):
         for factor in self._factors(image):
             small = image if factor == 1 else shrunk(image, factor)
             seen = self.search(small, target, quick=self.has_quick_search)
-            if isinstance(seen, DetectedCorners) and not len(
-                hidden_corners(seen, small.shape, self.corners(target) / target.square_m)
-            ):
+            if isinstance(seen, DetectedCorners) and len(seen.ids) == len(self.corners(target)):
                 # From pixel centres of the small image to those of the large one.
                 px = factor * seen.px + (factor - 1) / 2
                 refined = self._refined(image, target, DetectedCorners(seen.ids, px))
@@ -81,28 +78,3 @@ class Board(BoardKind):
         return DetectedCorners(
             seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
         )
-
-
-def hidden_corners(
-    seen: DetectedCorners | Corners, shape: tuple[int, ...], squares: FloatArray
-) -> IntArray:
-    """Ids (n,) of undetected corners that the image should contain with the squares around them.
-
-    `squares` are the positions of all corners [squares]. If the detected corners are too few to
-    locate the board, these are all others.
-    """
-    places = squares[:, :2]
-    missing = np.setdiff1d(np.arange(len(places)), seen.ids)
-    if not len(missing):
-        return missing
-    homography = cv2.findHomography(places[seen.ids], seen.px)[0] if len(seen.ids) > 3 else None
-    if homography is None:
-        return missing
-    # Detecting a corner requires both markers beside it.
-    around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    depth = around @ homography[2, :2] + homography[2, 2]
-    # Corners at the horizon are at infinity.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        px = (around @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None]
-    inside = (depth > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
-    return np.asarray(missing[inside.all(axis=1)])
