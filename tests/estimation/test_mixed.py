@@ -194,7 +194,8 @@ def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size
     units = example.units[0]
     moved = rng.normal(size=(*units.residuals.shape, 8))
     units.residuals[:] += moved @ (true_size * rng.normal(size=8))
-    size, gain = example.model.at(LOGS).likely_size(moved, np.ones(len(moved), dtype=bool))
+    everywhere = np.ones(len(moved), dtype=bool)
+    size, gain = example.model.likely_size(example.model.at(LOGS), moved, everywhere)
     without = example.value(LOGS)
 
     def beside(value):

@@ -132,7 +132,8 @@ def estimate_arm_sizes(
         blocks = replace(plain, bases=every, low=tuple(_variances(length)[:2].tolist()))
         tried = None
         # Skips the search where the gain seems too small.
-        if 2.0 * found.likely_size(blocks.columns(HARMONICS), plain.mine)[1] > _LEAST_GAIN:
+        _, gain = plain.likelihood.model.likely_size(found, blocks.columns(HARMONICS), plain.mine)
+        if 2.0 * gain > _LEAST_GAIN:
             logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
             tried = blocks.most_likely(logs, found.value - 0.5 * SIGNIFICANT)
         if tried is not None and tried.value < best.value:

@@ -120,6 +120,12 @@ class Units:
         squares = np.exp(2.0 * logs[self.sizes])
         return np.asarray(self.known + np.tensordot(squares, self.parts, axes=1))
 
+    def white(self, logs: FloatArray) -> "WhiteUnits":
+        """The units in units of their noise, at (k,) logarithms of the sizes."""
+        whitening = inverse_roots(self.total(logs))
+        residuals = (whitening @ self.residuals[:, :, None])[:, :, 0]
+        return WhiteUnits(whitening, whitening @ self.jacobian, residuals)
+
 
 @dataclass(frozen=True, eq=False)
 class CommonRows:
@@ -161,29 +167,6 @@ class MixedEstimate(LikelihoodValue):
     logs: FloatArray  # (k,) logarithms of the sizes.
     values: FloatArray  # (q,) best linear unbiased prediction of the common unknowns.
     root: FloatArray  # (q, q) root of their covariance `root @ root^T`.
-    units: tuple[WhiteUnits, ...]
-
-    def likely_size(self, moved: FloatArray, among: Mask) -> tuple[float, float]:
-        """Maximum-likelihood size of additional random unknowns of equal variance.
-
-        With the other sizes held, the likelihood of a size is a sum over the eigenvalues of the
-        unknowns' information. `moved` is the (n, d, j) Jacobian of the n first units in the (u,)
-        mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
-        """
-        own = self.units[0]
-        moved = own.whitening[among] @ moved
-        absorbed = self.root.T @ gram(own.jacobian[among], moved)
-        information = gram(moved, moved) - absorbed.T @ absorbed
-        values, vectors = np.linalg.eigh(information)
-        # Directions that the parameters absorb entirely hold rounding only.
-        kept = values > NULL_SHARE * np.trace(information + absorbed.T @ absorbed)
-        values, vectors = values[kept], vectors[:, kept]
-        squares = (gram(moved, own.residuals[among]) @ vectors) ** 2
-        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
-        added = 1.0 + sizes**2 * values
-        change = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
-        best = int(np.argmin(change))
-        return (float(sizes[best, 0]), -float(change[best])) if change[best] < 0.0 else (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,13 +191,11 @@ class MixedModel:
         information[is_random, is_random] = 1.0 / variances
         value, white = float(np.log(variances).sum()), []
         for unit in self.units:
-            whitening = inverse_roots(unit.total(logs))
-            jacobian = whitening @ unit.jacobian
-            residuals = (whitening @ unit.residuals[:, :, None])[:, :, 0]
-            information += gram(jacobian, jacobian)
-            gradient += gram(jacobian, residuals)
-            value -= 2.0 * float(np.linalg.slogdet(whitening)[1].sum())
-            white.append(WhiteUnits(whitening, jacobian, residuals))
+            at = unit.white(logs)
+            information += gram(at.jacobian, at.jacobian)
+            gradient += gram(at.jacobian, at.residuals)
+            value -= 2.0 * float(np.linalg.slogdet(at.whitening)[1].sum())
+            white.append(at)
         for rows in self.common:
             weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
             information += weight * rows.information
@@ -225,23 +206,23 @@ class MixedModel:
         values = root @ (root.T @ gradient)
         value += float(np.sum(values[is_random] ** 2 / variances))
         value -= 2.0 * float(np.linalg.slogdet(root)[1])
-        units = tuple(
-            replace(unit, residuals=unit.residuals - unit.jacobian @ values) for unit in white
-        )
-        value += sum(float(np.sum(unit.residuals**2)) for unit in units)
+        left = [replace(at, residuals=at.residuals - at.jacobian @ values) for at in white]
+        value += sum(float(np.sum(at.residuals**2)) for at in left)
         for rows in self.common:
             weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
             value += weight * rows.left(values)[1]
         flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
-        here = MixedEstimate(0.5 * value, *flat, logs, values, root, units)
-        gradient, curvature = self._slopes(here) if is_sloped else flat
+        here = MixedEstimate(0.5 * value, *flat, logs, values, root)
+        gradient, curvature = self._slopes(here, left) if is_sloped else flat
         if self.prior is not None:
             prior = self.prior.at(logs)
             gradient, curvature = gradient + prior.gradient, curvature + prior.curvature
             value += 2.0 * prior.value
         return replace(here, value=0.5 * value, gradient=gradient, curvature=curvature)
 
-    def _slopes(self, here: MixedEstimate) -> tuple[FloatArray, FloatArray]:
+    def _slopes(
+        self, here: MixedEstimate, white: Sequence[WhiteUnits]
+    ) -> tuple[FloatArray, FloatArray]:
         """Gradient (k,) and average information (k, k) by the logarithms of the sizes."""
         variances, values, root = np.exp(2.0 * here.logs), here.values, here.root
         by_size = np.zeros(len(variances))
@@ -256,7 +237,7 @@ class MixedModel:
         along = np.zeros((len(values), len(variances)))
         along[is_random] = 2.0 * parts * (values[is_random] / own)[:, None]
         average, absorbed = np.zeros((len(variances),) * 2), np.zeros_like(along)
-        for unit, at in zip(self.units, here.units, strict=True):
+        for unit, at in zip(self.units, white, strict=True):
             back = np.swapaxes(at.whitening, 1, 2)
             fitted = times_root(at.jacobian, root)
             remaining = np.eye(fitted.shape[1]) - fitted @ np.swapaxes(fitted, 1, 2)
@@ -288,6 +269,31 @@ class MixedModel:
             absorbed[:, rows.noise] += 2.0 * weight * rest
         projected = root.T @ absorbed
         return by_size, 0.5 * (average - projected.T @ projected)
+
+    def likely_size(
+        self, here: MixedEstimate, moved: FloatArray, among: Mask
+    ) -> tuple[float, float]:
+        """Maximum-likelihood size of more random unknowns of equal variance, beside an estimate.
+
+        With the other sizes held, the likelihood of a size is a sum over the eigenvalues of the
+        unknowns' information. `moved` is the (n, d, j) Jacobian of the n first units in the (u,)
+        mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
+        """
+        own = self.units[0].white(here.logs)
+        residuals = own.residuals - own.jacobian @ here.values
+        moved = own.whitening[among] @ moved
+        absorbed = here.root.T @ gram(own.jacobian[among], moved)
+        information = gram(moved, moved) - absorbed.T @ absorbed
+        values, vectors = np.linalg.eigh(information)
+        # Directions that the parameters absorb entirely hold rounding only.
+        kept = values > NULL_SHARE * np.trace(information + absorbed.T @ absorbed)
+        values, vectors = values[kept], vectors[:, kept]
+        squares = (gram(moved, residuals[among]) @ vectors) ** 2
+        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
+        added = 1.0 + sizes**2 * values
+        change = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
+        best = int(np.argmin(change))
+        return (float(sizes[best, 0]), -float(change[best])) if change[best] < 0.0 else (0.0, 0.0)
 
     def maximised(
         self,

@@ -13,7 +13,7 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.joint import ConvergedFit, moved_mahalanobis_sq
-from visioncal.estimation.lens_field import displacements, distances
+from visioncal.estimation.lens_field import displacements
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.lens_step import lens_step
 from visioncal.estimation.scene import ONLY_CAMERA
@@ -166,9 +166,10 @@ def _changed(run: RunState) -> Iterator[Finding]:
         compressed, camera = seen.compressed[which], optics.camera(name)
         poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
         if compressed.coefficients is not None and problem.levels is not None:
-            far = distances(stack, poses)[stack.view_of]
-            columns = displacements(stack.px, camera, far, replace(problem.levels, breathing=0.0))
-            beyond = columns @ compressed.coefficients.mean[: columns.shape[2]]
+            field = replace(problem.levels, breathing=0.0)
+            for rows, _ in stack.blocks():
+                columns = displacements(stack.px[rows], camera, 0.0, field)
+                beyond[rows] = columns @ compressed.coefficients.mean[: columns.shape[2]]
         step = lens_step(stack, camera, poses, beyond, order)
         if step is None:
             continue
