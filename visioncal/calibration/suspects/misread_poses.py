@@ -23,9 +23,9 @@ from visioncal.estimation.chain import robot_part
 # Robot and camera turn alike between two views where the angles differ by less [rad]; a robot that
 # moves by less stood still [m].
 _ALIKE_RAD, _STILL_M = 0.05, 1e-3
-# In a third of the pairs, those of sound views, the angles differ by less [rad]: by 2 degrees for a
+# In three of ten pairs, those of sound views, the angles differ by less [rad]: by 2 degrees for a
 # servo arm that repeats to 2 degrees, by 4 to 15 where angles were misread or rows are mixed up.
-_PAIRS_SHARE, _MISREAD_RAD = 0.35, float(np.deg2rad(3.5))
+_PAIRS_SHARE, _MISREAD_RAD = 0.3, float(np.deg2rad(3.5))
 
 # Poses are mirrored only on request: another sign of y would fit as well.
 _MIRRORED = Remedy(

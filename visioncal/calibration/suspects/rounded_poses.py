@@ -26,14 +26,18 @@ def _found(run: RunState) -> Iterator[Finding]:
     limits, robots = CalibrationLimits(), run.session.robots
     for name in robots:
         rows = [seen.robots[name] for seen in run.timed.observations if name in seen.robots]
-        noise = run.assessment.sigmas.get(robot_key(name), {})
+        arm = run.cell_fit.arms.get(robot_key(name))
+        # A calibrated arm is where its joints say.
+        if arm is None or arm.model is not None:
+            continue
+        noise = run.assessment.sigmas[arm.robot]
         step_m, step = _step(rows, POSE[:3]), _step(rows, POSE[3:])
         # A quaternion's components are half as large as the turn.
         sigma_mm, sigma_deg = 1e3 * step_m / 12**0.5, float(np.rad2deg(2.0 * step / 12**0.5))
         parts = []
-        if limits.robot_mm < sigma_mm < noise.get("translation_mm", 0.0) / _SHOWN:
+        if limits.robot_mm < sigma_mm < noise["translation_mm"] / _SHOWN:
             parts.append(f"their positions to {figure(1e3 * step_m)} mm")
-        if limits.robot_deg < sigma_deg < noise.get("rotation_deg", 0.0) / _SHOWN:
+        if limits.robot_deg < sigma_deg < noise["rotation_deg"] / _SHOWN:
             parts.append(f"their quaternions to {figure(step)}")
         if parts:
             yield Finding(
