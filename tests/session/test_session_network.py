@@ -312,12 +312,6 @@ def test_files_from_elsewhere_come_along(boards, tmp_path):
     assert Session.load(tmp_path / "far" / "copy").digest() == session.digest()
 
 
-def test_a_board_that_no_row_names_is_told(boards):
-    changed(boards, "views.csv", "0,0,floor", "0,0,wall")
-    told = "session.toml: targets.floor: no row of views.csv names it."
-    assert told in Session.load(boards).warnings
-
-
 def test_rows_without_a_robot_are_named_before_frames_that_hang_on_nothing(tmp_path):
     (tmp_path / "session.toml").write_text(
         'schema = 1\nname = "s"\nmount = "eye-in-hand"\ntarget = "charuco_9x6_30mm"\n'

@@ -147,16 +147,8 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
             )
 
 
-def kind_warnings(
-    declaration: Declaration, views: Sequence[View], document: Mapping[str, Any] | None
-) -> Iterator[str]:
-    """Warnings of what no row names, and of misspelt keys of targets (`document`)."""
-    for kind in KINDS:
-        declared = declaration.named(kind)
-        named = {view.text.get(kind, "").strip() for view in views}
-        for name in declared if len(declared) > 1 else ():
-            if name not in named:
-                yield f"session.toml: {kind}s.{name}: no row of views.csv names it."
+def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
+    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
     for name, path in (paths := _declared_targets(declaration)).items():
         described = document if len(paths) == 1 else (document or {}).get(name)
         for words in misspelt_keys(described or {}):

@@ -38,10 +38,10 @@ from visioncal.session.kinds import (
     check_images_can_be_used,
     check_kinds_named,
     is_camera_observation,
-    kind_warnings,
     outside_warnings,
     read_robots,
     read_targets,
+    target_warnings,
 )
 from visioncal.session.observations import (
     Observation,
@@ -527,7 +527,7 @@ def _build(
     warnings = [
         *declaration_warnings(declaration, "session.toml"),
         *cols.column_warnings(columns, "views.csv"),
-        *kind_warnings(declaration, views, target_document),
+        *target_warnings(declaration, target_document),
     ]
     check_kinds_named(declaration, views)
     check_frames(declaration, views)
