@@ -39,7 +39,7 @@ ROTATIONS = tuple(
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
 _PLAIN_NUMBERS = frozenset({"stamp_s", "ambient_c", *LOAD}.union(*WHOLE_GROUPS))
 _NUMBERED = re.compile(r"(q[1-9]\d*_rad|tau[1-9]\d*_nm|current[1-9]\d*_a|temp[1-9]\d*_c)", re.ASCII)
-_JOINT, _JOINT_DEG = re.compile(r"q([1-9][0-9]*)_rad"), re.compile(r"q[1-9][0-9]*_deg")
+_JOINT = re.compile(r"q([1-9][0-9]*)_rad")
 _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
@@ -165,17 +165,9 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
     """Warnings of unknown columns that look like misspelt known ones."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
-    degrees = [name for name in columns if _JOINT_DEG.fullmatch(name)]
-    if degrees:
-        yield (
-            f"{where}: {', '.join(degrees)} are kept as text: angles of joints are read in "
-            "radians, as q1_rad, q2_rad and so on. Multiply by pi / 180."
-        )
     for name in columns:
         # A known word with a suffix, as target_id, is not misspelt.
-        is_other = (
-            name in (*known, *degrees) or is_number(name) or re.split(r"[_.]", name)[0] in known
-        )
+        is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
         in_radians = name.replace("_deg", "_rad")
         if hint := "" if is_other else did_you_mean(in_radians, known, _MISSPELT):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"
