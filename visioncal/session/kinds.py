@@ -34,7 +34,7 @@ class Instrument:
     sigma_per_m: float = 0.0  # Its growth with the distance from there [m/m].
     # Of a probe's rotation about each axis; None where unknown [rad].
     sigma_rad: float | None = None
-    words: str = ""  # Description of a known instrument.
+    words: str = ""  # Its description, or its name.
 
     def sigmas_m(self, places: FloatArray) -> FloatArray:
         """Standard deviations (m,) of each coordinate of (m, 3) measured positions [m]."""
@@ -56,7 +56,8 @@ def stated_instrument(table: InstrumentTable) -> Instrument:
         DataError: The name is unknown and no noise is stated.
     """
     known = known_instruments()
-    values = vars(known[name]) if (name := table.name.strip().lower()) in known else {}
+    name = table.name.strip().lower()
+    values = vars(known[name]) if name in known else {"words": table.name}
     stated = {key: getattr(table, key) for key in ("sigma_m", "sigma_per_m", "sigma_rad")}
     values = values | {key: value for key, value in stated.items() if value is not None}
     if "sigma_m" not in values:
