@@ -27,7 +27,6 @@ from visioncal.dynamics.identify import (
     SLOW_RAD_S,
     Options,
     block_of,
-    fit_friction_to_known,
     identify,
     predict,
     validate,
@@ -439,7 +438,7 @@ def test_motion_about_one_line_is_named():
 def test_results_survive_the_disk(tmp_path, worlds):
     built, found, fresh, rng = worlds[0]
     stream = recorded(built, fresh, rng)
-    prediction = predict(found.identified, stream, fit_friction_to_known(found))
+    prediction = predict(found.identified, stream)
     result = replace(found.identified, validation=validate(found.identified, prediction))
     result.save(tmp_path / "dynamics.json")
     again = Identified.load(tmp_path)
@@ -447,7 +446,7 @@ def test_results_survive_the_disk(tmp_path, worlds):
     assert (again.torques(motion) == result.torques(motion)).all()
     assert (again.consistent_torques(motion) == result.consistent_torques(motion)).all()
     assert again.determined == result.determined
-    assert (again.validation.known_rms_nm == result.validation.known_rms_nm).all()
+    assert (again.validation.rms_nm == result.validation.rms_nm).all()
     assert again.streams[0].label == "streams/robot.csv"
 
 
@@ -467,11 +466,8 @@ def test_a_real_panda_is_predicted(panda):
     train, test = condition(panda.part(0.0, 0.7), 8.0), condition(panda.part(0.7, 1.0), 8.0)
     found = identify(load_robot("panda"), [train])
     assert found.identified.base.rank == 64
-    result = validate(
-        found.identified, predict(found.identified, test, fit_friction_to_known(found))
-    )
+    result = validate(found.identified, predict(found.identified, test))
     limits = np.array([5.0, 1.5, 2.4, 4.9, 6.2, 3.4, 17.9])
     assert (100.0 * result.shares <= limits).all()
     assert found.identified.inertias.consistent
     assert (100.0 * result.consistent_rms_nm / result.torque_nm <= 1.15 * limits).all()
-    assert (result.rms_nm < result.known_rms_nm).all()

@@ -100,8 +100,6 @@ class DynamicsLimits:
     # Share of a torque's range below which an error is no reason for doubt.
     slight_share: float = 0.02
     range_share: Pair = (0.2, 0.6)  # Prediction error over the torque's range.
-    # Prediction error of known inertias over the range, beyond which the robot is another one.
-    known_share: float = 0.5
     # Change of torques by their lag over the range, below which it is only a note.
     lag_share: float = 0.1
 

@@ -59,9 +59,6 @@ class TorqueValidation:
     noise_nm: Vector  # (n,) noise of the torques by the fit [N m].
     # (n,) error with the consistent standard parameters; None without these.
     consistent_rms_nm: Vector | None = None
-    # (n,) error with the robot's own inertias and friction fitted to them; None where it has no
-    # inertias.
-    known_rms_nm: Vector | None = None
 
     @property
     def shares(self) -> FloatArray:
@@ -231,49 +228,18 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
             f"range (joints 1 to {len(shares)}).",
         ),
     )
-    yield from _of_known(identified, validation)
-
-
-def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[_Judged]:
-    known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
-    if known is not None:
-        less_accurate = validation.rms_nm > known
-        if less_accurate.any():
-            yield _check(
-                "worse_than_known",
-                f"{_joints(less_accurate)}: the inertias that {identified.robot.name} comes with "
-                "predict torques better than the identified ones.",
-                _plan(identified, _MOTION),
-            )
-        else:
-            times = float(np.median(known / np.maximum(validation.rms_nm, 1e-12)))
-            yield (
-                "good",
-                Finding(
-                    NOTE,
-                    f"That is {figure(times)} times nearer than by the inertias that "
-                    f"{identified.robot.name} comes with, in the median of the joints.",
-                ),
-            )
-        unexplained = known > _LIMITS.known_share * validation.torque_nm
-        if unexplained.any():
-            yield _check(
-                "other_robot",
-                f"{_joints(unexplained)}: by the inertias that {identified.robot.name} comes with, "
-                f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
-                "torques' range stays unexplained.",
-                Remedy(
-                    "Check whether it is the robot that was recorded, whether it stands "
-                    "upright ([robot] gravity_m_s2), and what is on its flange."
-                ),
-            )
+    bodies = validation.consistent_rms_nm
     if bodies is not None:
         worse = bodies > _LIMITS.bodies_worse * validation.rms_nm
         if worse.any():
             yield _check(
                 "bodies",
                 f"{_joints(worse)}: no bodies near the known ones explain the torques as "
-                "well; friction may be of another kind, or a load is on the flange.",
+                "well; friction may be of another kind.",
+                Remedy(
+                    "Check whether it is the robot that was recorded, whether it stands upright "
+                    "([robot] gravity_m_s2), and what is on its flange."
+                ),
             )
 
 

@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.core.errors import DegenerateError
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.base import (
@@ -33,7 +32,7 @@ from visioncal.dynamics.regression import (
     rms_of,
     std_of,
 )
-from visioncal.robot import Robot, joint_torques
+from visioncal.robot import Robot
 
 # Uncertainty of filtered speeds, below which the sign of friction is smoothed [rad/s].
 SLOW_RAD_S = 1e-4
@@ -243,9 +242,6 @@ class Prediction:
     predicted_nm: FloatArray  # (k, n) by the base parameters [N m].
     # (k, n) by the consistent standard parameters [N m]; None without these.
     consistent_nm: FloatArray | None
-    # (k, n) by the robot's own inertias and friction fitted to them [N m]; None where it has no
-    # inertias.
-    known_nm: FloatArray | None
     used: Mask  # (k, n) mask of valid torques.
     q: FloatArray  # (k, n) joint angles, filtered likewise [rad].
     dq: FloatArray  # (k, n) their speeds [rad/s].
@@ -261,27 +257,15 @@ class Prediction:
         return std_of(self.measured_nm, self.used)
 
 
-def predict(
-    identified: Identified, stream: Conditioned, own_friction: FloatArray | None = None
-) -> Prediction:
-    """Predicts a stream's filtered torques.
-
-    Args:
-        identified: The arm's dynamics.
-        stream: The samples.
-        own_friction: (f,) friction fitted to the robot's own inertias; see `fit_friction_to_known`.
-    """
+def predict(identified: Identified, stream: Conditioned) -> Prediction:
+    """Predicts a stream's filtered torques."""
     with_bodies = identified.consistent is not None
-    known = None
-    if own_friction is not None:
-        known = stream.filtered(partial(_known_torques, identified, own_friction))
     return Prediction(
         stream.label,
         stream.times_s,
         stream.torques_nm,
         stream.filtered(identified.torques),
         stream.filtered(identified.consistent_torques) if with_bodies else None,
-        known,
         stream.used,
         stream.filtered(lambda motion: motion.q),
         stream.filtered(lambda motion: motion.dq),
@@ -291,49 +275,14 @@ def predict(
 
 def validate(identified: Identified, prediction: Prediction) -> TorqueValidation:
     """Compares predicted with measured torques."""
-    consistent, known = prediction.consistent_nm, prediction.known_nm
+    consistent = prediction.consistent_nm
     return TorqueValidation(
         prediction.label,
         prediction.rms_nm(prediction.predicted_nm),
         prediction.torque_nm,
         np.max([stream.noise_nm for stream in identified.streams], axis=0),
         None if consistent is None else prediction.rms_nm(consistent),
-        None if known is None else prediction.rms_nm(known),
     )
-
-
-def fit_friction_to_known(identification: Identification) -> FloatArray | None:
-    """Fits friction to the robot's own inertias.
-
-    Returns:
-        (f,) parameters in the model's order; None where the robot has no inertias, or the model no
-        friction.
-    """
-    identified = identification.identified
-    robot, model = identified.robot, identified.base.model
-    if robot.inertias is None or not model.terms.symbols:
-        return None
-    blocks = []
-    for stream, block in zip(identification.streams, identification.fit.blocks, strict=True):
-        links = stream.filtered(partial(_link_torques, model))
-        x = stream.filtered(model.terms.columns)
-        blocks.append(NoiseBlock(x, block.y - links, block.used, block.correlation))
-    try:
-        return regress(blocks).values
-    except np.linalg.LinAlgError as error:
-        raise DegenerateError("dynamics: the motion does not determine friction.") from error
-
-
-def _link_torques(model: DynamicModel, motion: JointMotion) -> FloatArray:
-    robot = model.robot
-    if robot.inertias is None:
-        return np.zeros_like(motion.q)
-    return joint_torques(robot, robot.inertias, motion.q, motion.dq, motion.ddq)
-
-
-def _known_torques(identified: Identified, friction: FloatArray, motion: JointMotion) -> FloatArray:
-    model = identified.base.model
-    return np.asarray(_link_torques(model, motion) + model.terms.columns(motion) @ friction)
 
 
 def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:

@@ -17,7 +17,6 @@ from visioncal.dynamics.identify import (
     Options,
     Prediction,
     find_lag,
-    fit_friction_to_known,
     identify,
     predict,
     validate,
@@ -132,8 +131,7 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
             "session": {"name": session.name, "sha256": session.digest()},
         },
     )
-    friction = fit_friction_to_known(identification)
-    fitted = tuple(predict(identified, stream, friction) for stream in streams)
+    fitted = tuple(predict(identified, stream) for stream in streams)
     return Run(session, identified, identification, predicted, fitted)
 
 
@@ -319,5 +317,5 @@ def _speed(stream: Conditioned) -> FloatArray:
 
 
 def _predicted(identification: Identification, stream: Conditioned, which: str = "") -> Prediction:
-    predicted = predict(identification.identified, stream, fit_friction_to_known(identification))
+    predicted = predict(identification.identified, stream)
     return replace(predicted, label=f"{which}{stream.label}")

@@ -36,7 +36,6 @@ def torque_table(identified: "Identified") -> Table:
             "unseen": validation.rms_nm,
             "% of it": 100.0 * validation.shares,
             "as bodies": validation.consistent_rms_nm,
-            "before": validation.known_rms_nm,
         }
     columns = [
         [significant(None)] * identified.robot.joint_count
