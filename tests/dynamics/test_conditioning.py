@@ -79,7 +79,7 @@ def test_motions_are_recovered(senses):
         assert np.sqrt(np.mean((got - true[rows]) ** 2)) < most
 
 
-def test_a_clock_that_jitters_is_named_and_evened():
+def test_a_clock_that_jitters_is_evened():
     rng = np.random.default_rng(7)
     built, done = real_dynamics("ur5e", rng), multi_sine(6, rng)
     true = record(built, done, rng, Senses(q_rad=0.0, torque_share=0.0, dq_rad_s=None))
@@ -87,7 +87,6 @@ def test_a_clock_that_jitters_is_named_and_evened():
     values = [np.interp(uneven, true.stamps_s, true[name]) for name in true.columns[1:]]
     stream = Stream(true.columns, np.column_stack([uneven, *values]))
     found = conditioned(stream)
-    assert "steps of its clock differ by" in found.notes[0]
     motion = found.pieces[0].measured.motion
     ddq = np.stack(
         [np.interp(motion.times_s, done.times_s, column) for column in done.ddq.T], axis=1

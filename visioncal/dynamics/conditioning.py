@@ -14,8 +14,8 @@ from visioncal.dynamics.model import JointMotion, Measured
 from visioncal.dynamics.reading import (
     RecordedSamples,
     StampClock,
-    clock_notes,
     even_parts,
+    gap_notes,
 )
 
 # Cut-off of the low-pass: a rigid arm's torques, but for the corners of friction, lie within so
@@ -357,7 +357,7 @@ def condition(
         longest_gap_s = _longest_gap(smoothing, rate_hz, clock.usual_s)
         parts = even_parts(recorded, invalid, clock, longest_gap_s)
         longest = max(parts, key=len)
-    notes += clock_notes(recorded, clock, longest_gap_s)
+    notes += gap_notes(recorded, clock, longest_gap_s)
     window = window_of(smoothing, rate_hz, len(longest))
     pieces, speeds_agree = [], True
     for part in parts:

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.version import __version__
 from visioncal.dynamics.excitation import Excitation
-from visioncal.dynamics.limits import CHECK_HZ, MotionExtremes, MotionLimits
+from visioncal.dynamics.limits import MotionExtremes, MotionLimits
 from visioncal.dynamics.model import JointMotion
 from visioncal.dynamics.sweeps import Sweeps
 
@@ -65,18 +65,12 @@ def motion_document(plan: MotionPlan) -> dict[str, Any]:
         document["sweeps"] = _sweeps(plan.sweeps)
     if unchecked := plan.allowed.unchecked:
         document["not_checked"] = list(unchecked)
-    return document | {
-        "limits": _limits(plan.allowed),
-        "robot": dict(plan.allowed.robot.document),
-    }
+    return document | {"robot": dict(plan.allowed.robot.document)}
 
 
 def _excitation(excitation: Excitation) -> dict[str, Any]:
     mean, sines, cosines = excitation.series.coefficients
     request = excitation.request
-    search = {"seed": request.seed, "seconds": excitation.seconds, "starts": excitation.starts}
-    if np.isfinite(request.seconds):
-        search["wished_seconds"] = request.seconds
     return {
         "period_s": request.period_s,
         "harmonics": request.harmonics,
@@ -87,9 +81,8 @@ def _excitation(excitation: Excitation) -> dict[str, Any]:
         "condition": excitation.condition,
         "condition_random": excitation.random,
         "base_parameters": list(excitation.base.names),
-        "weights": excitation.weights.tolist(),
-        "kept": _kept(excitation.extremes) | {"rate_hz": CHECK_HZ},
-        "search": search,
+        "kept": _kept(excitation.extremes),
+        "seed": request.seed,
     }
 
 
@@ -119,42 +112,12 @@ def _sweeps(sweeps: Sweeps) -> dict[str, Any]:
 
 
 def _kept(kept: MotionExtremes) -> dict[str, Any]:
-    """Extremes of a motion, and the shares of the limits that they use."""
-    document: dict[str, Any] = {
-        "lowest_rad": kept.lowest.tolist(),
-        "highest_rad": kept.highest.tolist(),
-        "speed_rad_s": kept.speed.tolist(),
-        "acceleration_rad_s2": kept.acceleration.tolist(),
-    }
-    if kept.torque is not None:
-        document["torque_nm"] = kept.torque.tolist()
-    document["share_of_allowed"] = kept.shares
+    """Shares of the limits that a motion uses."""
+    document: dict[str, Any] = {"share_of_allowed": kept.shares}
     if kept.nearest:
         document["nearest"] = {
             "mm": 1e3 * kept.clearance_m,
             "between": list(kept.nearest),
             "at_s": kept.nearest_s,
         }
-    return document
-
-
-def _limits(allowed: MotionLimits) -> dict[str, Any]:
-    """The limits, margins included."""
-    share = allowed.share
-    document: dict[str, Any] = {
-        "lower_rad": allowed.lower.tolist(),
-        "upper_rad": allowed.upper.tolist(),
-        "speed_rad_s": allowed.speed.tolist(),
-        "acceleration_rad_s2": allowed.acceleration.tolist(),
-        "clearance_mm": 1e3 * share.clearance_m,
-        "margin_rad": share.margin_rad,
-        "speed_share": share.speed,
-        "acceleration_share": share.acceleration,
-        "torque_margin": share.torque,
-        "bodies": [body.name for body in allowed.bodies if not body.of_arm],
-    }
-    if not allowed.unchecked:
-        document["torque_nm"] = allowed.torque.tolist()
-    if share.floor_m is not None:
-        document["floor_mm"] = 1e3 * share.floor_m
     return document

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import Stream, too_far_apart
 
@@ -207,31 +207,17 @@ def _gaps_of(clock: StampClock, longest_gap_s: float) -> IntArray:
     return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > longest_gap_s))
 
 
-def clock_notes(recorded: RecordedSamples, clock: StampClock, longest_gap_s: float) -> list[str]:
-    """Messages on gaps, missing samples and jitter of a stream's clock."""
-    steps, notes = np.diff(recorded.times_s), []
+def gap_notes(recorded: RecordedSamples, clock: StampClock, longest_gap_s: float) -> list[str]:
+    """Message on the gaps of a stream."""
     gaps = _gaps_of(clock, longest_gap_s)
-    if len(gaps):
-        places = [f"{recorded.times_s[index] - recorded.times_s[0]:.2f} s" for index in gaps]
-        notes.append(
-            f"{recorded.label}: samples are missing for up to {steps[gaps].max():.3g} s behind "
-            f"{some_of(places, 3)}; nothing is interpolated there."
-        )
-    lost = clock.counts - 1
-    lost[gaps] = 0
-    if lost.any():
-        share = 100.0 * float(lost.sum() / (lost.sum() + len(recorded)))
-        notes.append(
-            f"{recorded.label}: {figure(share)} % of its samples are missing here and there, for "
-            f"up to {figure(steps[lost > 0].max())} s; angles are interpolated, torques are not."
-        )
-    if not clock.even:
-        inner = np.delete(steps, np.flatnonzero(clock.counts > 1))
-        notes.append(
-            f"{recorded.label}: steps of its clock differ by {100.0 * clock.jitter:.0f} % (from "
-            f"{1e3 * inner.min():.3g} to {1e3 * inner.max():.3g} ms); it was resampled evenly."
-        )
-    return notes
+    if not len(gaps):
+        return []
+    places = [f"{recorded.times_s[index] - recorded.times_s[0]:.2f} s" for index in gaps]
+    return [
+        f"{recorded.label}: samples are missing for up to "
+        f"{np.diff(recorded.times_s)[gaps].max():.3g} s behind {some_of(places, 3)}; nothing is "
+        "interpolated there."
+    ]
 
 
 def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
