@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -23,6 +24,8 @@ T = TypeVar("T", bound=Observed)
 # Corners of two exposures of one scene differ by the camera's noise in some corner, by more than
 # this [px]; a picture that was stored anew in another file does not.
 _APART_PX = 0.01
+# Numbers of a pose (3, 4) by which rows of one stop may differ [rad, m].
+_UNITS = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
 # Images of one stop that are enough for a mean, and the greatest distance of half of the corners of
 # one of them from that of most [px]: beyond, the arm did not stand still.
 _MANY, _STANDING_PX = 4, 0.5
@@ -127,7 +130,7 @@ def _mean_of(images: Sequence[Corners]) -> tuple[Corners, list[int]]:
 
 def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int, int]:
     """The earlier view by repeated one; `corners` are those of all cameras, by view."""
-    groups = defaultdict(list)
+    groups, known = defaultdict(list), dict[int, list[FloatArray]]()
     for row in session.observations:
         view, found = row.view, corners.get(row.view.number)
         measured = [
@@ -141,51 +144,60 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
             reading = view.reading_m * (1e3 / APART_MM)
         if not len(reading):
             continue
-        states = [np.zeros(0)]
-        for _, robot in sorted(row.robots.items()):
-            joints = robot.joints_rad
-            states += [_entries(robot.matrix(POSE))]
-            states += [] if joints is None else [joints / APART_RAD]
+        robots, states = [robot for _, robot in sorted(row.robots.items())], [np.zeros(0)]
+        for robot in robots:
+            if robot.number not in known:
+                known[robot.number] = _state(robot)
+            states += known[robot.number]
         # Who observes what, and what else is measured. A robot's pose in its stream is that of the
         # time.
         alike = (
             bool(row.robots),
             *(row.seer, row.seen, None if found is None else found.ids.tobytes()),
             *map(len, states),
-            *(_others(one) for one in (view, *(robot for _, robot in sorted(row.robots.items())))),
+            *(_others(one) for one in (view, *robots)),
             view.stamp_s if row.missing_robots else None,
         )
         groups[alike].append((view, np.concatenate([*states, reading])))
     repeated = dict[int, int]()
     for (is_by_robot, *_), rows in groups.items():
         # The pairs that are near in all numbers, by the earlier row.
-        tree = cKDTree([numbers for _, numbers in rows])
+        tree, exact = (
+            cKDTree([numbers for _, numbers in rows]),
+            [each.tobytes() for _, each in rows],
+        )
         for first, later in sorted(tree.query_pairs(1.0, p=np.inf)):
-            (view, numbers), (other, others) = rows[first], rows[later]
+            (view, _), (other, _) = rows[first], rows[later]
             # Exact numbers are never read twice, and corners only where all stands still;
             # others are, at another time or stop.
             pairs = (view.stamp_s, other.stamp_s), (view.stop, other.stop)
             is_apart = any(None not in pair and pair[0] != pair[1] for pair in pairs)
             is_image = is_by_robot and view.number in corners
-            is_copy = is_image or not is_apart or np.array_equal(numbers, others)
+            is_copy = is_image or not is_apart or exact[first] == exact[later]
             if is_copy and not {view.number, other.number} & repeated.keys():
                 repeated[other.number] = view.number
     return dict(sorted(repeated.items()))
 
 
+def _state(robot: View) -> list[FloatArray]:
+    """Numbers of a robot's pose and joints in units of what rows of one stop may differ by."""
+    joints = robot.joints_rad
+    return [_entries(robot.matrix(POSE)), *([] if joints is None else [joints / APART_RAD])]
+
+
 def _entries(pose: FloatArray | None) -> FloatArray:
-    """Numbers of a pose in units of what rows of one stop may differ by; none for none."""
-    if pose is None:
-        return np.zeros(0)
-    units = np.array([np.deg2rad(APART_DEG)] * 3 + [1e-3 * APART_MM])
-    return np.asarray((pose[:3] / units).ravel())
+    """Numbers of a pose in the same units; none for none."""
+    return np.zeros(0) if pose is None else np.asarray((pose[:3] / _UNITS).ravel())
 
 
 def _others(row: View) -> frozenset[tuple[str, float]]:
     """What a row measured besides: loads, temperatures, torques."""
-    compared = {*POSE, *MEASURED_CAM_POSE, "stamp_s", *joint_columns(tuple(row.numbers))}
-    return frozenset(
-        (name, value)
-        for name, value in row.numbers.items()
-        if name not in compared and not name.startswith("meas_")
-    )
+    own = _others_among(tuple(row.numbers))
+    return frozenset((name, row.numbers[name]) for name in own)
+
+
+@cache
+def _others_among(columns: tuple[str, ...]) -> tuple[str, ...]:
+    """Columns of neither a pose, a reading, joints nor the time."""
+    compared = {*POSE, *MEASURED_CAM_POSE, "stamp_s", *joint_columns(columns)}
+    return tuple(name for name in columns if name not in compared and name[:5] != "meas_")
