@@ -12,7 +12,6 @@ from support.samples import made_up, tool_frame, with_frames
 
 from visioncal.calibration.run import Run, run
 from visioncal.cli.calibrate import calibrate_command
-from visioncal.cli.options import NeedOptions, WorkOptions
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
@@ -93,7 +92,7 @@ def pairs(tmp_path):
 
 
 def options(session, out):
-    return CalibrateOptions(session=session, need=NeedOptions(), work=WorkOptions(), out=out)
+    return CalibrateOptions(session=session, out=out)
 
 
 def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
