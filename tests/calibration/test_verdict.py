@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 from support.cells import calibrated, pairs_session, reporting, showing
 from support.marks import slow
@@ -24,7 +25,7 @@ from visioncal.calibration.suspects.ranking import MEASURE_BOARD
 from visioncal.core.codec import read, write
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import exp, invert, pose_difference
+from visioncal.core.transforms import compose, exp, invert, pose_difference
 from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
     CALIBRATE,
@@ -43,6 +44,7 @@ from visioncal.estimation.tolerance_probability import chance_within, radius_wit
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
+from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.vision.targets import load_target
@@ -135,6 +137,18 @@ def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said, writ
     found = scale_finding("board", load_target(name), MEASURED, MEASURED)
     assert said in found.words
     assert written in found.do.words
+
+
+@pytest.mark.parametrize(("repeatability", "is_doubt"), [((0.1, 0.01), True), ((5.0, 1.5), False)])
+def test_noise_is_plausible_by_the_kind_of_arm(repeatability, is_doubt) -> None:
+    arm = replace(
+        SOUND.arms[0], noise_mm=6.0, noise_deg=2.0, lower_bounds=None, repeatability=repeatability
+    )
+    scattered = replace(SOUND.pairs[0], weighted_held_out=Rms(30.0, 4.0))
+    found = ids(judge(replace(SOUND, arms=(arm,), pairs=(scattered,))))
+    assert ("unexplained" in found) == is_doubt
+    assert load_robot("so101").repeatability == (5.0, 1.5)
+    assert load_robot("ur5e").repeatability == (0.1, 0.01)
 
 
 @pytest.mark.parametrize("need", [None, Need(0.5)])
@@ -265,6 +279,16 @@ def test_poses_with_too_few_digits_are_the_cause(digits: int, is_found: bool) ->
     verdict = calibrate(replace(session, views=tuple(map(written, session.views)))).verdict
     assert (ids(verdict)[:1] == ["rounded_poses"]) == is_found
     assert not is_found or "positions to 1 mm and their quaternions to 0.001" in verdict.top[0]
+
+
+def test_angles_in_an_order_that_no_reading_brings_back_are_named() -> None:
+    cell = simulate(CellOptions(views=16))
+    poses = cell.robot.base_from_flange
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz")
+    misread = compose(Rotation.from_euler("ZYZ", angles).as_matrix(), poses[:, :3, 3])
+    verdict = calibrate(session_of(cell, misread)).verdict
+    assert ids(verdict)[:1] == ["misread_poses"]
+    assert "must turn by the same angle" in verdict.top[0]
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

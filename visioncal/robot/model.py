@@ -70,7 +70,8 @@ class Robot:
                 the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
                 may state their links' `mass_kg` and its centre `com_m`, in the frame in which the
                 joint's row ends, their `inertia_kg_m2` about it, and limits of their drives; any
-                description the `gravity_m_s2` in its base.
+                description the `gravity_m_s2` in its base, and the flange's `repeatability_mm` and
+                `repeatability_deg`.
 
         Raises:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
@@ -97,6 +98,15 @@ class Robot:
         model = _pinocchio_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
         return cls(name, tip, dict(document), chain, masses, inertias, rates, gravity, model)
+
+    @property
+    def repeatability(self) -> tuple[float, float]:
+        """Standard deviation of the flange from stop to stop [mm], [deg], by its description.
+
+        Where it states none, that of industrial arms.
+        """
+        table = DocumentTable(self.document, f"robot {self.name}")
+        return table.number("repeatability_mm", 0.1), table.number("repeatability_deg", 0.01)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -63,6 +63,8 @@ class JudgedArm:
     # nominal arm [mm].
     workspace_mm: float | None = None
     modelled: bool = False  # Whether its model is known.
+    # Standard deviation of its flange from stop to stop, as an arm of its kind has it [mm, deg].
+    repeatability: tuple[float, float] = (0.1, 0.01)
     can_tilt: bool = True  # Whether its flange turns about more than one direction.
     name: str = ""  # `Robot` and its name, for messages; empty for a single robot.
 

@@ -23,6 +23,8 @@ _LISTED = 3
 # Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
 # a small board far away.
 _OF_NOISE = 1.5
+# An arm's noise is plausible up to so many times what its kind has, at so far from its flange [m].
+_TIMES_REPEATABILITY, _REACH_M = 2.0, 0.3
 # Implausible noise of an arm is no doubt for a task that needs so many times as much.
 _GOOD_ENOUGH = 10.0
 
@@ -63,15 +65,20 @@ def _ratio(first: Rms, second: Rms) -> float:
 def _scatter(judged: Findings) -> Iterator[Finding]:
     """Findings on left-out views that disagree with the others, or with views in the fit."""
     words, views, is_fatal = [], list[ViewResult](), False
+    # A servo arm's own noise puts what is seen so far away.
+    by_arm = np.max([(0.0, 0.0), *(arm.repeatability for arm in judged.arms)], axis=0)
+    by_arm *= _TIMES_REPEATABILITY * np.sqrt(3.0)
+    by_arm[0] += 1e3 * _REACH_M * np.deg2rad(by_arm[1])
     for pair in judged.pairs:
         held = pair.weighted_held_out or pair.held_out
         beyond = []
-        for value, unit, (check, bad), noise in (
-            (held.mm, "mm", _LIMITS.scatter_mm, pair.noise.mm),
-            (held.deg or 0.0, "deg", _LIMITS.scatter_deg, pair.noise.deg or 0.0),
+        for value, unit, (check, bad), noise, of_arm in (
+            (held.mm, "mm", _LIMITS.scatter_mm, pair.noise.mm, by_arm[0]),
+            (held.deg or 0.0, "deg", _LIMITS.scatter_deg, pair.noise.deg or 0.0, by_arm[1]),
         ):
-            if value > max(check, _OF_NOISE * noise):
-                beyond.append(f"{figure(value)} {unit} (doubt begins at {check:g})")
+            least = max(check, of_arm)
+            if value > max(least, _OF_NOISE * noise):
+                beyond.append(f"{figure(value)} {unit} (doubt begins at {figure(least)})")
                 is_fatal |= value > bad
         if beyond:
             views += [view for view in pair.views if view.used and view.residual_mm is not None]
@@ -86,7 +93,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             Remedy(
                 "Look at the worst views for possible causes: a board, tool or instrument that "
                 "moved, rows paired with other poses, units or conventions of the poses, "
-                "intrinsics, a warped board, or an arm with large model errors.",
+                "intrinsics, a warped board, a marker of few pixels, or an arm with large errors.",
                 REVIEW,
             ),
             tuple(view.view for view in worst),
@@ -287,9 +294,10 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
     for arm in judged.arms:
         if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
             continue
+        limit_mm, limit_deg = _TIMES_REPEATABILITY * np.array(arm.repeatability)
         # Only noise whose confidence interval is above the limit counts.
         least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
-        if max(least_mm / _LIMITS.robot_mm, least_deg / _LIMITS.robot_deg) <= 1.0:
+        if max(least_mm / limit_mm, least_deg / limit_deg) <= 1.0:
             continue
         likelier = (
             "Look for what is likelier than noise of the arm: a board of another size than stated "
@@ -297,11 +305,12 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
             "instrument that was moved or reads worse than stated, a model of the arm that is off "
             "by as much, or poses that were read before the arm stood still."
         )
-        ratio = max(arm.noise_mm / _LIMITS.robot_mm, arm.noise_deg / _LIMITS.robot_deg)
+        ratio = max(arm.noise_mm / limit_mm, arm.noise_deg / limit_deg)
         yield Finding(
             UNEXPLAINED,
             "The residuals would take a flange that is off by "
-            f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; arms repeat to 0.1 mm.",
+            f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; such "
+            f"arms repeat to {mm_and_deg(*arm.repeatability)}.",
             Remedy(likelier),
-            until_mm=_GOOD_ENOUGH * ratio * _LIMITS.robot_mm,
+            until_mm=_GOOD_ENOUGH * ratio * limit_mm,
         ).of(arm.name)
