@@ -13,7 +13,7 @@ from visioncal.core.files import sha256, temporary_folder, write_atomically
 from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES, robot_file
 from visioncal.session.corners import FILE as CORNERS
 from visioncal.session.corners import write_corners
-from visioncal.session.document import RobotTable, TargetTable
+from visioncal.session.document import Kind
 from visioncal.session.images import inside_path
 from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import write_stream
@@ -80,35 +80,31 @@ def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
         Built-in names are kept.
     """
     declaration, placed, texts = session.declaration, dict(session.document), dict[str, str]()
-    target_document, robot_document = session.target_document, session.robot_document
-    for name, entry in declaration.named("target").items():
-        stated = entry.target if isinstance(entry, TargetTable) else ""
-        if target_document is None or not is_file(stated):
-            continue
-        path = _place_inside(stated, f"target_{name}.toml" if name else "target.toml")
-        content = target_document[name] if len(declaration.targets) > 1 else target_document
-        content, tables = stored_target(content, Path(path).stem)
-        texts |= {str(Path(path).with_name(table)): text for table, text in tables.items()}
-        texts[path] = tomli_w.dumps(content)
-        if name:
-            kept = {**entry.model_dump(), "target": path}
-            placed["targets"] = {**placed["targets"], name: kept}
-        else:
-            placed["target"] = path
-    for name, robot in declaration.named("robot").items():
-        model = robot.model if isinstance(robot, RobotTable) else None
-        several = len(declaration.robots) > 1
-        described = (robot_document or {}).get(name) if several else robot_document
-        if model is None or not is_file(model) or described is None:
-            continue
-        file, text = robot_file(described, model)
-        path = _place_inside(model, f"{name}_{file}" if name else file)
-        texts[path] = text
-        if name:
-            kept = {**robot.model_dump(exclude_none=True), "model": path}
-            placed["robots"] = {**placed["robots"], name: kept}
-        else:
-            placed["robot"] = {**placed["robot"], "model": path}
+    stored: tuple[tuple[Kind, str, Mapping[str, Any] | None], ...] = (
+        ("target", "target", session.target_document),
+        ("robot", "model", session.robot_document),
+    )
+    for kind, field, documents in stored:
+        several = len(getattr(declaration, f"{kind}s")) > 1
+        for name, table in declaration.named(kind).items():
+            stated, tables = getattr(table, field), dict[str, str]()
+            described = (documents or {}).get(name) if several else documents
+            if described is None or not is_file(stated):
+                continue
+            if kind == "target":
+                path = _place_inside(stated, f"target_{name}.toml" if name else "target.toml")
+                content, tables = stored_target(described, Path(path).stem)
+                text = tomli_w.dumps(content)
+            else:
+                file, text = robot_file(described, stated)
+                path = _place_inside(stated, f"{name}_{file}" if name else file)
+            texts |= {str(Path(path).with_name(table)): rows for table, rows in tables.items()}
+            texts[path] = text
+            if name:
+                kept = {**table.model_dump(exclude_none=True), field: path}
+                placed[f"{kind}s"] = {**placed[f"{kind}s"], name: kept}
+            else:
+                placed[kind] = path if kind == "target" else {**placed[kind], field: path}
     return placed, texts
 
 

@@ -120,7 +120,7 @@ _Loader.yaml_constructors = {
     f"{_STANDARD}bool": lambda _, node: _CONSTANTS[node.value.lower()],
     f"{_STANDARD}seq": lambda loader, node: loader.construct_sequence(node, deep=True),
     **dict.fromkeys(
-        (f"{_STANDARD}{kind}" for kind in ("map", "opencv-matrix", "opencv-nd-matrix")),
+        (f"{_STANDARD}{kind}" for kind in ("map", "opencv-matrix")),
         _Loader.mapping,
     ),
 }
@@ -163,7 +163,7 @@ def parse_xml(data: bytes, where: str) -> Element:
     return root
 
 
-_MATRICES = ("opencv-matrix", "opencv-nd-matrix")
+_MATRIX = "opencv-matrix"
 
 
 def read_opencv(path: Path) -> Mapping[str, Any]:
@@ -187,7 +187,7 @@ def read_opencv(path: Path) -> Mapping[str, Any]:
 
 def _with_matrices(value: object, where: str) -> object:
     if isinstance(value, Mapping):
-        if value.get("type_id") in _MATRICES:
+        if value.get("type_id") == _MATRIX:
             return matrix_from(value, where)
         return {key: _with_matrices(number, f"{where}: {key}") for key, number in value.items()}
     return value
@@ -195,7 +195,7 @@ def _with_matrices(value: object, where: str) -> object:
 
 def _from_xml(element: Element, where: str) -> object:
     place, children = f"{where}: <{element.tag}>", [*element.iterfind("*")]
-    if element.get("type_id") in _MATRICES:
+    if element.get("type_id") == _MATRIX:
         texts = {child.tag: (child.text or "").strip('" \n') for child in children}
         return matrix_from(
             {tag: text if tag == "dt" else _numbers(text, place) for tag, text in texts.items()},

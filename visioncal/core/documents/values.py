@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import MAX_VALUES, UTF16_MARKS, read_bytes, save_as_utf8
+from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
 
 # A number as others write it; also `1.`, `.5` and `1e-3`.
@@ -81,27 +81,19 @@ def mapping(value: object, where: str) -> Mapping[str, Any]:
 
 
 def matrix_from(value: object, where: str) -> FloatArray:
-    """Builds a matrix from OpenCV's rows, cols (or sizes), dt and data; raises DataError.
-
-    Returns:
-        (rows, cols) numbers, (rows, cols, channels) where dt names several channels, or an array
-        of the stated sizes.
-    """
+    """(rows, cols) or (rows, cols, channels) of OpenCV's rows, cols, dt and data; or DataError."""
     content = mapping(value, where)
     data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)
-    stated = content.get("sizes", [content.get("rows"), content.get("cols")])
-    sides = as_numbers(stated, f"{where}: rows, cols").reshape(-1).tolist()
     kind = re.fullmatch(r"([0-9]{0,3})[ucwsifdh]", str(content.get("dt", "d")))
-    channels = float(kind[1] or 1) if kind else 1.0
-    sides += [channels] * (channels > 1)
-    valid = kind is not None and all(side % 1 == 0 and side >= 0 for side in sides)
-    # A side of 0 must not hide the others.
-    valid = valid and len(sides) < 9 and math.prod(max(side, 1.0) for side in sides) <= MAX_VALUES
-    if not valid or math.prod(sides) != len(data):
-        words = " x ".join(f"{side:g}" for side in sides[:4])
+    sides = [number(content.get(name), f"{where}: {name}") for name in ("rows", "cols")]
+    sides += [float(kind[1])] if kind and kind[1] not in ("", "1") else []
+    if kind is None or any(side % 1 or side < 0 for side in sides) or math.prod(sides) != len(data):
+        words = " x ".join(f"{side:g}" for side in sides)
         raise DataError(
             f"{where}: {len(data)} numbers are no matrix of {words} of the type "
             f"{content.get('dt', 'd')!r}.",
             culprits=[where],
         )
-    return data.reshape([int(side) for side in sides])
+    # A side of 0 hides others of any size.
+    shape = [int(side) for side in sides] if len(data) else [0] * len(sides)
+    return data.reshape(shape)
