@@ -82,6 +82,5 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
         load_exportable(tmp_path / "out"), "text", selection
     )
     drawn = {chunk.entity_path for chunk in RrdReader(recording).stream()}
-    for entity in ("/cameras/top", "/targets/plate/sheet", "/robots/b/links", "/sight"):
+    for entity in ("/cameras/top", "/targets/plate/sheet", "/robots/b/links", "/network"):
         assert entity in drawn
-    assert "/network" in drawn

@@ -30,77 +30,65 @@ def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> t
     except ValueError:
         values = ()
     count = len(form.split(",")) if form else max(len(values), 1)
-    if len(values) != count or not all(map(math.isfinite, values)):
-        needed = f"{form} is needed, numbers" if form else "numbers are needed,"
-        raise DataError(
-            f"{option} is {words[:80]!r}; {needed} with commas between.",
-            culprits=[option],
-        )
+    needed = f"{form} is needed, numbers" if form else "numbers are needed,"
+    are_right = len(values) == count and all(map(math.isfinite, values))
+    _check(are_right, words, option, f"{needed} with commas between")
     return tuple(scale * value for value in values)
 
 
 def pair_in(words: str, option: str) -> tuple[int, int]:
-    """Parses the numbers of two views, written as 8,17.
-
-    Raises:
-        DataError: It is not two whole numbers.
-    """
+    """Parses the numbers of two views, written as 8,17."""
     numbers = _whole_numbers(words)
-    if len(numbers) != 2:
-        raise DataError(
-            f"{option} is {words[:40]!r}; the numbers of two views are needed, as 8,17.",
-            culprits=[option],
-        )
+    needed = "the numbers of two views are needed, as 8,17"
+    _check(len(numbers) == 2, words, option, needed)
     return numbers[0], numbers[1]
 
 
 def views_in(words: str, option: str) -> tuple[int, ...]:
-    """Parses numbers of views, written as 1-12,14.
-
-    Raises:
-        DataError: It is not whole numbers, or a range ends before it begins.
-    """
+    """Parses numbers of views, written as 1-12,14."""
     found: list[int] = []
     for part in words.split(","):
         ends = _whole_numbers(part.replace("-", ","))
-        if not 1 <= len(ends) <= 2 or ends[0] > ends[-1]:
-            raise DataError(
-                f"{option} is {words[:40]!r}; numbers of views are needed, as 1-12,14.",
-                culprits=[option],
-            )
+        is_range = 1 <= len(ends) <= 2 and ends[0] <= ends[-1]
+        _check(is_range, words, option, "numbers of views are needed, as 1-12,14")
         found += range(ends[0], ends[-1] + 1)
     return tuple(found)
 
 
 def serial_in(words: str, option: str) -> tuple[str, str]:
-    """Parses what a serial number is of, and the number, written as camera=1234.
-
-    Raises:
-        DataError: One of both is missing.
-    """
+    """Parses what a serial number is of, and the number, written as camera=1234."""
     what, sign, number = words.partition("=")
-    if not sign or not what:
-        raise DataError(
-            f"{option} is {words!r}; what it is of and the number are needed, as camera=1234.",
-            culprits=[option],
-        )
+    needed = "what it is of and the number are needed, as camera=1234"
+    _check(bool(sign and what), words, option, needed)
     return f"serial number, {what}", number
 
 
 def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
-    """Parses the width and height of images [px], written as 1280,800 or 1280x800.
+    """Parses the width and height of images [px], written as 1280,800 or 1280x800."""
+    numbers = _whole_numbers(words.replace("x", ","))
+    needed = (
+        "width and height of the images are needed [px], two whole numbers above 0, as 1280,800"
+    )
+    _check(len(numbers) == 2 and min(numbers) > 0, words, option, needed)
+    return numbers[0], numbers[1]
+
+
+def names_in(words: str, option: str) -> tuple[str, ...]:
+    """Parses an option of names separated by commas."""
+    names = tuple(part.strip() for part in words.split(","))
+    are_names = all(names) and len(set(names)) == len(names)
+    _check(are_names, words, option, "names are needed, each once, with commas between")
+    return names
+
+
+def _check(is_right: bool, words: str, option: str, needed: str) -> None:
+    """Refuses a value of an option.
 
     Raises:
-        DataError: It is not two whole numbers above 0.
+        DataError: It is not what is needed.
     """
-    numbers = _whole_numbers(words.replace("x", ","))
-    if len(numbers) != 2 or min(numbers) < 1:
-        raise DataError(
-            f"{option} is {words[:40]!r}; width and height of the images are needed [px], two "
-            "whole numbers above 0, as 1280,800.",
-            culprits=[option],
-        )
-    return numbers[0], numbers[1]
+    if not is_right:
+        raise DataError(f"{option} is {words[:80]!r}; {needed}.", culprits=[option])
 
 
 def _whole_numbers(words: str) -> list[int]:
@@ -108,21 +96,6 @@ def _whole_numbers(words: str) -> list[int]:
     cells = [part.strip() for part in words.split(",")]
     are_whole = all(cell.isdecimal() and len(cell) <= _MOST_DIGITS for cell in cells)
     return [int(cell) for cell in cells] if are_whole else []
-
-
-def names_in(words: str, option: str) -> tuple[str, ...]:
-    """Parses an option of names separated by commas.
-
-    Raises:
-        DataError: A name is empty or occurs twice.
-    """
-    names = tuple(part.strip() for part in words.split(","))
-    if not all(names) or len(set(names)) < len(names):
-        raise DataError(
-            f"{option} is {words[:80]!r}; names are needed, each once, with commas between.",
-            culprits=[option],
-        )
-    return names
 
 
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:

@@ -36,7 +36,6 @@ RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 # A cell of several robots: its frame, and who saw whom.
 CELL_FRAME = "cell"
 CELL = "/cell"
-SIGHT_LINE = "/sight"
 NETWORK = "/network"
 
 # A plan: obstacles, and the path of the arm.

@@ -6,13 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present.cell_poses import CellPoses, RobotState
+from visioncal.present.network_layout import pairs, sigma_words
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.recorder import Row, send_rows
 from visioncal.present.result_parts import FrameHierarchy
+from visioncal.results import Calibration
+from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
+from visioncal.session import Session
+from visioncal.session.frames import frames_of_kind
 from visioncal.vision.camera import matrix_3x3
 
 # Sizes as shares of the cell's size, which is the distance of flanges from their bases.
@@ -137,21 +143,52 @@ class Scene(CellPoses):
             stream.log(f"{entity}/reach", style, static=True)
             send_strips(stream, f"{entity}/reach", rows.values(), lines, timeline)
 
-    def log_lines(
+    def log_network(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
+        """Draws a cell's frame, and its network as a graph: frames, sigmas, and who saw whom."""
+        axes = rr.TransformAxes3D(2.0 * _AXIS * self.size_m, show_frame=False)
+        stream.log(paths.CELL, rr.CoordinateFrame(paths.CELL_FRAME), axes, static=True)
+        tree = calibration.tree
+        nodes = [paths.CELL_FRAME, *(frame for frame in tree.last if frame != paths.CELL_FRAME)]
+        captions = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
+        captions[paths.CELL_FRAME] = f"the frame of {tree.reference}"
+        labels = [f"{node}\n{captions.get(node) or sigma_words(tree, node)}" for node in nodes]
+        seen = [(pair.seer, pair.seen) for pair in pairs(calibration.views) if pair.used]
+        hangs = [(tree.parents[node], node) for node in nodes if node != paths.CELL_FRAME]
+        colour = [colours.LINK if node in captions else colours.USED for node in nodes]
+        edges = rr.GraphEdges([*hangs, *seen], graph_type="undirected")
+        graph = rr.GraphNodes(nodes, labels=labels, colors=colour)
+        stream.log(paths.NETWORK, graph, edges, static=True)
+
+    def log_seen_targets(
         self,
         stream: rr.RecordingStream,
-        entity: str,
-        strips: Mapping[int, Sequence[FloatArray]],
-        rejected: Mapping[int, bool],
-        width: float = 1.0,
+        session: Session,
+        calibration: Calibration,
+        seen: Sequence[ViewEvidence],
     ) -> None:
-        """Draws lines in the cell by row, coloured by whether the view was used."""
+        """Draws the target's outline as each view alone places it, in the order of the session."""
+        # A part without strips clears those of the previous view.
+        strips: dict[int, list[FloatArray]] = {}
+        boards = session.boards if any(view.cam_from_target is not None for view in seen) else {}
+        seers = {view.view: view.seer or paths.CAM_FRAME for view in calibration.views}
+        cameras = frames_of_kind(seers.values(), "camera")
+        for row, (view, view_seen) in enumerate(zip(session.views, seen, strict=True)):
+            if (name := session.board_of(view)) not in boards:
+                continue
+            strips[row] = []
+            if view_seen.cam_from_target is None or seers.get(view_seen.view) not in cameras:
+                continue
+            cell_from_cam = self.in_cell(seers[view_seen.view], view_seen.view)
+            if cell_from_cam is not None:
+                pose = cell_from_cam @ view_seen.cam_from_target
+                strips[row] = [apply(pose, board.closed_outline(boards[name]))]
         if not strips:
             return
-        frame = rr.CoordinateFrame(paths.CELL_FRAME)
-        style = rr.LineStrips3D.from_fields(radii=self._radius(width * _LINE))
+        frame, entity = rr.CoordinateFrame(paths.CELL_FRAME), paths.SEEN_TARGET
+        style = rr.LineStrips3D.from_fields(radii=self._radius(_LINE))
         stream.log(entity, frame, style, static=True)
-        colour = [colours.REJECTED if rejected[strip] else colours.DETECTED for strip in strips]
+        unused = [seen[row].view in self.rejected for row in strips]
+        colour = [colours.REJECTED if is_unused else colours.DETECTED for is_unused in unused]
         send_strips(
             stream, entity, strips, [*strips.values()], more=rr.LineStrips3D.columns(colors=colour)
         )

@@ -11,8 +11,8 @@ from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
-from visioncal.present.recording import codec, notes, paths, sights
-from visioncal.present.recording.overlays import Overlay
+from visioncal.present.recording import codec, notes, paths
+from visioncal.present.recording.overlays import Overlay, image_frames, log_image_frames
 from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
@@ -162,9 +162,9 @@ def _draw(
     if calibration is None:
         return
     if calibration.cell is not None:
-        sights.log_network(stream, scene, calibration)
-        sights.log_sights(stream, scene, session, calibration)
-    sights.log_seen_targets(stream, scene, session, calibration, seen)
+        scene.log_network(stream, calibration)
+        log_image_frames(stream, paths.IMAGE, image_frames(session, calibration))
+    scene.log_seen_targets(stream, session, calibration, seen)
     notes.log_static(stream, calibration)
     shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
     unposed = {row: scene.unposed(view) for view, row in rows.items()}

@@ -55,8 +55,8 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
         ]
         for seer in seers
     ]
-    things = [*_THINGS, *(f"{thing}s" for thing in _THINGS), paths.STOPS, paths.FRAMES]
-    things += [paths.SEEN_TARGET, paths.CELL, paths.SIGHT_LINE]
+    things = [*_THINGS, *(f"{thing}s" for thing in _THINGS), paths.STOPS]
+    things += [paths.FRAMES, paths.SEEN_TARGET, paths.CELL]
     frame = paths.BASE_FRAME if cell is None else paths.CELL_FRAME
     left: rrb.Container | rrb.View = _space_view(
         "Cell", things, _eye(session, calibration), frame, has_image=has_images
@@ -87,8 +87,8 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     overview = rrb.Horizontal(
         left, rrb.Vertical(*right, row_shares=shares), name="Overview", column_shares=[1.2, 1]
     )
-    network = rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK)
     residuals = rrb.Vertical(*(rrb.Horizontal(*row) for row in curves), name="Residuals")
+    network = rrb.GraphView(name="Network: frames with their sigmas", origin=paths.NETWORK)
     tabs = (overview, *((network,) if cell is not None else ()), residuals)
     return _with_panels(rrb.Tabs(*tabs, active_tab=0))
 
