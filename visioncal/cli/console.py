@@ -106,9 +106,9 @@ def asked(question: str) -> str:
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
     """Prints an error as one message to stderr, and with `as_json` as JSON to stdout, too."""
     next_step = error.next_step
-    if not next_step and error.culprits and isinstance(error, DataError):
+    if not next_step and isinstance(error, DataError):
         # The message says what is needed.
-        next_step = f"Correct {error.culprits[0]}, and run the command again."
+        next_step = f"Correct {[*error.culprits, 'that'][0]}, and run the command again."
     if as_json:
         document = {
             "class": type(error).__name__,
