@@ -222,9 +222,6 @@ class EndangeredFrames:
             f"{some_of(list(self.frames))} had joined the result that this one replaces: kept in "
             f"{self.file}."
         )
-        replaced = sorted(self.before.keys() & self.frames.keys())
-        if replaced:
-            words += f" It had another {some_of(replaced)} of an earlier time."
         if seen:
             words += (
                 f" By images of the camera as it was calibrated before: {some_of(seen)}. Place "

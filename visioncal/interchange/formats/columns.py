@@ -141,10 +141,10 @@ def _images(
     name = fields.find(requested.image) if requested.image else _image_name(fields, beside, taken)
     if name in fields.texts:
         return images_named(fields.texts[name], fields.folder, requested.images), name, ()
-    if beside is None:
+    has_images = beside is not None and any(is_image_name(file.name) for file in files_in(beside))
+    if beside is None or not (requested.images or has_images):
         return (), "", ()
-    views, numbered = fields.views or tuple(range(len(fields))), bool(fields.views)
-    paths, notes = images_beside(beside, requested.images, views, fields.places, numbered=numbered)
+    paths, notes = images_beside(beside, fields.views, fields.places)
     return paths, "", notes
 
 

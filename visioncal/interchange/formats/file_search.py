@@ -100,30 +100,22 @@ def is_image_name(name: str) -> bool:
 
 
 def images_beside(
-    folder: Path,
-    chosen: Path | None,
-    views: Sequence[int],
-    labels: Sequence[str],
-    *,
-    numbered: bool,
+    folder: Path, views: Sequence[int], labels: Sequence[str]
 ) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
-    """Pairs rows with the images of `chosen`, else with any in `folder`, and notes assumptions.
+    """Pairs rows with the images of a folder, and notes assumptions; raises DataError.
 
-    With `numbered` the rows' numbers are from the source's names, as are the images'; otherwise
-    both are paired in natural order, and their counts must agree. Raises DataError.
+    By the rows' numbers in the source's names (`views`), where there are some and the images have
+    them, too; otherwise both are paired in natural order, and their counts must agree.
     """
-    if chosen is None and not any(is_image_name(path.name) for path in files_in(folder)):
-        return (), ()
-    folder = chosen or folder
     images = _images_in(folder)
     of_views = [image for image in images if number_in(image.name) in set(views)]
     by_number = _unique_numbers(of_views)
-    if numbered and 0 < len(by_number) == len(of_views):
+    if 0 < len(by_number) == len(of_views):
         return tuple(by_number.get(view) for view in views), ()
     first, last = images[0].name, images[-1].name
-    if len(images) != len(views):
+    if len(images) != len(labels):
         raise DataError(
-            f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(views)} "
+            f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(labels)} "
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
             culprits=[str(folder)],
             next_step="Name each row's image with --image-column, or remove what is over. Where "
