@@ -35,8 +35,6 @@ from visioncal.interchange.formats.reading import (
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 # Present epochs are about 1e9 s: (larger than, seconds a unit).
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-# Numbers of values that a pose in one field may have.
-_WHOLE_POSES = (6, 7, 12, 16)
 
 
 def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:
@@ -97,20 +95,6 @@ def foreign_from(
         notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     paths, image_name, more = _images(fields, requested, images, used)
-    if camera is None and not paths:
-        candidates = [
-            name
-            for name, numbers in fields.numbers.items()
-            if numbers.ndim > 1 and numbers[0].size in _WHOLE_POSES and name not in used
-        ]
-        if candidates:
-            raise DataError(
-                f"{fields.name}: which of its fields are the target's poses is not known; "
-                f"{some_of(candidates)} may be.",
-                culprits=candidates,
-                next_step="Name them with --camera-columns; where they are of the camera in the "
-                "target, with --camera-inverse.",
-            )
     return ForeignRecording(
         name=fields.name,
         robot=robot,
@@ -241,22 +225,17 @@ def _poses(
 
 def _timed(fields: Fields, stamp: str, numbers: PoseNumbers) -> tuple[FloatArray, PoseNumbers]:
     """Times [s] and poses of the samples that have a pose."""
-    stamps, places = fields.column(stamp)[:, 0], fields.places
-    if not np.isfinite(stamps).all():
-        place = places[int(np.argmin(np.isfinite(stamps)))]
-        raise DataError(f"{place}: the time is missing.", culprits=[place])
-    not_increasing = np.diff(stamps) <= 0
-    if not_increasing.any():
-        place = places[int(np.argmax(not_increasing)) + 1]
+    stamps, rows = fields.column(stamp)[:, 0], np.flatnonzero(numbers.present)
+    bad = ~np.isfinite(stamps)
+    bad[1:] |= np.diff(stamps) <= 0
+    if bad.any() or len(rows) < 3:
+        place = fields.places[int(np.argmax(bad))]
+        fault = "the time is missing, or does not increase" if bad.any() else "under three poses"
         raise DataError(
-            f"{place}: the time does not increase from the row before.",
+            f"{place}: {fault}.",
             culprits=[place],
             next_step="Sort the rows by time and remove doubled ones.",
         )
-    rows = np.flatnonzero(numbers.present)
-    if len(rows) < 3:
-        place = numbers.places[0]
-        raise DataError(f"{place}: {len(rows)} poses; 3 or more are needed.", culprits=[place])
     return _in_seconds(stamps)[rows], numbers.rows(rows)
 
 
