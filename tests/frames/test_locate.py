@@ -230,7 +230,6 @@ def test_the_region_holds_the_true_place(options):
         plane += [pick_by_plane(cell, calibration, rng) for _ in range(10)]
         target += [pick_by_target(cell, calibration, BOARD, rng) for _ in range(10)]
     for picks in (plane, target):
-        held = np.mean([pick.located.holds(pick.truth) for pick in picks])
         near = [
             1e3 * np.linalg.norm(pick.truth - pick.located.p_base) <= pick.located.radius95_mm
             for pick in picks
@@ -238,7 +237,6 @@ def test_the_region_holds_the_true_place(options):
         # Of 80 picks 95 %, with a standard deviation of 2.4 %; picks of one cell share its
         # calibration, so that they count for fewer: four times that. A region that was too wide by
         # half would hold every one of them.
-        assert held == pytest.approx(0.95, abs=0.1)
         assert np.mean(near) == pytest.approx(0.95, abs=0.1)
 
 
@@ -306,10 +304,6 @@ def test_a_place_tells_where_its_uncertainty_is_from():
     assert found.budget_mm["robot"] == pytest.approx(1e3 * np.sqrt(3e-8))
     # Two directions of 0.2 mm: chi-square's 95 % quantile of two is 5.991.
     assert found.radius95_mm == pytest.approx(0.2 * np.sqrt(5.991), rel=1e-3)
-    assert found.holds(np.array([0.2e-3 * 2.44, 0.0, 0.0]))
-    assert not found.holds(np.array([0.2e-3 * 2.46, 0.0, 0.0]))
-    # Off an exactly known plane there is nothing, however near.
-    assert not found.holds(np.array([0.0, 0.0, 1e-6]))
     # With the noise from few residuals, the region is wider.
     assert Located(np.zeros(3), parts, 8.0).radius95_mm > 1.15 * found.radius95_mm
 
@@ -417,8 +411,7 @@ def test_a_camera_that_was_stated_beside_measured_poses_looks(tmp_path, target):
     plane = Plane.through(base_from_target[:3, 2], expected)
     px = project(stated, in_cam[None])
     (found,) = locate(again, px, plane, cell.robot.base_from_flange[0], sigma_px=0.1)
-    assert found.holds(expected)
-    assert found.radius95_mm < 1.0
+    assert 1e3 * np.linalg.norm(found.p_base - expected) < found.radius95_mm < 1.0
 
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"

@@ -27,9 +27,6 @@ from visioncal.session.selecting import EYE, Choice
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import load_target
 
-# A direction with less than this share of the largest variance is exact, such as the normal of a
-# declared plane; a point may be off along it by rounding only [m].
-_EXACT_SHARE, _ROUNDING_M = 1e-12, 1e-9
 # Factor beyond the distances of the views that is named: a board of a third of the image reaches
 # that much nearer or farther than its middle where it is steeply tilted.
 _BEYOND = 1.5
@@ -83,31 +80,8 @@ class Located:
         if not total > 0.0:
             return 0.0
         count = total**2 / float(np.sum(values**2))
-        return float(1e3 * np.sqrt(total * _quantile95(count, self.freedom)))
-
-    def holds(self, p_base: FloatArray) -> bool:
-        """Whether the 95 % ellipsoid around the position contains a point.
-
-        Its semi-axes are the covariance's, times the root of the 95 % quantile of `n F(n, freedom)`
-        over the n uncertain directions: two for a point of an exactly known plane. The point is
-        (3,) [m].
-        """
-        values, vectors = np.linalg.eigh(self.covariance)
-        offset = vectors.T @ (p_base - self.p_base)
-        is_uncertain = values > _EXACT_SHARE * max(float(values[-1]), 0.0)
-        if np.any(np.abs(offset[~is_uncertain]) > _ROUNDING_M):
-            return False
-        count = int(is_uncertain.sum())
-        if not count:
-            return True
-        squared = float(np.sum(offset[is_uncertain] ** 2 / values[is_uncertain]))
-        return squared <= count * _quantile95(count, self.freedom)
-
-
-def _quantile95(count: float, freedom: float) -> float:
-    """95 % quantile of F with `count` and `freedom` degrees of freedom."""
-    # Beyond the limit, F does not differ from chi-square, and its series lose digits.
-    return float(f_limit(0.05, count, min(freedom, 1e6)))
+        # Beyond the limit, F does not differ from chi-square, and its series lose digits.
+        return float(1e3 * np.sqrt(total * f_limit(0.05, count, min(self.freedom, 1e6))))
 
 
 @typed
