@@ -8,15 +8,19 @@ import numpy as np
 from visioncal.calibration.pipeline.cell_fit import CellFit, within
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.validate import HeldOutResiduals, cross_validate
+from visioncal.calibration.stages.validate import (
+    HeldOutResiduals,
+    needed_frames,
+    pose_residuals,
+)
+from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply_each
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import solve_without
 from visioncal.results.sections import UncertaintyResult
 from visioncal.session import frame_name
@@ -30,19 +34,34 @@ def left_out(cell_fit: CellFit) -> HeldOutResiduals:
     """Residuals of the inliers, each by a fit without its stop, to first order."""
     fit, part, mount = cell_fit.inlier_fit.fit, cell_fit.inlier_problem, cell_fit.cell.mount
     used = np.flatnonzero(cell_fit.inlier_fit.used)
-
-    def refit(kept: Mask) -> State:
-        if cell_fit.solver == "joint" or mount is None:
-            return solve_without(part, fit, kept)
-        return closed_form_state(part.subset(kept), cell_fit.solver, fit.state, mount)
-
-    def pixels(rows: IntArray, predicted: FloatArray, state: State) -> FloatArray:
-        mine = used[rows].tolist()
-        seen = [cell_fit.cell.rows[at] for at in mine], [cell_fit.poses[at] for at in mine]
-        return cell_fit.pixels(*seen, predicted, state)
-
+    stops = np.unique(part.observations.stops, return_inverse=True)[1]
+    needed, count = needed_frames(part), int(stops.max()) + 1
+    # Few stops are held out one by one; with more, ten groups suffice, of no neighbours.
+    folds = count if count <= 30 else 10
+    fold = stops % folds
+    away_m, away_rad, rms_px = (np.full(len(part), np.nan) for _ in range(3))
+    with one_blas_thread():
+        for out in range(folds):
+            kept = fold != out
+            determined = needed[kept].any(axis=0)
+            held = ~kept & ~(needed & ~determined).any(axis=1)
+            if not held.any():
+                continue
+            state = (
+                solve_without(part, fit, kept)
+                if cell_fit.solver == "joint" or mount is None
+                else closed_form_state(part.subset(kept), cell_fit.solver, fit.state, mount)
+            )
+            predicted = part.predicted(state)
+            off_m, off_rad = pose_residuals(part, state, predicted)
+            away_m[held], away_rad[held] = off_m[held], off_rad[held]
+            mine = used[held].tolist()
+            seen = [cell_fit.cell.rows[at] for at in mine], [cell_fit.poses[at] for at in mine]
+            rms_px[held] = cell_fit.pixels(*seen, predicted[held], state)
+    method = "leave-one-out" if folds == count else f"{folds}-fold"
+    unit = "views" if count == len(part) else "stops"
     of = {None: "", "instrument": ", of the whole fit"}.get(mount, ", of the hand-eye fit")
-    return cross_validate(part, refit, pixels, of)
+    return HeldOutResiduals(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
 
 
 def _covariances_of_edges(

@@ -110,17 +110,18 @@ class Picks:
     @cached_property
     def good_for_mm(self) -> float:
         """The least need of position alone that would be met [mm]."""
-        covariances, offsets = self._with_strays
-        return 1e3 * radius_within(covariances, NeedLimits.probability[0], self.freedom, offsets)
+        return 1e3 * self._least_need(0)
 
     @cached_property
     def good_for_deg(self) -> float:
         """The least need of rotation alone that would be met [deg]."""
+        return float(np.rad2deg(self._least_need(3)))
+
+    def _least_need(self, rolled: int) -> float:
         covariances, known = self._with_strays
-        turned = np.roll(covariances, 3, axis=(1, 2))
-        offsets = None if known is None else np.roll(known, 3, axis=1)
-        share = NeedLimits.probability[0]
-        return float(np.rad2deg(radius_within(turned, share, self.freedom, offsets)))
+        covariances = np.roll(covariances, rolled, axis=(1, 2))
+        offsets = None if known is None else np.roll(known, rolled, axis=1)
+        return radius_within(covariances, NeedLimits.probability[0], self.freedom, offsets)
 
     @property
     def budget_mm(self) -> dict[str, float]:

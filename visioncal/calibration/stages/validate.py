@@ -1,13 +1,12 @@
-"""Cross-validation: each observation is predicted by a fit without its stop."""
+"""Residuals of observations, of those that are left out of a fit, and of their corners."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, distances
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, Corners, FloatArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.vision.camera import project
@@ -25,50 +24,7 @@ class HeldOutResiduals:
     rms_px: FloatArray  # (n,) reprojection error through the chain [px]; NaN without corners.
 
 
-def cross_validate(
-    problem: Problem,
-    refit: Callable[[Mask], State],
-    pixels: Callable[[IntArray, FloatArray, State], FloatArray],
-    of: str = "",
-) -> HeldOutResiduals:
-    """Holds stops out, one by one or in ten groups, and predicts their observations.
-
-    Args:
-        problem: The n observations in the fit.
-        refit: Fits those of an (n,) mask.
-        pixels: Reprojection errors (m,) [px] of some observations (m,), which are predicted at
-            (m, 4, 4), at a state.
-        of: What is fitted, as a part of the method's words.
-
-    Returns:
-        The residuals; NaN for what the others do not determine.
-    """
-    stops = np.unique(problem.observations.stops, return_inverse=True)[1]
-    needed = _needed_frames(problem)
-    count = int(stops.max()) + 1
-    # Few stops are held out one by one; with more, ten groups suffice.
-    folds = count if count <= 30 else 10
-    # Strides, so that a group's stops are not neighbours.
-    fold = stops % folds
-    away_m, away_rad, rms_px = (np.full(len(problem), np.nan) for _ in range(3))
-    with one_blas_thread():
-        for left_out in range(folds):
-            kept = fold != left_out
-            determined = needed[kept].any(axis=0)
-            held = ~kept & ~(needed & ~determined).any(axis=1)
-            if not held.any():
-                continue
-            state = refit(kept)
-            predicted = problem.predicted(state)
-            off_m, off_rad = pose_residuals(problem, state, predicted)
-            away_m[held], away_rad[held] = off_m[held], off_rad[held]
-            rms_px[held] = pixels(np.flatnonzero(held), predicted[held], state)
-    method = "leave-one-out" if folds == count else f"{folds}-fold"
-    unit = "views" if count == len(problem) else "stops"
-    return HeldOutResiduals(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
-
-
-def _needed_frames(problem: Problem) -> Mask:
+def needed_frames(problem: Problem) -> Mask:
     """(n, u) the unknown frames in the path of each observation."""
     needed = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
     for group in problem.groups:

@@ -13,7 +13,7 @@ from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
 from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at, without
-from visioncal.results import Rms, ViewResult
+from visioncal.results import ViewResult
 
 _LIMITS = CalibrationLimits()
 # Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
@@ -52,14 +52,6 @@ def collect_findings(judged: Findings) -> list[Finding]:
         *robots,
         *(warning for warning in judged.warnings if SUSPECTS[warning.kind].is_doubt),
     ]
-
-
-def _ratio(first: Rms, second: Rms) -> float:
-    """The largest ratio of two residuals, of position and of rotation; 0 where all are rounding."""
-    pairs = [(first.mm, second.mm), (first.deg or 0.0, second.deg or 0.0)]
-    if first.deg is None or second.deg is None:
-        pairs.pop()
-    return max(one / max(other, _ROUNDING) if one > _ROUNDING else 0.0 for one, other in pairs)
 
 
 def _scatter(judged: Findings) -> Iterator[Finding]:
@@ -125,8 +117,14 @@ def _left_out(pair: JudgedPair) -> Iterator[Finding]:
 
 def _holdout(pair: JudgedPair) -> Iterator[Finding]:
     """Finding on views that the session holds back, and the result does not predict."""
-    holdout = pair.holdout
-    if holdout is not None and (ratio := _ratio(holdout, pair.held_out)) > _LIMITS.holdout:
+    holdout, left_out = pair.holdout, pair.held_out
+    if holdout is None:
+        return
+    ratio = max(
+        one / max(other, _ROUNDING)
+        for one, other in ((holdout.mm, left_out.mm), (holdout.deg or 0.0, left_out.deg or np.inf))
+    )
+    if ratio > _LIMITS.holdout and max(holdout.mm, holdout.deg or 0.0) > _ROUNDING:
         yield Finding(
             "holdout",
             f"The views that the session holds back are missed by {holdout.words}, {ratio:.0f} "
@@ -188,17 +186,15 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
             is_fatal |= sigma > bad
     if not weak:
         return
-    named = ", ".join(weak)
-    least = f"{_LIMITS.sigma_mm[0]:g} mm and {_LIMITS.sigma_deg[0]:g} deg"
-    known = f"known to {named} (sigma; doubt begins at {least}): most of that"
-    words = f"Weakly determined by the motion, with their sigmas: {named}; doubt begins at {least}."
-    step = _tilted(judged)
+    step, by = _tilted(judged), "by the motion"
     if any(warning.do == NO_JOINTS for warning in judged.warnings):
-        words = f"As mounts, {known} is the arm's, and is the same in every recording."
-        step = NO_JOINTS
+        step, by = NO_JOINTS, "by the arm's own errors"
     elif _is_of_board(judged):
-        step = MEASURE_BOARD
-        words = f"Frames are {known} is the board's, as well as its size is stated."
+        step, by = MEASURE_BOARD, "by how well the board's size is stated"
+    words = (
+        f"Weakly determined {by}, with their sigmas: {', '.join(weak)}; doubt begins at "
+        f"{_LIMITS.sigma_mm[0]:g} mm and {_LIMITS.sigma_deg[0]:g} deg."
+    )
     yield Finding("weak_motion", words, step, is_fatal=is_fatal, until_mm=0.0)
 
 

@@ -183,21 +183,13 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
 
 def _hidden(first: Mapping[str, Finding]) -> Iterator[str]:
     """Kinds of findings that are mere effects of another finding."""
-    arm = first.get(ARM_ERRORS)
     for name, finding in first.items():
         if name == "lens" and not finding.mahalanobis_sq:
             # It was refined with the rest.
             continue
         for kind in first.keys() - {name}:
-            # Errors of the arm that are more evident are no effect of what the corners alone show.
-            is_clearer = (
-                name == "lens_changed"
-                and kind == ARM_ERRORS
-                and arm is not None
-                and arm.mahalanobis_sq > finding.mahalanobis_sq
-            )
-            among = {kind, CHAIN} if SUSPECTS[kind].of_chain else {kind}
-            if not is_clearer and among & {*SUSPECTS[name].hides}:
+            of_chain = SUSPECTS[kind].of_chain and CHAIN in SUSPECTS[name].hides
+            if of_chain or kind in SUSPECTS[name].hides:
                 yield kind
 
 
