@@ -343,8 +343,8 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
         ("ros", Selection(), r"and one is written.*--edge \w+_from_cam_\w+"),
         ("ros", Selection("base_a_from_target_plate"), "its pose is needed"),
         ("ros", Selection("base_a_from_cam_tpo"), "Did you mean cam_top"),
-        ("ros", Selection("all", inverse=True), "--inverse, --parent and --child are of one"),
-        ("opencv", Selection("all"), "opencv holds one transform"),
+        ("ros", Selection("all", inverse=True), "without --inverse, --parent and --child"),
+        ("opencv", Selection("all"), "written as ros, "),
         ("easy-handeye", Selection(), "holds the camera"),
     ],
 )

@@ -93,21 +93,17 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     if selection.edge == _ALL:
         available = placements(source, selection.camera)
         _check_takes(form, selection)
-        why = ""
-        if form.write_all is None:
-            why = f"{form.name} holds one transform"
-        elif selection.inverse or selection.parent is not None or selection.child is not None:
-            why = "--inverse, --parent and --child are of one transform"
-        elif available.cell is None:
-            why = f"{available.words} is of no whole cell"
-        if why:
+        is_of_one = selection.inverse or selection.parent is not None or selection.child is not None
+        if form.write_all is None or is_of_one or available.cell is None:
+            forms = [one.name for one in EXPORT_FORMATS if getattr(one, "write_all", None)]
             raise DataError(
-                f"--edge all: {why}.",
+                f"--edge all: all transforms are of a whole cell, written as {', '.join(forms)}, "
+                "without --inverse, --parent and --child.",
                 culprits=["--edge"],
                 next_step=f"Name one of {', '.join(available.by_name)}.",
             )
         contents = tuple(_content(form, selection, available, name) for name in available.by_name)
-        text = "" if form.write_all is None else form.write_all(contents)
+        text = form.write_all(contents)
     else:
         contents = (select(source, selection, form),)
         text = form.write(contents[0])

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 
 from visioncal.core.documents.structured import read_yaml
-from visioncal.core.documents.values import mapping, number
+from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.columns import foreign_from
@@ -208,32 +208,18 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
     if "Charuco" not in kind:
         notes.append(f"The target finder {kind[:60]!r} has no twin here; name the target.")
         return None
-    where, dictionary = "target_finder", finder.get("dictionary")
-    if not isinstance(dictionary, str):
-        wanted = _integer(dictionary, f"{where}: dictionary")
-        names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-        dictionary = next((name for name in names if getattr(cv2.aruco, name) == wanted), None)
-        if dictionary is None:
-            raise DataError(
-                f"{where}: dictionary is {wanted}, which OpenCV does not have.",
-                culprits=[f"{where}: dictionary"],
-            )
+    dictionary = finder.get("dictionary")
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    # What is wrong in it is told of the target.
     return {
         "kind": "charuco",
-        "columns": _integer(finder.get("cols"), f"{where}: cols"),
-        "rows": _integer(finder.get("rows"), f"{where}: rows"),
-        "square_m": number(finder.get("chessboard_dim"), f"{where}: chessboard_dim"),
-        "marker_m": number(finder.get("aruco_marker_dim"), f"{where}: aruco_marker_dim"),
-        "dictionary": dictionary,
+        "columns": finder.get("cols"),
+        "rows": finder.get("rows"),
+        "square_m": finder.get("chessboard_dim"),
+        "marker_m": finder.get("aruco_marker_dim"),
+        "dictionary": next((n for n in names if getattr(cv2.aruco, n) == dictionary), dictionary),
         "legacy": False,
     }
-
-
-def _integer(value: object, where: str) -> int:
-    parsed = number(value, where)
-    if parsed % 1:
-        raise DataError(f"{where} is {parsed}; a whole number is needed.", culprits=[where])
-    return int(parsed)
 
 
 def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
