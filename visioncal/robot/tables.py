@@ -128,8 +128,7 @@ def table_from_document(document: Mapping[str, Any]) -> DHTable:
 
     Each `[[joint]]` holds a_m, alpha_rad, d_m, and may hold name, theta_offset_rad, beta_rad
     (hayati), type, lower_deg and upper_deg (lower_m and upper_m where prismatic; 360 deg where
-    absent), gear_ratio, sine_rad and cosine_rad. `[base]` and `[flange]` hold xyz_m and rpy_rad;
-    `[flange]` may be a row of the convention instead, with theta_rad.
+    absent), gear_ratio, sine_rad and cosine_rad. `[base]` and `[flange]` hold xyz_m and rpy_rad.
 
     Raises:
         DataError: A field is missing, unknown or out of range.
@@ -143,10 +142,9 @@ def table_from_document(document: Mapping[str, Any]) -> DHTable:
     prismatic = np.array([_is_prismatic(row) for row in tables])
     limits = np.array([_limits(row) for row in tables])
     across = np.array([_across(row, convention) for row in tables])
-    flange, last = _flange(subtable(table, "flange"), convention)
     nothing = np.zeros((1, 4))
     modified = convention == "modified"
-    a, alpha, beta, parallel = np.vstack([across, last] if modified else [nothing, across]).T
+    a, alpha, beta, parallel = np.vstack([across, nothing] if modified else [nothing, across]).T
     return DHTable(
         name,
         table.text("tip", "flange"),
@@ -160,7 +158,7 @@ def table_from_document(document: Mapping[str, Any]) -> DHTable:
         beta,
         parallel > 0.0,
         _pose(subtable(table, "base")),
-        flange,
+        _pose(subtable(table, "flange")),
         limits[:, 0],
         limits[:, 1],
         np.array([joint_function(row, _FUNCTION_KEYS) for row in tables]),
@@ -175,6 +173,7 @@ def table_document(table: DHTable, source: str = "") -> dict[str, Any]:
     """
     modified = table.convention == "modified"
     before = table.base if modified else table.base @ table.along_x[0]
+    behind = table.along_x[-1] @ table.flange if modified else table.flange
     document: dict[str, Any] = {
         "schema": 1,
         "name": table.name,
@@ -185,10 +184,8 @@ def table_document(table: DHTable, source: str = "") -> dict[str, Any]:
     }
     if not np.array_equal(before, np.eye(4)):
         document["base"] = _pose_document(before)
-    if modified:
-        document |= _flange_row(table)
-    elif not np.array_equal(table.flange, np.eye(4)):
-        document["flange"] = _pose_document(table.flange)
+    if not np.array_equal(behind, np.eye(4)):
+        document["flange"] = _pose_document(behind)
     return document
 
 
@@ -257,32 +254,6 @@ def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, f
             "It looks like millimetres: multiply a_m and d_m of all joints by 0.001.",
         )
     return length_m, row.number("alpha_rad"), beta, float(parallel)
-
-
-def _flange(row: DocumentTable, convention: Convention) -> tuple[FloatArray, FloatArray]:
-    """The constant after X_n, and X_n as (1, 4) where the convention has no row for it."""
-    nothing = np.zeros((1, 4))
-    if not row.content or any(key in row.content for key in _POSE_KEYS):
-        return _pose(row), nothing
-    across = np.array([_across(row, convention)])
-    a, alpha, beta, _ = across[0]
-    along = about_z(np.asarray(row.number("theta_rad", 0.0)), np.asarray(row.number("d_m")))
-    if convention == "modified":
-        return along, across
-    return along @ about_x(a, alpha, beta), nothing
-
-
-def _flange_row(table: DHTable) -> dict[str, Any]:
-    """`[flange]` of a modified table: a row where possible, else a pose."""
-    flange = table.flange
-    theta = math.atan2(flange[1, 0], flange[0, 0])
-    if np.array_equal(flange, about_z(np.asarray(theta), flange[2, 3])):
-        numbers = (table.a_m[-1], table.alpha_rad[-1], flange[2, 3], theta)
-        if not any(numbers):
-            return {}
-        keys = ("a_m", "alpha_rad", "d_m", "theta_rad")
-        return {"flange": dict(zip(keys, map(float, numbers), strict=True))}
-    return {"flange": _pose_document(table.along_x[-1] @ flange)}
 
 
 def _pose(row: DocumentTable) -> FloatArray:
