@@ -186,6 +186,20 @@ def test_the_offset_of_two_clocks_is_found(tmp_path, ahead_s):
     assert max(away) < 1e-4
 
 
+def test_two_files_of_stops_with_the_same_times_are_rows(tmp_path):
+    stamps = 6.0 * np.arange(len(BASE_FROM_FLANGE))
+    for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
+        np.savetxt(tmp_path / f"{name}.txt", np.hstack([stamps[:, None], quaternions(poses)]))
+    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
+    session = convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
+    assert not session.streams
+    for name, poses in (
+        ("base_from_flange", BASE_FROM_FLANGE),
+        ("cam_from_target", CAM_FROM_TARGET),
+    ):
+        np.testing.assert_allclose(poses_of(session, name), poses, atol=1e-14)
+
+
 def test_streams_of_different_motions_are_refused(tmp_path):
     stamps = np.arange(0, 30, 0.02)
     for name, poses in (("robot", swung(stamps)), ("camera", swung(1.7 * stamps + 3))):

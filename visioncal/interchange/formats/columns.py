@@ -181,6 +181,10 @@ def with_camera_file(
     if robot_stamp and camera_stamp:
         robot_s, robot = _timed(robot_fields, robot_stamp, robot)
         camera_s, camera = _timed(camera_fields, camera_stamp, camera)
+        if np.array_equal(robot_s, camera_s):
+            # Rows that one program wrote, of stops whose times tell nothing about the clocks.
+            notes = (*notes, "Both files have the same times: their rows belong together.")
+            return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)
         return ForeignRecording(
             name=name,
             robot=PoseNumbers.empty(camera.places),
