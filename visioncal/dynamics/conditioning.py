@@ -110,18 +110,12 @@ class LowPass:
         return self._weighted_sums(invalid.astype(float), weights / weights.sum())
 
     def _weighted_sums(self, values: FloatArray, taps: FloatArray) -> FloatArray:
-        """Weighted sums: blocks of samples times blocks of taps, summed along the diagonals."""
-        count, flat = self.count(len(values)), values.reshape(len(values), -1)
-        if len(taps) == 1:
-            return values
-        blocks = (len(taps) - 1) // self.step
-        kept = flat[: (count + blocks - 1) * self.step].reshape(-1, self.step, flat.shape[1])
-        parts = taps[:-1].reshape(blocks, self.step) @ kept
-        last = flat[blocks * self.step :: self.step][:count]
-        total = taps[-1] * last
-        for block in range(blocks):
-            total += parts[block : block + count, block]
-        return np.asarray(total.reshape(count, *values.shape[1:]))
+        """Weighted sums of full windows."""
+        from scipy.signal import upfirdn
+
+        first = (len(taps) - 1) // self.step
+        sums = upfirdn(taps, values, 1, self.step, axis=0)
+        return np.asarray(sums[first : first + self.count(len(values))])
 
 
 def bandwidth(q: FloatArray, rate_hz: float) -> float:
