@@ -286,9 +286,11 @@ def equations_from(
     """
     stops, linear = problem.observations.stops, problem.linear(solution.state)
     augmented = np.concatenate([linear.jacobian, linear.residuals[:, :, None]], axis=2)
-    weighted = Whitening.of(problem, solution.noise, linear.by_errors).inverse(augmented)
+    # Errors are shared within a stop alone: the weights may be on either side.
+    whitening = Whitening.of(problem, solution.noise, linear.by_errors)
+    weighted = whitening.inverse(augmented[:, :, asked])
     total = np.zeros((len(asked), augmented.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         at_stop = stops == stop
-        total = total + gram(augmented[at_stop][:, :, asked], weighted[at_stop])
+        total = total + gram(weighted[at_stop], augmented[at_stop])
         yield stop, total[:, :-1], total[:, -1]
