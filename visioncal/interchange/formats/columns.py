@@ -10,6 +10,7 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
+from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.interchange.formats.file_search import (
     files_in,
     images_beside,
@@ -181,7 +182,8 @@ def with_camera_file(
     if robot_stamp and camera_stamp:
         robot_s, robot = _timed(robot_fields, robot_stamp, robot)
         camera_s, camera = _timed(camera_fields, camera_stamp, camera)
-        if np.array_equal(robot_s, camera_s):
+        is_slow = len(robot_s) > 1 and float(np.median(np.diff(robot_s))) > LONGEST_GAP_S
+        if is_slow and np.array_equal(robot_s, camera_s):
             # Rows that one program wrote, of stops whose times tell nothing about the clocks.
             notes = (*notes, "Both files have the same times: their rows belong together.")
             return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)
