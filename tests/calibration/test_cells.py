@@ -640,5 +640,5 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     now, was = ({view.number: view.numbers for view in it.views} for it in (mended, three))
     assert now == was
     other = next(view.number for view in three.views if view.text["target"] != "plate_b")
-    with pytest.raises(DataError, match=r"of another .*target"):
+    with pytest.raises(DataError, match=r"another .*target"):
         exchange_views(three, first, other)

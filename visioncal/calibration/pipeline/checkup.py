@@ -15,10 +15,12 @@ from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
-from visioncal.core.number_format import counted, some_of
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
+from visioncal.robot import Robot
 from visioncal.session import Session
 
 
@@ -132,7 +134,7 @@ def _refused(kind: str, error: VisioncalError) -> Finding:
 
 
 def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
-    """Findings on too poor motion, and on outliers."""
+    """Findings on too poor motion, on outliers, and on what all views disagree by."""
     try:
         cell, inliers = first_inliers(read_cell(run), run, mount)
     except VisioncalError as error:
@@ -150,6 +152,17 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
                 CALIBRATE,
             ),
             views,
+        )
+    robots = map(Robot.from_document, run.session.robot_documents.values())
+    repeats_mm = max((robot.repeatability[0] for robot in robots), default=0.1)
+    rad, metres = inliers.fit.noise.robots[0].tolist()
+    if 1e3 * metres > max(CalibrationLimits().sigma_mm[0], 2.0 * repeats_mm):
+        yield Finding(
+            "scatter",
+            f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} from stop to stop, "
+            f"and such arms repeat to {repeats_mm:g} mm: the board is of another size than stated, "
+            "the lens is not this camera's, or the poses are not of these images.",
+            Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
 
 
