@@ -40,6 +40,12 @@ class CalibrationLimits:
     # are seldom independent between stops, as the covariance assumes.
     robot_mm: float = 0.2
     robot_deg: float = 0.02  # The same in rotation [deg].
+    # The same over what an arm of its kind has, and how many times as much a task needs at least,
+    # for which it is no doubt.
+    repeatability: float = 2.0
+    good_enough: float = 10.0
+    # Left-out scatter over that by the sensor's noise, as of a small board far away.
+    of_noise: float = 1.5
     # Stops of the robot in the fit; fewer do not suffice to check the result.
     stops: tuple[int, int] = (10, 5)
     lost_share: Pair = (0.25, 0.6)  # Share of views that could not be used.

@@ -156,7 +156,8 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
     robots = map(Robot.from_document, run.session.robot_documents.values())
     repeats_mm = max((robot.repeatability[0] for robot in robots), default=0.1)
     rad, metres = inliers.fit.noise.robots[0].tolist()
-    if 1e3 * metres > max(CalibrationLimits().sigma_mm[0], 2.0 * repeats_mm):
+    limits = CalibrationLimits()
+    if 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):
         yield Finding(
             "scatter",
             f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} from stop to stop, "

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.stages.motion import LEVER_M
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_remedy
@@ -20,13 +21,6 @@ _LIMITS = CalibrationLimits()
 _ROUNDING = 1e-6
 # Views that are named.
 _LISTED = 3
-# Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
-# a small board far away.
-_OF_NOISE = 1.5
-# An arm's noise is plausible up to so many times what its kind has, at so far from its flange [m].
-_TIMES_REPEATABILITY, _REACH_M = 2.0, 0.3
-# Implausible noise of an arm is no doubt for a task that needs so many times as much.
-_GOOD_ENOUGH = 10.0
 
 
 def collect_findings(judged: Findings) -> list[Finding]:
@@ -59,8 +53,8 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
     words, views, is_fatal = [], list[ViewResult](), False
     # A servo arm's own noise puts what is seen so far away.
     by_arm = np.max([(0.0, 0.0), *(arm.repeatability for arm in judged.arms)], axis=0)
-    by_arm *= _TIMES_REPEATABILITY * np.sqrt(3.0)
-    by_arm[0] += 1e3 * _REACH_M * np.deg2rad(by_arm[1])
+    by_arm *= _LIMITS.repeatability * np.sqrt(3.0)
+    by_arm[0] += 1e3 * LEVER_M * np.deg2rad(by_arm[1])
     for pair in judged.pairs:
         held = pair.weighted_held_out or pair.held_out
         beyond = []
@@ -69,7 +63,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             (held.deg or 0.0, "deg", _LIMITS.scatter_deg, pair.noise.deg or 0.0, by_arm[1]),
         ):
             least = max(check, of_arm)
-            if value > max(least, _OF_NOISE * noise):
+            if value > max(least, _LIMITS.of_noise * noise):
                 beyond.append(f"{figure(value)} {unit} (doubt begins at {figure(least)})")
                 is_fatal |= value > bad
         if beyond:
@@ -290,7 +284,7 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
     for arm in judged.arms:
         if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
             continue
-        limit_mm, limit_deg = _TIMES_REPEATABILITY * np.array(arm.repeatability)
+        limit_mm, limit_deg = _LIMITS.repeatability * np.array(arm.repeatability)
         # Only noise whose confidence interval is above the limit counts.
         least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
         if max(least_mm / limit_mm, least_deg / limit_deg) <= 1.0:
@@ -308,5 +302,5 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
             f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; such "
             f"arms repeat to {mm_and_deg(*arm.repeatability)}.",
             Remedy(likelier),
-            until_mm=_GOOD_ENOUGH * ratio * limit_mm,
+            until_mm=_LIMITS.good_enough * ratio * limit_mm,
         ).of(arm.name)

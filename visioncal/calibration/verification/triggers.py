@@ -1,7 +1,7 @@
 """Triggers of a recalibration: a failed check, a collision, other conditions, age."""
 
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -11,7 +11,6 @@ from visioncal.session import Session
 
 State: TypeAlias = Literal["fired", "quiet", "unknown"]
 
-_DAY_S = 86400.0
 # Quantities in words, with limit, unit and the column of the sessions that has it.
 _LIMITS = {
     "ambient_change_k": ("the ambient temperature's change", 10.0, "K", "ambient_c"),
@@ -89,4 +88,4 @@ def _age_days(created: str, now: datetime) -> float | str:
     except ValueError:
         return f"the calibration's time is {created!r}"
     then = then if then.tzinfo else then.replace(tzinfo=UTC)
-    return round((now - then).total_seconds() / _DAY_S, 1)
+    return round((now - then) / timedelta(days=1), 1)
