@@ -51,7 +51,8 @@ def html_card(
     )
     items = "".join(f"<li>{escape(say)}</li>" for say in says)
     return (
-        '<div style="border:1px solid #bbb;border-radius:6px;padding:8px 12px;max-width:46em">'
+        '<div style="border:1px solid #bbb;border-radius:6px;padding:8px 12px;max-width:46em;'
+        'font-family:sans-serif">'
         f"<div>{badge}<b>{escape(title)}</b></div><table>{rows}</table>"
         f"{f'<ul>{items}</ul>' if items else ''}</div>"
     )

@@ -241,7 +241,7 @@ class Calibration(CalibrationSections):
         turned = "" if left_out.deg is None else f", {figure(left_out.deg)} deg"
         return {
             "views used": f"{used} of {len(self.views)}",
-            "left out, predicted to": f"{figure(left_out.mm)} mm{turned}",
+            "views not used in the fit agree to": f"{figure(left_out.mm)} mm{turned}",
             **{
                 name: f"{edge.place_words()}, {edge.rotation_words(self.controller)}, "
                 f"{edge.sigma_words}"

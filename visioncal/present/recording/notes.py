@@ -103,7 +103,7 @@ def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons and next steps, the transforms, and the views left out."""
     judged, cell, budget = calibration.verdict, calibration.cell, calibration.budget
     steps = [
-        f"{at}. {plain(step.words)}" + (f"\n\n   `{step.command}`" if step.command else "")
+        f"{at}. {plain(step.words)}" + (f"  \n   `{step.command}`" if step.command else "")
         for at, step in enumerate(calibration.next_steps, 1)
     ]
     frames = [
