@@ -45,7 +45,7 @@ _ANYWHERE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Suspect:
+class PossibleChange:
     """A change that may have happened."""
 
     cause: ChangeHypothesis
@@ -71,10 +71,10 @@ class Check:
     repeated: int  # Number of the calibration's stops that are repeated.
     unchanged: HypothesisEvidence  # Fit and evidence without a change.
     p_value: float  # Probability of a misfit at least as large if nothing has changed.
-    suspects: tuple[Suspect, ...]  # All changes that were compared, the likeliest first.
+    compared: tuple[PossibleChange, ...]  # All changes that were compared, the likeliest first.
     # Changes that cannot be distinguished from the likeliest, which is the first; empty where
     # nothing has changed.
-    named: tuple[Suspect, ...]
+    named: tuple[PossibleChange, ...]
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
 
     @property
@@ -95,7 +95,7 @@ class Check:
     @property
     def camera_sigma(self) -> FloatArray:
         """(6,) standard deviations of an estimated motion of the camera [rad, m]."""
-        camera = next(suspect for suspect in self.suspects if suspect.name == CAMERA)
+        camera = next(change for change in self.compared if change.name == CAMERA)
         return np.sqrt(np.diag(camera.explained.covariance))
 
 
@@ -183,18 +183,18 @@ def check(
     priors = np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
     scores = np.array([explained.likelihood for explained in explanations]) + np.log(priors)
     evidence = float(np.logaddexp.reduce(scores))
-    suspects = tuple(
-        Suspect(causes[index], float(np.exp(scores[index] - evidence)), explanations[index])
+    compared = tuple(
+        PossibleChange(causes[index], float(np.exp(scores[index] - evidence)), explanations[index])
         for index in np.argsort(-scores, kind="stable")
     )
     is_changed = evidence - unchanged.likelihood >= np.log(_LIMITS.likelihood_ratio)
-    named = _not_separated(suspects) if is_changed else ()
+    named = _not_separated(compared) if is_changed else ()
     changes = remaining = log(predicted.away(prior))
     if named:
         likeliest = named[0].cause
         corrected = undone(problem, likeliest, named[0].explained.values)
         remaining = log(board_changes(corrected, with_change(belief.state, likeliest)))
-    best, freedom = suspects[0], suspects[0].explained.freedom
+    best, freedom = compared[0], compared[0].explained.freedom
     # Without degrees of freedom, or by larger noise, everything is explained.
     limit = f_limit(_LIMITS.unexplained, freedom, prior.freedom) if freedom > 0 else np.inf
     is_explained = best.cause.kind == NOISE or best.explained.misfit < max(freedom, 1) * limit
@@ -206,23 +206,23 @@ def check(
         0 if repeated is None else len(repeated.repeats),
         unchanged,
         float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
-        suspects,
+        compared,
         named,
         bool(is_explained),
     )
 
 
-def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
+def _not_separated(compared: Sequence[PossibleChange]) -> tuple[PossibleChange, ...]:
     """The likeliest change, and those that explain the stops about as well."""
     # These are about as likely, or fit about as well if it were not for their more unknowns: a
     # turned base looks like a slip of the first joint, however unlikely a turn about just that
     # axis.
-    best, *others = suspects
+    best, *others = compared
     if best.cause.kind in (NOISE, *PAIRS):
         return (best,)
 
-    def penalised(suspect: Suspect) -> float:
-        return suspect.explained.deviance + len(suspect.explained.values)
+    def penalised(change: PossibleChange) -> float:
+        return change.explained.deviance + len(change.explained.values)
 
     most = penalised(best) + 2.0 * np.log(_LIMITS.ruled_out)
     rivals = [

@@ -16,7 +16,7 @@ from visioncal.calibration.verification.change_hypotheses import (
     SIZE,
     VIEW,
 )
-from visioncal.calibration.verification.check import Check, Suspect
+from visioncal.calibration.verification.check import Check, PossibleChange
 from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
@@ -129,7 +129,7 @@ def _runnable(check: Check, step: Remedy) -> Remedy:
     return step if allowed.get(step.command, True) else Remedy(step.words)
 
 
-def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
+def _rivals(check: Check, best: PossibleChange, others: Sequence[PossibleChange]) -> Finding:
     """Finding on the changes that cannot be distinguished from the likeliest."""
     named = listed([change_words(check, other) for other in others])
     robot = check.calibration.calibrated_robot
@@ -140,13 +140,13 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     return Finding("rivals", f"{_stops(check)} cannot separate that from {named}.", step)
 
 
-def change_words(check: Check, suspect: Suspect) -> str:
+def change_words(check: Check, change: PossibleChange) -> str:
     """A change with its estimates, as a part of a sentence."""
-    found, robot = _estimates(check, suspect), check.calibration.calibrated_robot
+    found, robot = _estimates(check, change), check.calibration.calibrated_robot
     share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
     facts = {
-        "name": suspect.name,
-        "board": f"board {suspect.name.partition(' ')[2]}".strip(),
+        "name": change.name,
+        "board": f"board {change.name.partition(' ')[2]}".strip(),
         "moved": _moved_words(found.get(CAMERA, found)),
         "other": _moved_words(found.get(BOARD, {})),
         "larger": "larger" if share > 0.0 else "smaller",
@@ -157,15 +157,15 @@ def change_words(check: Check, suspect: Suspect) -> str:
         "steel": abs(share) / _STEEL,
         "factor": found.get("noise_factor", 1.0),
     }
-    if suspect.cause.kind == JOINT:
+    if change.cause.kind == JOINT:
         unit = "mm" if "offset_mm" in found else "deg"
         offset, sigma = found[f"offset_{unit}"], found[f"sigma_{unit}"]
         sign = "+" if offset > 0.0 else "-"
         facts |= {
-            "joint": suspect.name if robot is None else joint_words(suspect.cause.at, robot),
+            "joint": change.name if robot is None else joint_words(change.cause.at, robot),
             "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
-    return _KINDS[suspect.cause.kind][0].format(**facts)
+    return _KINDS[change.cause.kind][0].format(**facts)
 
 
 def _moved_words(move: Mapping[str, Any]) -> str:
@@ -183,26 +183,26 @@ def _moved_words(move: Mapping[str, Any]) -> str:
     return " and ".join(parts)
 
 
-def _estimates(check: Check, suspect: Suspect) -> dict[str, Any]:
+def _estimates(check: Check, change: PossibleChange) -> dict[str, Any]:
     """Estimates of a change for verify.json: millimetres, degrees, shares."""
-    kind, explained = suspect.cause.kind, suspect.explained
+    kind, explained = change.cause.kind, change.explained
     if kind == NOISE:
         return {"noise_factor": explained.noise_factor}
     if kind == BOTH:
-        return {CAMERA: _motion(check, suspect, 0), BOARD: _motion(check, suspect, 6)}
+        return {CAMERA: _motion(check, change, 0), BOARD: _motion(check, change, 6)}
     value, sigma = float(explained.values[-1]), float(np.sqrt(explained.covariance[-1, -1]))
     if kind == JOINT:
         robot = check.calibration.calibrated_robot
-        is_prismatic = robot is not None and robot.chain.prismatic[suspect.cause.at]
+        is_prismatic = robot is not None and robot.chain.prismatic[change.cause.at]
         unit, scale = ("mm", 1e3) if is_prismatic else ("deg", float(np.rad2deg(1.0)))
         return {f"offset_{unit}": scale * value, f"sigma_{unit}": scale * sigma}
     share = {"share": value, "sigma": sigma} if kind in (LENGTH, SIZE, REPLACED) else {}
-    return share | (_motion(check, suspect, 0) if kind not in (LENGTH, SIZE) else {})
+    return share | (_motion(check, change, 0) if kind not in (LENGTH, SIZE) else {})
 
 
-def _motion(check: Check, suspect: Suspect, first: int) -> dict[str, Any]:
+def _motion(check: Check, change: PossibleChange, first: int) -> dict[str, Any]:
     """Estimated motion of a camera or board, by the six values of a change from `first` on."""
-    cause, explained, edges = suspect.cause, suspect.explained, check.prior.state.edges
+    cause, explained, edges = change.cause, change.explained, check.prior.state.edges
     part, targets = slice(first, first + 6), [*check.prior.targets.values()]
     is_camera, point = cause.kind in (CAMERA, BOTH) and first == 0, np.zeros(3)
     if targets and not is_camera:
@@ -283,7 +283,7 @@ def to_document(
     """
     calibration, observed = check.calibration, check.predicted.observed
     verdict = verdict or verdict_of(check)
-    others = [suspect for suspect in listed_suspects(check) if suspect not in check.named]
+    others = [change for change in listed_changes(check) if change not in check.named]
     return {
         "schema": 1,
         "passed": check.passed,
@@ -295,8 +295,8 @@ def to_document(
         "session": {"name": observed.session.name, "sha256": observed.session.digest()},
         "sentences": list(verdict.reasons),
         "next": [vars(step) for step in verdict.next_steps],
-        "changes": [_change(check, suspect) for suspect in check.named],
-        "others": [_change(check, suspect) for suspect in others],
+        "changes": [_change(check, change) for change in check.named],
+        "others": [_change(check, change) for change in others],
         "explained": check.explained,
         "misfit": check.misfit,
         "degrees_of_freedom": check.unchanged.freedom,
@@ -327,13 +327,13 @@ def to_document(
     }
 
 
-def listed_suspects(check: Check) -> tuple[Suspect, ...]:
+def listed_changes(check: Check) -> tuple[PossibleChange, ...]:
     """Changes to list: those that are named, and others that are not unlikely."""
-    others = (suspect for suspect in check.suspects if suspect not in check.named)
+    others = (change for change in check.compared if change not in check.named)
     return (*check.named, *(other for other in others if other.probability > _LISTED_SHARE))
 
 
-def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
+def _change(check: Check, change: PossibleChange) -> dict[str, Any]:
     """A change for the JSON document, with its estimates."""
-    estimates = _estimates(check, suspect)
-    return {"cause": suspect.name, "probability": suspect.probability, **estimates}
+    estimates = _estimates(check, change)
+    return {"cause": change.name, "probability": change.probability, **estimates}

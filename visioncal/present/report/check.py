@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
-from visioncal.calibration.verification.messages import change_words, listed_suspects
+from visioncal.calibration.verification.messages import change_words, listed_changes
 from visioncal.calibration.verification.triggers import Trigger
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
@@ -70,12 +70,12 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
 def _change_table(check: Check) -> Table:
     """Changes that were compared: their probability, and whether the check found them."""
     rows = []
-    for suspect in [] if check.passed else listed_suspects(check):
-        share, is_found = 100.0 * suspect.probability, suspect in check.named
+    for change in [] if check.passed else listed_changes(check):
+        share, is_found = 100.0 * change.probability, change in check.named
         cells = (
             f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
             "found" if is_found else "ruled out",
-            change_words(check, suspect),
+            change_words(check, change),
         )
         rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return _reasons(rows, ("share", "", "change"))
