@@ -76,12 +76,11 @@ class CalibrateOptions(NeedOptions, WorkOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions(NeedOptions):
-    """Calibrate many sessions at once, and report which stand out of their fleet.
+    """Calibrate many sessions at once, and show their results on one page.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
-    them, outliers among robots of the same model first. Existing results are kept: started again,
-    an interrupted batch continues. Exit status 0: there are results, none of them bad; 3: one is
-    bad; 2: there is none.
+    them, the worst verdicts first. Existing results are kept: started again, an interrupted batch
+    continues. Exit status 0: there are results, none of them bad; 3: one is bad; 2: there is none.
     """
 
     out: Path = out_folder(default=REQUIRED)
