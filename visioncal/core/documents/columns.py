@@ -103,14 +103,15 @@ class NumberChecks:
             return
         # hypot does not overflow.
         norms = np.hypot.reduce([self.values[name] for name in names])
+        is_far = norms.max(initial=0.0, where=np.isfinite(norms)) > _FAR_FROM_UNIT
+        other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
         for row in np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist():
-            other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
             self.report(
                 row,
                 f"{names[0]} ... {names[-1]}",
                 f"the quaternion's norm is {norms[row]:.6g}, but must be 1 to within "
                 f"{_NORM_TOLERANCE:g}",
-                other if norms.max(initial=0.0, where=np.isfinite(norms)) > _FAR_FROM_UNIT else "",
+                other if is_far else "",
             )
 
     def check(self, next_step: str = "") -> None:
