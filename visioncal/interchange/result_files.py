@@ -65,7 +65,10 @@ def load_result(path: Path) -> Calibration:
     Raises:
         DataError: There is none, or it cannot be read.
     """
-    found = load_exportable(path)
+    return _calibration(load_exportable(path), path)
+
+
+def _calibration(found: "Calibration | FrameFile | Identified", path: Path) -> Calibration:
     if not isinstance(found, Calibration):
         what = "frames of tools and fixtures" if isinstance(found, FrameFile) else "dynamics"
         raise DataError(
@@ -83,9 +86,9 @@ def load_result_or_frames(path: Path, robot: str | None = None) -> Calibration |
         DataError: There is neither, or it cannot be read.
     """
     found = load_exportable(path)
-    return (
-        found if isinstance(found, FrameFile) else load_calibration(path, Choice(robot=robot), ARM)
-    )
+    if isinstance(found, FrameFile):
+        return found
+    return _calibration(found, path).chosen(Choice(robot=robot), ARM)
 
 
 def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
