@@ -11,6 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.types import FloatArray, Mount
+from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
 
@@ -27,8 +28,6 @@ HAND_EYE: Mapping[Mount, str] = {
     "instrument": "base_from_instrument",
 }
 WORST_FIRST = ("bad", "check", "good")
-# By what a format holds: the beginning of its transform's parent.
-PARENTS: Mapping[str, str] = {"tool": "flange", "fixture": "base"}
 _COMMANDS: Mapping[str, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
@@ -86,7 +85,7 @@ class Placements:
         """
         wanted, names = "transform", self.frames
         if holds == "tool" or holds == "fixture":
-            wanted, names = holds, tuple(name for name in names if name.startswith(PARENTS[holds]))
+            wanted, names = holds, tuple(name for name in names if is_kind(name, holds))
         elif self.mount is not None:
             return HAND_EYE[self.mount]
         elif self.cell is not None:
@@ -111,6 +110,12 @@ def ends_of(name: str) -> tuple[str, str]:
     """Names of a transform's parent and child; empty where the name has none."""
     parent, _, child = name.partition("_from_")
     return parent, child
+
+
+def is_kind(name: str, kind: FrameKind) -> bool:
+    """Whether a transform is a tool's pose on a flange, or a fixture's in a base."""
+    # The parent by our names: flange, flange_2, ...
+    return ends_of(name)[0].partition("_")[0] == PARENTS[kind]
 
 
 def placements(source: Source, camera: str | None = None) -> Placements:

@@ -10,18 +10,18 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified, judge
+from visioncal.frames.naming import PARENTS
 from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
 from visioncal.interchange.exports.content import (
     HAND_EYE,
     OF_TRANSFORMS,
-    PARENTS,
     WORST_FIRST,
     Content,
     ExportFormat,
     Placements,
     Selection,
     Source,
-    ends_of,
+    is_kind,
     placements,
 )
 from visioncal.interchange.exports.mujoco import MUJOCO
@@ -146,10 +146,10 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
         name = f"{available.cell.tree.parents[frame]}_from_{frame}"
     elif name is None and not why:
         name = available.chosen(form.holds)
-    parent = PARENTS.get(form.holds)
-    if parent and (selection.inverse or ends_of(name or "")[0].partition("_")[0] != parent):
+    if form.holds == "tool" or form.holds == "fixture":
         what = f"the inverse of {name}" if selection.inverse else name
-        why = f"writes a {form.holds}, {parent}_from_*, and {what} is none"
+        if selection.inverse or not is_kind(name or "", form.holds):
+            why = f"writes a {form.holds}, {PARENTS[form.holds]}_from_*, and {what} is none"
     if why or name is None:
         raise DataError(
             f"{form.name} {why}.",
