@@ -10,7 +10,7 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
-from visioncal.estimation.trajectory import LONGEST_GAP_S
+from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
 from visioncal.interchange.formats.file_search import (
     files_in,
     images_beside,
@@ -182,23 +182,22 @@ def with_camera_file(
     if robot_stamp and camera_stamp:
         robot_s, robot = _timed(robot_fields, robot_stamp, robot)
         camera_s, camera = _timed(camera_fields, camera_stamp, camera)
-        is_slow = len(robot_s) > 1 and float(np.median(np.diff(robot_s))) > LONGEST_GAP_S
-        if is_slow and np.array_equal(robot_s, camera_s):
-            # Rows that one program wrote, of stops whose times tell nothing about the clocks.
-            notes = (*notes, "Both files have the same times: their rows belong together.")
-            return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)
-        return ForeignRecording(
-            name=name,
-            robot=PoseNumbers.empty(camera.places),
-            camera=camera,
-            stamps_s=camera_s,
-            stream=ForeignStream(robot_s, robot),
-            notes=(
-                *notes,
-                f"All {len(camera)} samples of the camera are views, and the robot's are a stream "
-                "beside them: calibrate finds how far their clocks differ.",
-            ),
-        )
+        is_of_stops = Samples(robot_s).step_s > LONGEST_GAP_S
+        # Of stops that one program wrote the times do not determine the offset of two clocks.
+        if not (is_of_stops and np.array_equal(robot_s, camera_s)):
+            return ForeignRecording(
+                name=name,
+                robot=PoseNumbers.empty(camera.places),
+                camera=camera,
+                stamps_s=camera_s,
+                stream=ForeignStream(robot_s, robot),
+                notes=(
+                    *notes,
+                    f"All {len(camera)} samples of the camera are views, and the robot's are a "
+                    "stream beside them: calibrate finds how far their clocks differ.",
+                ),
+            )
+        notes = (*notes, "Both files have the same times: their rows belong together.")
     if len(robot) != len(camera):
         raise DataError(
             f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
