@@ -304,10 +304,8 @@ def joints_from(
     """
     joints = np.hstack([fields.column(name) for name in names])
     bad = ~np.isfinite(joints).all(axis=1)
-    ends, largest = (
-        [name.rsplit(".", 1)[-1].lower() for name in names],
-        np.abs(joints).max(initial=0),
-    )
+    ends = [name.rsplit(".", 1)[-1].lower() for name in names]
+    largest = np.abs(joints).max(initial=0.0)
     is_named = degrees or all(any(unit in end for unit in _DEGREES) for end in ends)
     is_large = not is_named and bool(largest > _MOST_TURNS_RAD)
     fault = "a joint angle is missing or infinite" if bad.any() else ""
