@@ -139,12 +139,12 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     arms = {name: name for name in robot_names()} | _ARMS
     arm = next((arms[word] for word in sorted(arms, key=len, reverse=True) if word in kind), None)
     mount: Mount = "eye-in-hand" if any(at in key for at in _WRISTS) else "eye-to-hand"
-    if arm is None and requested.robot_model is None:
-        notes.append(f"Robot type {kind!r} is no built-in arm: name its model with --robot-model.")
-    if arm is not None and requested.robot_model is None:
-        tip = read_robot_document(arm)["tip"]
+    if requested.robot_model is None:
         notes.append(
-            f"The flange is {tip} of the built-in model {arm}; --robot-model names another."
+            f"Robot type {kind!r} is no built-in arm: name its model with --robot-model."
+            if arm is None
+            else f"The flange is {read_robot_document(arm)['tip']} of the built-in model {arm}; "
+            "--robot-model names another."
         )
     notes += [
         how,
