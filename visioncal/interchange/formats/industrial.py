@@ -210,7 +210,7 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
         return None
     dictionary = finder.get("dictionary")
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    # What is wrong in it is told of the target.
+    # Its values are checked where the target is read.
     return {
         "kind": "charuco",
         "columns": finder.get("cols"),
