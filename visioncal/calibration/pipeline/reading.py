@@ -24,12 +24,11 @@ from visioncal.calibration.stages.robots import (
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.verdict import NOTE, Finding, Remedy
-from visioncal.session import STREAMS
+from visioncal.session import STREAMS, Session
+from visioncal.session.columns import column_warnings
 
-# Beginning of warnings about the robot's model.
+# Place that warnings about the robot's model begin with.
 _OF_MODEL = "session.toml: robot.model:"
-# Part of a warning about a column that may be misspelt, or the user's own.
-_KEPT_COLUMN = "is not a known one and is kept as text"
 _MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
@@ -48,9 +47,8 @@ def read_cell_inputs(run: RunState) -> RunState:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    warnings = map(_suspicious, session.warnings)
     lost = [found for found in (missing_images(session), empty_rows(session)) if found is not None]
-    run = run.noting((), (*lost, *warnings, *_not_used(run)))
+    run = run.noting((), (*lost, *_suspicious(session), *_not_used(run)))
     run = replace(run, notes=(*run.notes, *session.declaration.corrected))
     if len(run.held_back) == len(session.views):
         raise all_held_back(run)
@@ -85,14 +83,19 @@ def _not_used(run: RunState) -> Iterator[Finding]:
         )
 
 
-def _suspicious(warning: str) -> Finding:
-    """Turns a warning on reading the session into a finding, with a remedy where one is known."""
-    if warning.startswith(_OF_MODEL):
-        return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
-    file = warning.partition(": ")[0]
-    if _KEPT_COLUMN in warning:
-        return Finding(NOTE, warning)
-    return Finding("remark", warning, Remedy(f"In {file}, correct or delete what this names."))
+def _suspicious(session: Session) -> Iterator[Finding]:
+    """Findings on what was suspicious in the session's files, with remedies where known."""
+    # A column that may be misspelt, or the user's own.
+    of_columns = [*column_warnings(session.columns, "views.csv")]
+    for warning in session.warnings:
+        if warning.startswith(_OF_MODEL):
+            yield Finding("misread_joints", warning, Remedy(_MODEL_STEP))
+        elif warning in of_columns:
+            yield Finding(NOTE, warning)
+        else:
+            file = warning.partition(": ")[0]
+            step = Remedy(f"In {file}, correct or delete what this names.")
+            yield Finding("remark", warning, step)
 
 
 def _reported(run: RunState) -> RunState:
