@@ -44,7 +44,7 @@ from visioncal.estimation.tolerance_probability import chance_within, radius_wit
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
-from visioncal.robot import load_robot
+from visioncal.robot import load_robot, with_base
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.vision.targets import load_target
@@ -147,7 +147,9 @@ def test_noise_is_plausible_by_the_kind_of_arm(repeatability, is_doubt) -> None:
     scattered = replace(SOUND.pairs[0], weighted_held_out=Rms(30.0, 4.0))
     found = ids(judge(replace(SOUND, arms=(arm,), pairs=(scattered,))))
     assert ("unexplained" in found) == is_doubt
-    assert load_robot("so101").repeatability == (5.0, 1.5)
+    servo = load_robot("so101")
+    for arm in (servo, servo.corrected(), with_base(servo, exp(np.full(6, 0.1)))):
+        assert arm.repeatability == (5.0, 1.5)
     assert load_robot("ur5e").repeatability == (0.1, 0.01)
 
 

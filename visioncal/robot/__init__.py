@@ -38,7 +38,7 @@ from visioncal.robot.loads import (
     deflected_joints,
     joint_deflections,
 )
-from visioncal.robot.model import LINK_KEYS, Robot
+from visioncal.robot.model import LINK_KEYS, REPEATABILITY, Robot
 from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, torque_regressor
 
@@ -46,6 +46,7 @@ __all__ = [
     "FUNCTION_NAMES",
     "LINK_KEYS",
     "PARAMETER_NAMES",
+    "REPEATABILITY",
     "ROBOT_SUFFIXES",
     "Chain",
     "DHTable",

@@ -16,7 +16,7 @@ from visioncal.core.choices import Convention
 from visioncal.core.transforms import compose, invert, skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain, chain_document
-from visioncal.robot.model import LINK_KEYS, Robot
+from visioncal.robot.model import ARM_KEYS, LINK_KEYS, Robot
 from visioncal.robot.tables import (
     DHTable,
     about_x,
@@ -174,7 +174,7 @@ def _of_table(
     document = table_document(table, source)
     for row, known in zip(document["joint"], robot.document["joint"], strict=True):
         row |= {key: known[key] for key in LINK_KEYS if key in known}
-    kept = {name: robot.document[name] for name in ("gravity_m_s2",) if name in robot.document}
+    kept = {name: robot.document[name] for name in ARM_KEYS if name in robot.document}
     return Robot.from_document(document | kept | dict(gravity))
 
 

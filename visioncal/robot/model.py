@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 BODY_KEYS = ("body_radius_m", "body_offset_m")
 # Optional keys of link and drive in a joint's table: all that is not geometry.
 LINK_KEYS = (*BODY_KEYS, *MASS_KEYS, INERTIA_KEY, *RATE_KEYS)
+# Optional keys of the whole arm beside its geometry.
+ARM_KEYS = ("gravity_m_s2", "repeatability_mm", "repeatability_deg")
+# Standard deviation of an industrial arm's flange from stop to stop [mm], [deg].
+REPEATABILITY = (0.1, 0.01)
 
 # Tolerance of parallel axes, for calibrated arms.
 _PARALLEL = 0.05
@@ -105,8 +109,8 @@ class Robot:
 
         Where it states none, that of industrial arms.
         """
-        table = DocumentTable(self.document, f"robot {self.name}")
-        return table.number("repeatability_mm", 0.1), table.number("repeatability_deg", 0.01)
+        table, (mm, deg) = DocumentTable(self.document, f"robot {self.name}"), REPEATABILITY
+        return table.number("repeatability_mm", mm), table.number("repeatability_deg", deg)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -340,7 +344,7 @@ class Robot:
         return Robot.from_document(self.weighted(document))
 
     def weighted(self, document: Mapping[str, Any]) -> dict[str, Any]:
-        """Adds this arm's masses, inertias, drive limits and gravity to a chain's description."""
+        """Adds this arm's masses, inertias, drive limits and `ARM_KEYS` to a description."""
         weighted = dict(document)
         bodies = self.masses if self.inertias is None else self.inertias
         nothing: list[dict[str, Any]] = [{} for _ in document["joint"]]
@@ -348,9 +352,7 @@ class Robot:
         weighted["joint"] = [
             row | body | rate for row, body, rate in zip(document["joint"], *parts, strict=True)
         ]
-        if "gravity_m_s2" in self.document:
-            weighted["gravity_m_s2"] = self.document["gravity_m_s2"]
-        return weighted
+        return weighted | {key: self.document[key] for key in ARM_KEYS if key in self.document}
 
     def _effective(self, q: FloatArray) -> FloatArray:
         """Effective positions (m, n) of (m, n) joint angles, after a check of the shape."""

@@ -20,7 +20,7 @@ from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
-from visioncal.robot import Robot
+from visioncal.robot import REPEATABILITY
 from visioncal.session import Session
 
 
@@ -153,8 +153,7 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
             ),
             views,
         )
-    robots = map(Robot.from_document, run.session.robot_documents.values())
-    repeats_mm = max((robot.repeatability[0] for robot in robots), default=0.1)
+    repeats_mm, _ = REPEATABILITY if run.robot is None else run.robot.repeatability
     rad, metres = inliers.fit.noise.robots[0].tolist()
     limits = CalibrationLimits()
     if 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):

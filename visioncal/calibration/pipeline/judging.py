@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
 from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import (
@@ -39,7 +39,6 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
-from visioncal.robot import Robot
 
 
 def judge_run(state: RunState) -> RunState:
@@ -227,8 +226,6 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
 
 def _arms(answer: FitAssessment) -> list[JudgedArm]:
     problem, cell_fit = answer.problem, answer.cell_fit
-    documents = cell_fit.cell.session.robot_documents.items()
-    models = {robot_key(name): Robot.from_document(document) for name, document in documents}
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
@@ -237,12 +234,12 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
             len(stops_of(problem, robot)),
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
             workspace_mm=None if accuracy is None else accuracy.median,
-            modelled=robot in models,
+            modelled=arm.matched is not None,
             can_tilt=arm.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
-        if robot in models:
-            judged = replace(judged, repeatability=models[robot].repeatability)
+        if arm.matched is not None:
+            judged = replace(judged, repeatability=arm.matched.robot.repeatability)
         # Of pose pairs without a stated noise, the detection's may be in the flange's.
         if not problem.is_combined and problem.observations.covariance.any():
             noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()

@@ -9,6 +9,7 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms, rms_of
+from visioncal.robot import REPEATABILITY
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class JudgedArm:
     workspace_mm: float | None = None
     modelled: bool = False  # Whether its model is known.
     # Standard deviation of its flange from stop to stop, as an arm of its kind has it [mm, deg].
-    repeatability: tuple[float, float] = (0.1, 0.01)
+    repeatability: tuple[float, float] = REPEATABILITY
     can_tilt: bool = True  # Whether its flange turns about more than one direction.
     name: str = ""  # `Robot` and its name, for messages; empty for a single robot.
 
