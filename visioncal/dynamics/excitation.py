@@ -296,7 +296,6 @@ class Excitation:
     random: float  # Median of those of random motions within the limits of joints and drives.
     extremes: MotionExtremes  # Its extremes, at a thousand samples a second.
     starts: int  # Number of descents made.
-    seconds: float  # Duration of the search [s of one core].
 
 
 def excite(
@@ -343,9 +342,7 @@ class _ExcitationSearch:
             )
         condition, series, kept = self._best
         result = (series, condition, self._random(), kept, starts)
-        return Excitation(
-            request, self._base, self._weights, *result, time.process_time() - self._begin
-        )
+        return Excitation(request, self._base, self._weights, *result)
 
     @property
     def _is_over(self) -> bool:
