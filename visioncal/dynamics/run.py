@@ -114,11 +114,13 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     predicted, validation = None, None
     if request.validate_on:
         validation_samples = _read(session, robot, request.validate_on, request)
-        predicted = _predicted(identification, _conditioned(robot, validation_samples, request))
+        fresh = _conditioned(robot, validation_samples, request)
+        predicted = predict(identification.identified, fresh)
         validation = validate(identification.identified, predicted)
     elif split is not None:
         without_end = identify(robot, split.fitted, replace(options, checked=False))
-        predicted = _predicted(without_end, split.held_out, "the last 30 % of ")
+        predicted = predict(without_end.identified, split.held_out)
+        predicted = replace(predicted, label=f"the last 30 % of {predicted.label}")
         # In a part of a motion a joint's torque may be constant.
         ranges_nm = identification.identified.streams[split.fastest].torque_nm
         validation = replace(validate(identification.identified, predicted), torque_nm=ranges_nm)
@@ -314,8 +316,3 @@ def _speed(stream: Conditioned) -> FloatArray:
     """Root mean square speed of the slowest joint [rad/s]."""
     speeds = np.concatenate([piece.measured.motion.dq for piece in stream.pieces])
     return np.asarray(np.sqrt(np.mean(speeds**2, axis=0)).min())
-
-
-def _predicted(identification: Identification, stream: Conditioned, which: str = "") -> Prediction:
-    predicted = predict(identification.identified, stream)
-    return replace(predicted, label=f"{which}{stream.label}")
