@@ -316,9 +316,9 @@ def fit_consistent(
         residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=_SETTLED
     )
     free = fit.active_mask == 0
-    solved = np.where(free, fit.x, 0.0)
-    rows = slopes(solved)[:, free]
-    by_unknowns = jacobian(solved)[:, free]
+    estimate = np.where(free, fit.x, 0.0)
+    rows = slopes(estimate)[:, free]
+    by_unknowns = jacobian(estimate)[:, free]
     posterior = by_unknowns @ covariance_from(rows.T @ rows) @ by_unknowns.T
-    left = residuals(solved)[: base.rank]
-    return Consistent(standard(solved), posterior, float(left @ left))
+    left = residuals(estimate)[: base.rank]
+    return Consistent(standard(estimate), posterior, float(left @ left))
