@@ -133,9 +133,7 @@ class Inverse:
         if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
         # The same random postures every time.
-        centre, half = bounds.middle_and_half(wanted)
-        shares = np.random.default_rng(0).uniform(-1.0, 1.0, (_STARTS, len(wanted)))
-        starts = centre + shares * half
+        starts = self.starts(_STARTS, np.random.default_rng(0), wanted)
         candidates = [first, *(self._descend(goal, start, wanted) for start in starts)]
         reached = [posture for posture in candidates if posture.reached]
         if reached:
@@ -159,9 +157,15 @@ class Inverse:
         positions = np.array([posture.positions for posture in found]).reshape(starts.shape)
         return positions, np.array([posture.reached for posture in found], dtype=bool)
 
-    def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draws (count, n) effective positions over the joints' ranges [rad or m]."""
-        centre, half = self._bounds.middle_and_half(np.zeros(self._model.nq))
+    def starts(
+        self, count: int, rng: np.random.Generator, around: FloatArray | None = None
+    ) -> FloatArray:
+        """Draws (count, n) effective positions over the joints' ranges [rad or m].
+
+        Those of joints without limits are about given ones (n,), or about zero.
+        """
+        around = np.zeros(self._model.nq) if around is None else around
+        centre, half = self._bounds.middle_and_half(around)
         return np.asarray(centre + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
 
     def _descend(
