@@ -156,15 +156,21 @@ def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None
             yield f"{path}: {words}"
 
 
+def is_file(name: object) -> bool:
+    """Whether the name of a target or a robot is a path, not a built-in name."""
+    return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
+
+
 def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
     """Warnings that name the files outside of the folder that were read."""
+    if folder is None:
+        return
     named = [(path, "target") for path in _declared_targets(declaration).values()]
-    robots = (getattr(table, "model", None) for table in declaration.named("robot").values())
-    named += [(path, "model") for path in robots if path is not None]
-    for path, key in dict.fromkeys(named) if folder is not None else ():
-        file = (folder or Path()) / path.replace("\\", "/")
-        is_file = path.lower().endswith(ROBOT_SUFFIXES) and not absence(file)
-        if is_file and folder is not None and not is_inside(file, folder):
+    robots = declaration.named("robot").values()
+    named += [(getattr(table, "model", None) or "", "model") for table in robots]
+    for path, key in dict.fromkeys(named):
+        file = folder / path.replace("\\", "/")
+        if is_file(path) and not absence(file) and not is_inside(file, folder):
             yield (
                 f"session.toml: {key} = {path!r} lies outside of the session's folder: "
                 f"{file.resolve()} was read."

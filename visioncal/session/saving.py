@@ -10,11 +10,12 @@ import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256, temporary_folder, write_atomically
-from visioncal.robot import LINK_KEYS, ROBOT_SUFFIXES, robot_file
+from visioncal.robot import LINK_KEYS, robot_file
 from visioncal.session.corners import FILE as CORNERS
 from visioncal.session.corners import write_corners
 from visioncal.session.document import Kind
 from visioncal.session.images import inside_path
+from visioncal.session.kinds import is_file
 from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import write_stream
 from visioncal.session.table import write_csv
@@ -158,11 +159,6 @@ def digest_of(session: "Session") -> str:
     if session.corner_table is not None:
         facts["corners"] = session.corner_table.fact()
     return sha256(json.dumps(_canonical(facts), sort_keys=True).encode())
-
-
-def is_file(name: object) -> bool:
-    """Whether a name is a path, not a built-in name."""
-    return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
 
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
