@@ -319,7 +319,7 @@ def rows_of(
     """
     waiting, count = [*reversed(jobs)], min(workers or os.cpu_count() or 1, len(jobs))
     while waiting:
-        # A cluster has a queue of its own; a pool gets no more than it runs, which tells what ran.
+        # A cluster has a queue of its own; a pool gets no more than it runs: what it has, ran.
         most, engine = (len(jobs), _cluster(scheduler)) if scheduler else (count, _pool(count))
         running: dict[Future[FleetRow], Job] = {}
         with engine as executor:
@@ -354,7 +354,7 @@ def _row(future: Future[FleetRow], job: Job, scheduler: str | None) -> FleetRow:
             f"the scheduler at {scheduler} went away before the session was calibrated.",
             "Start it and the same command again: what is finished is kept.",
         )
-    except Exception as error:  # noqa: BLE001 - `work` raises nothing: Dask tells of a death
+    except Exception as error:  # noqa: BLE001 - `work` raises nothing: Dask reports a death
         return failed_row(job, DIED, f"its worker died: {error}.", _MEMORY)
 
 
