@@ -30,7 +30,7 @@ from visioncal.present.viewer import blueprint
 from visioncal.results import Edge, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.boards import find_target
-from visioncal.vision.targets import corner_positions, target_from_document
+from visioncal.vision.targets import corner_positions, outline, target_from_document
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")
 
@@ -134,7 +134,7 @@ def test_the_sheet_shows_the_pattern_in_the_target_s_frame(document):
     seen = find_target(
         cv2.copyMakeBorder(picture, *[margin] * 4, cv2.BORDER_CONSTANT, value=255), target
     )
-    low, _, high, _ = board.outline(target)
+    low, _, high, _ = outline(target)
     px_per_m = picture.shape[1] / (high - low)[0]
     expected = (corner_positions(target)[seen.ids] - low)[:, :2] * px_per_m + margin - 0.5
     assert len(seen.ids) == len(corner_positions(target))

@@ -20,6 +20,13 @@ from visioncal.core.transforms import apply, compose
 from visioncal.core.types import FloatArray, IntArray, Target
 from visioncal.vision.boards import KINDS, kind_of
 
+# Edges of a unit box as one line strip.
+_BOX = np.array(
+    [
+        *((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0)),
+        *((1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 1, 0), (0, 1, 1), (0, 0, 1)),
+    ]
+)
 # Keys of target descriptions.
 KEYS = {"kind", "points"}.union(*(kind.keys.split() for kind in KINDS.values()))
 
@@ -154,6 +161,32 @@ def is_seen_in_part(target: Target) -> bool:
 def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
     """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
     return kind_of(target).extent_m(target)
+
+
+def outline(target: Target) -> FloatArray:
+    """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page.
+
+    For a rig: the cross-section in the middle of its bounding box.
+    """
+    low, high = extent_m(target)
+    middle_z = float(np.mean([end[:, 2] for end in _bounds(target)]))
+    corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
+    return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle_z)
+
+
+def closed_outline(target: Target) -> FloatArray:
+    """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box."""
+    if target.is_rig:
+        low, high = _bounds(target)
+        return np.asarray(low + _BOX * (high - low))
+    corners = outline(target)
+    return np.vstack([corners, corners[:1]])
+
+
+def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:
+    """Low and high corners (1, 3) of the bounding box of a target's corners [m]."""
+    corners_m = corner_positions(target)
+    return corners_m.min(axis=0, keepdims=True), corners_m.max(axis=0, keepdims=True)
 
 
 def rotation_transforms(target: Target) -> FloatArray:

@@ -11,7 +11,7 @@ from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.robot.collision import arm_bodies
 from visioncal.vision.camera import normalise, project_with_jacobian
-from visioncal.vision.targets import extent_m
+from visioncal.vision.targets import extent_m, outline
 
 # Range of distances, relative to that at which the print's half diagonal fills the image's half
 # short side.
@@ -99,10 +99,10 @@ class BoardViews:
         self._x, self._z = (np.array([getattr(one, edge) for one in drawn]) for edge in "xz")
         self._low, self._high = low, high = extent_m(cell.target)
         self.centre = np.append(0.5 * (low + high), 0.0)
-        knots = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        knots = outline(cell.target)
         shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
         points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
-        self.outline = np.pad(points.reshape(-1, 2), ((0, 0), (0, 1)))
+        self.outline = points.reshape(-1, 3)
         self.distance_m = cell.limits.distance_m or self._filling_m(float(np.nanmin(tangents)))
 
     def _filling_m(self, half: float) -> tuple[float, float]:

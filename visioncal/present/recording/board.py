@@ -1,50 +1,18 @@
-"""Drawing of a target: its pattern on a sheet or its points, and its outline."""
+"""Drawing of a target: its pattern on a sheet, or its points."""
 
 import cv2
 import numpy as np
 import rerun as rr
 
-from visioncal.core.types import FloatArray, Image, Target
+from visioncal.core.types import Image, Target
 from visioncal.present.recording import colours
 from visioncal.vision.printing.pattern import dark_cells, dark_discs
-from visioncal.vision.targets import corner_positions, extent_m
+from visioncal.vision.targets import corner_positions, extent_m, outline
 
 # Resolution that shows the markers' bits, and the limit for a large board's pattern.
 _SQUARE_PX, _LARGEST_PX = 48, 2000
-# Radius of a rig's points as a share of its extent; edges of a unit box as one line strip.
+# Radius of a rig's points as a share of its extent.
 _DOT = 0.02
-_BOX = np.array(
-    [
-        *((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0)),
-        *((1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 1, 0), (0, 1, 1), (0, 0, 1)),
-    ]
-)
-
-
-def outline(target: Target) -> FloatArray:
-    """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page.
-
-    For a rig: the cross-section in the middle of its bounding box.
-    """
-    low, high = extent_m(target)
-    middle_z = float(np.mean([end[:, 2] for end in _bounds(target)]))
-    corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
-    return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle_z)
-
-
-def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:
-    """Low and high corners (1, 3) of the bounding box of a target's corners [m]."""
-    corners_m = corner_positions(target)
-    return corners_m.min(axis=0, keepdims=True), corners_m.max(axis=0, keepdims=True)
-
-
-def closed_outline(target: Target) -> FloatArray:
-    """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box."""
-    if target.is_rig:
-        low, high = _bounds(target)
-        return np.asarray(low + _BOX * (high - low))
-    corners = outline(target)
-    return np.vstack([corners, corners[:1]])
 
 
 def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:

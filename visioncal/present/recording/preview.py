@@ -14,14 +14,14 @@ from visioncal.core.transforms import apply, invert
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
 from visioncal.present.cell_poses import states_of
-from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import Obstacle, log_obstacles
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder, send_rows
 from visioncal.present.recording.scene import Scene, Seen
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.targets import closed_outline, corner_positions
 
 # Width of the way, as a share of the cell's size.
 _LINE = 0.002
@@ -127,7 +127,7 @@ def _log_static(stream: rr.RecordingStream, preview: Preview) -> None:
 
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:
     """Draws the image of each stop, on both timelines; `steps` are its steps on the way."""
-    outline = board.closed_outline(preview.target)
+    outline = closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
     px, rims = [], []

@@ -20,6 +20,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.frames import frames_of_kind
 from visioncal.vision.camera import matrix_3x3
+from visioncal.vision.targets import closed_outline
 
 # Sizes as shares of the cell's size, which is the distance of flanges from their bases.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
@@ -181,7 +182,7 @@ class Scene(CellPoses):
             cell_from_cam = self.in_cell(seers[view_seen.view], view_seen.view)
             if cell_from_cam is not None:
                 pose = cell_from_cam @ view_seen.cam_from_target
-                strips[row] = [apply(pose, board.closed_outline(boards[name]))]
+                strips[row] = [apply(pose, closed_outline(boards[name]))]
         if not strips:
             return
         frame, entity = rr.CoordinateFrame(paths.CELL_FRAME), paths.SEEN_TARGET

@@ -14,7 +14,7 @@ from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.vision.camera import matrix_3x3
-from visioncal.vision.targets import extent_m
+from visioncal.vision.targets import closed_outline
 
 # Height of the picture, and what remains free at its borders [px].
 _HEIGHT, _BORDER = 340.0, 36.0
@@ -128,23 +128,15 @@ def _seen(cell: CellPoses, views: Sequence[ViewResult], size_m: float) -> Iterat
     for view in views:
         for frame in (view.seen or "target", view.seer or "cam"):
             pose = cell.in_cell(frame, view.view, past=False)
-            if pose is None or (frame, pose.round(4).tobytes()) in drawn:
+            if pose is None or (place := (frame, pose.round(4).tobytes())) in drawn:
                 continue
-            drawn.add((frame, pose.round(4).tobytes()))
+            drawn.add(place)
             camera, board = cell.cameras.get(frame), cell.boards.get(frame)
             if camera is not None:
-                corners = _rectangle(np.zeros(2), np.array(camera.resolution), 1.0)
-                rays = size_m * corners @ np.linalg.inv(matrix_3x3(camera)).T
+                width, height = camera.resolution
+                px = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
+                rays = size_m * px @ np.linalg.inv(matrix_3x3(camera)).T
                 ends = np.vstack([np.zeros(3), rays])[[*_PYRAMID]]
                 yield _Line(frame, "accent", 1.0, apply(pose, ends))
             elif board is not None:
-                ends = _rectangle(*extent_m(board), 0.0)[[0, 1, 2, 3, 0]]
-                yield _Line(frame, "good", 1.0, apply(pose, ends))
-
-
-def _rectangle(low: FloatArray, high: FloatArray, depth: float) -> FloatArray:
-    """(4, 3) corners of a rectangle at a depth."""
-    (left, top), (right, bottom) = low, high
-    return np.array(
-        [[left, top, depth], [right, top, depth], [right, bottom, depth], [left, bottom, depth]]
-    )
+                yield _Line(frame, "good", 1.0, apply(pose, closed_outline(board)))
