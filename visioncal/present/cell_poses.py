@@ -156,10 +156,5 @@ def _size_m(frames: FrameHierarchy, states: Mapping[str, Mapping[int, RobotState
     """Distance of flanges from their bases, or half the cell's extent if that is larger."""
     poses = [state.pose for by_view in states.values() for state in by_view.values()]
     distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-    places = [
-        matrix[:3, 3]
-        for frame, matrix in frames.matrices.items()
-        if frames.parents[frame] in (CELL, "base")
-    ]
-    extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *places], axis=0)))
+    extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *frames.fixed_m], axis=0)))
     return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)

@@ -25,6 +25,15 @@ class FrameHierarchy:
     matrices: Mapping[str, FloatArray]
     robots: Mapping[str, str]  # Robot name by its flange's frame.
 
+    @property
+    def fixed_m(self) -> list[FloatArray]:
+        """Positions (3,) of the frames that are fixed in the cell, or in a lone robot's base."""
+        return [
+            matrix[:3, 3]
+            for frame, matrix in self.matrices.items()
+            if self.parents[frame] in (CELL, "base")
+        ]
+
 
 def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
     """Cameras by frame."""

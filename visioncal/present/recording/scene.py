@@ -8,6 +8,7 @@ import rerun as rr
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.present import result_parts
 from visioncal.present.cell_poses import CellPoses, RobotState
 from visioncal.present.network_layout import pairs, sigma_words
 from visioncal.present.recording import board, colours, paths
@@ -53,16 +54,19 @@ class Scene(CellPoses):
         seen: "Seen | None" = None,
     ) -> "Scene":
         """A robot in given states, with what a camera on it or beside it is to see."""
-        parents, matrices = {"base": paths.CELL_FRAME, "flange": "base"}, {"base": np.eye(4)}
+        frames = result_parts.frames(None)
         if seen is not None:
             in_hand = seen.mount == "eye-in-hand"
-            parents |= {
+            parents = {
                 paths.CAM_FRAME: "flange" if in_hand else "base",
                 paths.TARGET_FRAME: "base" if in_hand else "flange",
             }
-            matrices |= {paths.CAM_FRAME: seen.x, paths.TARGET_FRAME: seen.z}
+            matrices = {paths.CAM_FRAME: seen.x, paths.TARGET_FRAME: seen.z}
+            frames = FrameHierarchy(
+                {**frames.parents, **parents}, {**frames.matrices, **matrices}, frames.robots
+            )
         return cls(
-            FrameHierarchy(parents, matrices, {"flange": ""}),
+            frames,
             {"flange": states},
             {} if robot is None else {"": robot},
             {} if seen is None else {paths.CAM_FRAME: seen.camera},

@@ -154,13 +154,7 @@ def _image_view(name: str, bounds: rrb.VisualBounds2D | None = None) -> rrb.Spat
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
     """Views the cell from the side so that it fills the view; None without known positions."""
-    frames = result_parts.frames(calibration)
-    parents = {paths.CELL_FRAME, paths.BASE_FRAME}
-    fixed = [
-        matrix[:3, 3]
-        for frame, matrix in frames.matrices.items()
-        if frames.parents[frame] in parents
-    ]
+    fixed = result_parts.frames(calibration).fixed_m
     # With several robots, the poses have different bases.
     poses = {} if session.is_network else reported_matrices(session.views)
     places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
