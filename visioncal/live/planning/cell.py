@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.codec import Array, Vector, WrittenForm
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, rigid_fault
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
@@ -186,15 +186,9 @@ class PlanCell:
 
 
 def _check_pose(what: str, pose: FloatArray) -> None:
-    pose = np.asarray(pose)
-    valid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
-    if valid:
-        rotation = pose[:3, :3]
-        deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        valid = bool(deviation < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0.0)
-    if not valid:
+    if fault := rigid_fault(np.asarray(pose), _ROTATION_TOLERANCE):
         raise DataError(
-            f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed.",
+            f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed: {fault}.",
             culprits=[what],
         )
 
