@@ -23,7 +23,7 @@ _REST_MM, _REST_DEG, _REST_S = 0.1, 0.01, 0.25
 _SLOW_SHARE, _ENOUGH_VIEWS, _MOST_VIEWS = 0.5, 20, 200
 _NEW_RAD, _NEW_M = np.deg2rad(2.0), 0.01
 # Lever that makes speeds of rotation and translation comparable [m].
-LEVER_M = 0.3
+_LEVER_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def slow_and_new(poses: FloatArray, speeds: FloatArray) -> IntArray:
         (k,) the moments, ascending.
     """
     speed = np.linalg.norm(speeds[:, :3], axis=1)
-    speed = speed + np.linalg.norm(speeds[:, 3:], axis=1) / LEVER_M
+    speed = speed + np.linalg.norm(speeds[:, 3:], axis=1) / _LEVER_M
     chosen: list[int] = []
     limit = float(np.quantile(speed, _SLOW_SHARE))
     for at in np.argsort(speed, kind="stable"):

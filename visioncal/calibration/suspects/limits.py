@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.motion import LEVER_M
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_remedy
@@ -19,6 +18,8 @@ from visioncal.results import ViewResult
 _LIMITS = CalibrationLimits()
 # Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
 _ROUNDING = 1e-6
+# Distance of what is seen from a flange, at which the flange's turns move it [m].
+_SEEN_AT_M = 0.3
 # Views that are named.
 _LISTED = 3
 
@@ -54,7 +55,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
     # A servo arm's own noise puts what is seen so far away.
     by_arm = np.max([(0.0, 0.0), *(arm.repeatability for arm in judged.arms)], axis=0)
     by_arm *= _LIMITS.repeatability * np.sqrt(3.0)
-    by_arm[0] += 1e3 * LEVER_M * np.deg2rad(by_arm[1])
+    by_arm[0] += 1e3 * _SEEN_AT_M * np.deg2rad(by_arm[1])
     for pair in judged.pairs:
         held = pair.weighted_held_out or pair.held_out
         beyond = []
