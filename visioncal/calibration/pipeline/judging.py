@@ -52,8 +52,8 @@ def judge_run(state: RunState) -> RunState:
             rest = (found for found in findings.warnings if found.kind not in BY_CHAIN)
             findings = replace(findings, warnings=(*state.misread, *rest))
             verdict = judge(findings)
-    state = replace(state, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
-    return replace(state, findings=findings, verdict=verdict)
+    warnings = tuple(findings.warnings)
+    return replace(state, warnings=warnings, findings=findings, verdict=verdict)
 
 
 def findings_of(run: RunState) -> Findings:

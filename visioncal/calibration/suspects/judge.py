@@ -38,7 +38,7 @@ def judge(findings: Findings) -> Verdict:
         below, and never good with something unexplained.
 
     Raises:
-        KeyError: A finding is of a kind that is not in the catalogue.
+        KeyError: A finding is of a kind that is no suspect of the registry.
     """
     picks, warnings = findings.picks, list(findings.warnings)
     small = [warning for warning in warnings if is_negligible(warning, picks)]

@@ -10,7 +10,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, INFLATED, 
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.joint import ConvergedFit, moved_mahalanobis_sq
 from visioncal.estimation.lens_field import displacements
@@ -45,12 +45,15 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     stack, compressed = problem.stack, seen.compressed[[*optics.problems].index(camera)]
     unknowns, stated_px = problem.unknowns(compressed), stack.stated_px
     shown_px = stack.shown_px(compressed.residuals, unknowns)
-    is_wider = stated_px is not None and shown_px > stated_px
-    if is_wider and stack.contradicts(compressed.residuals, unknowns):
+    if (
+        stated_px is not None
+        and shown_px > stated_px
+        and stack.contradicts(compressed.residuals, unknowns)
+    ):
         yield Finding(
             "corner_noise",
             f"The corners scatter by {figure(shown_px)} px, and corners.csv states "
-            f"{figure(stated_px or 0.0)} px (sigma_px of a typical corner). The result goes by the "
+            f"{figure(stated_px)} px (sigma_px of a typical corner). The result goes by the "
             "scatter.",
             Remedy(
                 "Look for errors of the detector, the lens or the target that sigma_px leaves out."
@@ -99,7 +102,7 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             )
 
 
-def has_changed(fitted: ConvergedFit, places: np.ndarray) -> bool:
+def has_changed(fitted: ConvergedFit, places: IntArray) -> bool:
     """Whether values of lenses and boards differ significantly from the stated ones."""
     free = np.intersect1d(places, fitted.linearised.moving)
     if not len(free):

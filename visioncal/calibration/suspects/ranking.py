@@ -109,14 +109,14 @@ def rank_causes(
     """Ranks findings by their probability of being the cause, and adds too large error sources.
 
     Args:
-        doubts: All findings, of kinds in the catalogue.
+        doubts: All findings, of kinds in the registry.
         picks: Error budgets of picks.
         met: The required accuracy and the probability of meeting it; None where none is stated.
         more: Remedy that makes the calibration less uncertain.
         left_out_mm: Disagreement of left-out views [mm].
 
     Raises:
-        KeyError: A kind is not in the catalogue.
+        KeyError: A kind is not in the registry.
     """
     found = _with_probabilities(doubts, left_out_mm)
     sigmas = [finding for finding in found if SUSPECTS[finding.kind].is_sigma]

@@ -1,5 +1,6 @@
 """What may be wrong with a session, a cell or a result; see `registry`."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -22,8 +23,8 @@ SOURCES = (
     "robot_noise_of_pick",
     "uncorrected_targets",
 )
-# False-alarm probabilities of remarks, which no test is behind, and of facts.
-REMARK, FACT = 0.36787944117144233, 1e-12
+# False-alarm probabilities of remarks, which no test is behind (1 / e: even odds), and of facts.
+REMARK, FACT = math.exp(-1.0), 1e-12
 # What a change during the session inflates: errors by posture and time correlate before and after
 # it, and are tested beside it.
 INFLATED = (ARM_ERRORS, "calibration")
