@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.frames.touch_test import (
     evaluate_gaps,
-    flange_extent,
+    flange_extent_m,
     touch_targets,
     touch_test_finding,
 )
@@ -22,6 +22,7 @@ from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import rewrite_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
+from visioncal.robot.collision import camera_body
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.vision.targets import corner_positions
@@ -76,8 +77,9 @@ def test_the_tip_comes_as_near_as_predicted(proved, located):
 
 def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):
     look = Session.load(proved[1])
-    corners_m, extent_m = flange_extent(known)
-    lens_m = known.transforms["flange_from_cam"].translation[2]
+    extent_m, flange_from_cam = flange_extent_m(known), known.transforms["flange_from_cam"]
+    box_m = camera_body(0, flange_from_cam.as_matrix()).corners()
+    corners_m, lens_m = np.vstack([np.zeros(3), box_m]), flange_from_cam.translation[2]
     # The lens, and what is before its centre: the box of a camera is 0.1 m long, 0.03 behind it.
     assert lens_m < extent_m < lens_m + 0.1
     raised(DataError, "which tool touches is not known", touch_targets, look, known)

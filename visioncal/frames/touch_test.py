@@ -55,14 +55,10 @@ class TouchTargets:
         return lifted
 
 
-def flange_extent(calibration: Calibration, tool: Tool | None = None) -> tuple[FloatArray, float]:
-    """What is known to be beyond the flange: the camera on it, and the tool.
+def flange_extent_m(calibration: Calibration, tool: Tool | None = None) -> float:
+    """How far the camera and the tool reach beyond the flange, along its z or the tool's [m].
 
     Without a tool, any tool of the calibration may be mounted.
-
-    Returns:
-        (k, 3) its points in the flange frame, and the farthest along the flange's z, or the tool's
-        [m].
     """
     frames = calibration.frames.items()
     tools = [frame.edge for name, frame in frames if name.startswith("flange_from_")]
@@ -71,8 +67,7 @@ def flange_extent(calibration: Calibration, tool: Tool | None = None) -> tuple[F
     if calibration.mount == "eye-in-hand":
         parts.append(camera_body(0, calibration.edges["flange_from_cam"].matrix).corners())
     direction = np.array([0.0, 0.0, 1.0]) if tool is None else tool.edge.matrix[:3, 2]
-    points = np.vstack(parts)
-    return points, float((points @ direction).max())
+    return float((np.vstack(parts) @ direction).max())
 
 
 def touch_targets(
@@ -90,7 +85,7 @@ def touch_targets(
         DataError: No image is usable; there is neither a tool nor a clearance; or something that is
             known on the flange would be in the board when the tip touches it.
     """
-    extent_m = flange_extent(calibration, tool)[1]
+    extent_m = flange_extent_m(calibration, tool)
     if tool is None and clearance_m is None:
         raise DataError(
             "touch-test: which tool touches is not known, and without one the flange itself, with "
