@@ -8,7 +8,7 @@ from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
+from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import CaptureEvent, record
 from visioncal.live.capture.take import TakenView
@@ -22,8 +22,7 @@ QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
 
 def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> CaptureFacts:
     """What is written of a fake cell."""
-    recorded = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
-    return CaptureFacts.of(LiveCell(arm, camera), name, recorded, plan)
+    return CaptureFacts.of(LiveCell(arm, camera), name, plan.cell, plan)
 
 
 def recorded(

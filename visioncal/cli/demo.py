@@ -26,7 +26,7 @@ from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.transforms import invert, log, pose_difference
 from visioncal.interchange.outputs import write_outputs, write_plan
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
+from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import CaptureEvent
 from visioncal.live.planning.cell import PlanCell
@@ -100,8 +100,7 @@ def _drive(bench: Bench, plan: PlanFile, session: Path) -> None:
 
     with ExitStack() as opened, signals_as_interrupts():
         cell = opened.enter_context(bench.connected())
-        recorded = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
-        facts = CaptureFacts.of(cell, session.name, recorded, plan)
+        facts = CaptureFacts.of(cell, session.name, plan.cell, plan)
         journal = Journal.begin(session, facts, cell.clock.unix_offset_s(), len(plan.stops))
         steps = record_driven(cell, plan, journal, _TAKING, Consent(None), watch)
         check_all(journal, steps)

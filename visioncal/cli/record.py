@@ -30,6 +30,7 @@ from visioncal.live.capture.recording import (
     record,
 )
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
+from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.robot import load_robot
 
@@ -48,6 +49,7 @@ def record_command(options: RecordOptions) -> None:
     if not drives:
         is_dry = {"--dry-run": options.dry_run or None}
         refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
+    driven = plan if drives else None
     taking = CaptureOptions(
         speed=options.speed,
         frames=options.frames,
@@ -55,19 +57,19 @@ def record_command(options: RecordOptions) -> None:
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
     with signals_as_interrupts(), _opened(options, is_moved=drives and not options.dry_run) as cell:
-        if drives and plan is not None:
-            _check_resolution(plan.cell.camera.resolution, cell.camera.resolution)
-        if options.dry_run and plan is not None:
-            report_departure(motion_summary(cell, plan, (), taking), cell, taking)
+        if driven is not None:
+            _check_resolution(driven.cell.camera.resolution, cell.camera.resolution)
+        if options.dry_run and driven is not None:
+            report_departure(motion_summary(cell, driven, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
         consent = Consent.of("record", asked, yes=options.yes or not drives)
         start = Journal.resume if options.resume else Journal.begin
-        count = len(plan.stops) if drives and plan is not None else options.views
+        count = options.views if driven is None else len(driven.stops)
         facts = CaptureFacts.of(cell, options.out.name, recorded, plan)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        if drives and plan is not None:
-            steps = record_driven(cell, plan, journal, taking, consent, say_line)
+        if driven is not None:
+            steps = record_driven(cell, driven, journal, taking, consent, say_line)
         else:
             lens = cell.camera.factory or (None if plan is None else plan.cell.camera)
             target, robot = recorded.target, recorded.robot
@@ -78,13 +80,14 @@ def record_command(options: RecordOptions) -> None:
     _finish(journal, steps, as_json=options.as_json)
 
 
-def _recorded(plan: PlanFile | None, described: RecordOptions) -> RecordedCell:
+def _recorded(plan: PlanFile | None, described: RecordOptions) -> RecordedCell | PlanCell:
     """What is recorded, by the plan or by options."""
     target, robot, mount = described.target, described.robot, described.mount
+    found: RecordedCell | PlanCell
     if plan is not None:
         given = {"--target": target, "--robot": robot, "--mount": mount}
         refuse_given(given, "the plan says that already")
-        found = RecordedCell(plan.cell.mount, plan.cell.target, plan.cell.robot)
+        found = plan.cell
     elif target is None:
         raise DataError(
             "record: --plan or --target is needed to know what to look for.",

@@ -27,6 +27,7 @@ from visioncal.core.version import __version__
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import Session, View
@@ -47,7 +48,7 @@ _DIGEST = 64
 
 @dataclass(frozen=True, eq=False)
 class RecordedCell:
-    """What a recording is of."""
+    """What a recording without a plan is of; that of a plan is its cell."""
 
     mount: Mount
     target: Target
@@ -68,7 +69,7 @@ class CaptureFacts(RecordedCell):
 
     @classmethod
     def of(
-        cls, cell: LiveCell, name: str, recorded: RecordedCell, plan: PlanFile | None
+        cls, cell: LiveCell, name: str, recorded: RecordedCell | PlanCell, plan: PlanFile | None
     ) -> "CaptureFacts":
         """Facts of a recording by a cell's devices."""
         camera = cell.camera
