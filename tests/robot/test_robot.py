@@ -174,6 +174,7 @@ def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     ("change", "words"),
     [
         ({"schema": 2}, "schema is 2"),
+        ({"repeatability_mm": 0}, "repeatability_mm is 0; a number above 0"),
         ({"joint": [{"a_m": 0.0, "d_m": 0.1}]}, "joint joint_1: alpha_rad is missing"),
         ({"joint": [{"name": "j", "a_m": 0, "d_m": 0, "alpha_rad": 0}] * 2}, "a name of its own"),
         (

@@ -63,6 +63,8 @@ class Robot:
     inertias: Inertias | None  # Inertial parameters of its links; None where unknown.
     rates: DriveLimits  # Limits of its drives.
     gravity: FloatArray  # (3,) gravitational acceleration in the base's frame [m/s^2].
+    # Standard deviation of the flange from stop to stop [mm], [deg].
+    repeatability: tuple[float, float]
     _model: "pin.Model" = field(repr=False)
 
     @classmethod
@@ -101,16 +103,10 @@ class Robot:
             rates = DriveLimits.of_rows(joints)
         model = _pinocchio_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
-        return cls(name, tip, dict(document), chain, masses, inertias, rates, gravity, model)
-
-    @property
-    def repeatability(self) -> tuple[float, float]:
-        """Standard deviation of the flange from stop to stop [mm], [deg], by its description.
-
-        Where it states none, that of industrial arms.
-        """
-        table, (mm, deg) = DocumentTable(self.document, f"robot {self.name}"), REPEATABILITY
-        return table.number("repeatability_mm", mm), table.number("repeatability_deg", deg)
+        repeats_mm = table.number("repeatability_mm", REPEATABILITY[0], positive=True)
+        repeats_deg = table.number("repeatability_deg", REPEATABILITY[1], positive=True)
+        facts = (masses, inertias, rates, gravity, (repeats_mm, repeats_deg))
+        return cls(name, tip, dict(document), chain, *facts, model)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
