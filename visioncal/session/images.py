@@ -6,13 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 from visioncal.core.types import Searched
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_Place = TypeVar("_Place")
 
 
 class ImageStore(ABC):
@@ -94,10 +95,10 @@ class FolderImages(ImageStore):
 
 
 @dataclass(frozen=True, eq=False)
-class MemoryImages(ImageStore):
-    """Images held in memory; subclasses load them from elsewhere."""
+class ListedImages(ImageStore, Generic[_Place]):
+    """Images whose paths are known, each with the place that it is loaded from."""
 
-    files: Mapping[str, Any]  # By path: the bytes, or where a subclass finds them.
+    files: Mapping[str, _Place]  # The places, by path.
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file."""
@@ -105,13 +106,21 @@ class MemoryImages(ImageStore):
             raise DataError(f"The session has no image {path}.", culprits=[path])
         return self.load(self.files[path])
 
-    def load(self, place: Any) -> bytes:  # noqa: ANN401 - as the subclass has it
-        """The bytes of the image at a place."""
-        return bytes(place)
+    @abstractmethod
+    def load(self, place: _Place) -> bytes:
+        """The bytes of the image at a place; raises DataError."""
 
     def absence(self, path: str) -> str:
         """Why there is no such image; empty where there is one."""
         return "" if path in self.files else "is missing"
+
+
+class MemoryImages(ListedImages[bytes]):
+    """Images held in memory."""
+
+    def load(self, place: bytes) -> bytes:
+        """The bytes themselves."""
+        return place
 
 
 def image_path(path: str) -> str:

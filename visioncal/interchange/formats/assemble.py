@@ -26,12 +26,13 @@ from visioncal.interchange.formats.intrinsics import (
     target_name,
 )
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
-from visioncal.session import ImageStore, MemoryImages, Session, Stream
+from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
+from visioncal.session.images import ListedImages
 from visioncal.vision.boards.imaging import image_size, looks_like_image
 
 
-class FileImages(MemoryImages):
+class FileImages(ListedImages[Path]):
     """Image files anywhere on the disk, by their paths in the session."""
 
     def load(self, place: Path) -> bytes:

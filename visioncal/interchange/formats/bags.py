@@ -39,7 +39,7 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
-from visioncal.session.images import MemoryImages
+from visioncal.session.images import ListedImages
 from visioncal.vision.boards.imaging import image_size
 
 # A message, or a reader of these: their classes are made from the bag's own definitions.
@@ -107,7 +107,7 @@ class _Contents:
 
 
 @dataclass(frozen=True, eq=False)
-class BagImages(MemoryImages):
+class BagImages(ListedImages[tuple[str, bool, int]]):
     """Images in a bag: topic, whether it is compressed, and time of receipt [ns], by path."""
 
     source: Path

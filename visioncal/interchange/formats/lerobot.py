@@ -27,7 +27,7 @@ from visioncal.interchange.formats.foreign import (
     frames_to_take,
 )
 from visioncal.robot import read_robot_document, robot_names
-from visioncal.session.images import MemoryImages
+from visioncal.session.images import ListedImages
 
 _STATE, _IMAGES = "observation.state", "observation.image"
 # Built-in models by words in `robot_type`, beside their own names.
@@ -41,7 +41,7 @@ _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad
 _MOST_FRAMES = 60
 
 
-class FrameImages(MemoryImages):
+class FrameImages(ListedImages[tuple[Path, int] | bytes]):
     """Frames of videos by file and number, or images in parquet, by their paths in the session."""
 
     def load(self, place: tuple[Path, int] | bytes) -> bytes:
