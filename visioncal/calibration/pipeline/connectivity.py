@@ -25,8 +25,8 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
         return
     untied = [base for base in bases if base in lost] or [*lost]
     moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
-    how = ", tilted by 20 to 40 degrees about different axes."
-    advice = [connection_advice(cell, base).removesuffix(".") + how for base in bases]
+    how = ", tilted by 20 to 40 degrees about different axes"
+    advice = [connection_advice(cell, base, how) for base in bases]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: the observations that link "
         f"{'this robot' if len(bases) == 1 else 'these robots'} to the rest of the cell are too "
@@ -63,8 +63,11 @@ def _stations(cell: Cell, base: str) -> IntArray:
     return np.array(sorted(stations), dtype=np.int64)
 
 
-def connection_advice(cell: Cell, frame: str) -> str:
-    """Advice on observations that would connect a frame to the rest, in a sentence."""
+def connection_advice(cell: Cell, frame: str, how: str = "") -> str:
+    """Advice on observations that would connect a frame to the rest, in a sentence.
+
+    `how` is what else the stops of a robot must be like, as the end of the sentence.
+    """
     tree, connected = cell.tree, cell.connected_frames()
     if frame.startswith(("instrument", "point")):
         return (
@@ -82,7 +85,7 @@ def connection_advice(cell: Cell, frame: str) -> str:
     else:
         who = some_of(seers) or "a camera that is tied"
         what = some_of(boards) or f"a board on {flange or frame}"
-    return f"To tie {frame}: let {who} see {what} at 5 stops or more."
+    return f"To tie {frame}: let {who} see {what} at 5 stops or more{how}."
 
 
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
