@@ -165,9 +165,6 @@ def shift_error(estimate: FloatArray, truth: FloatArray) -> float:
     return float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
 
 
-MOVEIT = Path(__file__).parents[3] / "shared/data/pose_pairs_small/moveit_eye_to_hand_50.json"
-
-
 Build = Callable[[np.random.Generator], Problem]
 all_solvers = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS.keys())
 

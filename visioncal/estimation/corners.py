@@ -290,10 +290,8 @@ class WithoutPoses:
             return self.answer, self.products
         stack, count = self.stack, self.left.shape[2]
         zooms, squares = stack.weighed_zooms
-        rows, left = (
-            np.concatenate([self.by_pose, zooms[:, :, None]], axis=2),
-            self.left * self.roots[stack.view_of, None, None],
-        )
+        rows = np.concatenate([self.by_pose, zooms[:, :, None]], axis=2)
+        left = self.left * self.roots[stack.view_of, None, None]
         stack.refocus(rows[:, :, :6])
         stack.refocus(left)
         size, lens = count + 2 * modes.count, len(lens_part)

@@ -246,7 +246,7 @@ def _is_scale(size: int) -> bool:
 
 
 def _closed(problem: CornerProblem, stops: int) -> tuple[int, ...]:
-    """The sizes that are zero: those that too few corners or stops do not tell."""
+    """The sizes that are zero: those that too few corners or stops do not determine."""
     boards = range(_BOARDS, _BOARDS + 3 * len(problem.board_sizes))
     closed = set[int]()
     if not problem.has_spare_corners:

@@ -280,7 +280,7 @@ def _cause(touches: Touches, fit: GroupFit, culprit: Direction) -> tuple[str, st
         )
     tips = touches.subset(fit.used & touches.are("point"))
     poses = tips.base_from_flange
-    # Only touches of one point tell the tip.
+    # Only touches of one point determine the tip.
     first, second = np.nonzero(np.triu(tips.points[:, None] == tips.points, 1))
     turns = (invert(poses[second]) @ poses[first])[:, :3, :3]
     turning = Turning.by(Rotation.from_matrix(turns).as_rotvec()) if len(turns) else None

@@ -162,10 +162,8 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
     repeated = dict[int, int]()
     for (is_by_robot, *_), rows in groups.items():
         # The pairs that are near in all numbers, by the earlier row.
-        tree, exact = (
-            cKDTree([numbers for _, numbers in rows]),
-            [each.tobytes() for _, each in rows],
-        )
+        tree = cKDTree([numbers for _, numbers in rows])
+        exact = [numbers.tobytes() for _, numbers in rows]
         for first, later in sorted(tree.query_pairs(1.0, p=np.inf)):
             (view, _), (other, _) = rows[first], rows[later]
             # Exact numbers are never read twice, and corners only where all stands still;
