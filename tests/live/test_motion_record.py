@@ -31,8 +31,8 @@ class Scripted:
         middle = 0.5 * (self.begin_s + self.end_s)
         moves = self.begin_s <= now_s < self.end_s and not middle < now_s < middle + 1.0
         dq = np.array([0.3, -0.1]) * moves
-        told = {"q": np.array([now_s, 0.0]), "dq": dq, "currents_a": np.array([1.0, 2.0])}
-        return ArmState(now_s, np.eye(4), controller_s=now_s, **told)
+        reported = {"q": np.array([now_s, 0.0]), "dq": dq, "currents_a": np.array([1.0, 2.0])}
+        return ArmState(now_s, np.eye(4), controller_s=now_s, **reported)
 
 
 def test_a_motion_is_recorded_from_before_its_begin_to_behind_its_end():

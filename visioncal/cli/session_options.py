@@ -354,8 +354,8 @@ class ConvertOptions(RobotPoseOptions):
 class DoctorOptions:
     """Say what is wrong with a session before it is calibrated, and what to type.
 
-    Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and
-    clocks, in seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2:
+    Checks files, pairing, units, conventions of the poses, the board, blur, motion and clocks, in
+    seconds, as nothing is fitted. Exit status 0: nothing is wrong; 3: something is; 2:
     it cannot be read.
     """
 
