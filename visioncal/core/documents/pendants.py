@@ -163,15 +163,16 @@ def _named(line: str) -> _PendantNumbers | None:
             return None
         # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
         likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
-        units = ("".join(map(str, units)) for units in (lengths, angles))
+        units = (next(iter(found), "") for found in (lengths, angles))
         return _PendantNumbers(tuple(cells[name][0] for name in needed), likely, *units)
     return None
 
 
 def _bare(line: str) -> _PendantNumbers | None:
     found = _numbers(line, ())
-    forms = _BARE_FORMS.get(0 if found is None else len(found.numbers))
-    return None if found is None or forms is None else replace(found, forms=forms)
+    if found is None or len(found.numbers) not in _BARE_FORMS:
+        return None
+    return replace(found, forms=_BARE_FORMS[len(found.numbers)])
 
 
 def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
