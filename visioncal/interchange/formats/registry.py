@@ -127,7 +127,7 @@ def read_foreign(
 ) -> ForeignRecording:
     """Reads a foreign recording with the user's options applied; raises DataError.
 
-    Its format is recognised unless `form` names it.
+    Its format is recognised; `form` selects one of several that fit.
     """
     # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)
