@@ -133,12 +133,15 @@ class CellPoses:
         )
 
     def in_cell(self, frame: str, view: int, *, past: bool = True) -> FloatArray | None:
-        """(4, 4) pose of a frame in the cell in a view; None where unknown, or past if so asked."""
+        """(4, 4) pose of a frame in the cell in a view; None where unknown.
+
+        With `past`, a robot without a pose in this view stands as in another one.
+        """
         matrix = np.eye(4)
         while frame != CELL:
             if frame in self.frames.robots:
                 state = self.states[frame].get(view)
-                edge = None if state is None or state.is_past > past else state.pose
+                edge = None if state is None or (state.is_past and not past) else state.pose
             else:
                 edge = self.frames.matrices.get(frame)
             if edge is None:

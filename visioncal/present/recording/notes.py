@@ -4,7 +4,6 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 
 import rerun as rr
 
@@ -55,7 +54,7 @@ def log_views(
     stream: rr.RecordingStream,
     sights: Mapping[int, ViewResult],
     rows: Mapping[int, View],
-    unposed: Mapping[int, Sequence[str]] = MappingProxyType({}),
+    unposed: Mapping[int, Sequence[str]],
 ) -> None:
     """Logs residuals and status of the views, by row; `unposed` are robots without a pose."""
     by_seer: dict[str, dict[int, ViewResult]] = defaultdict(dict)

@@ -16,8 +16,8 @@ from visioncal.core.errors import DataError
 from visioncal.present.recording import paths
 from visioncal.present.recording.rrd_messages import scan
 
-# Place on a timeline: the view's row, or a time [s] on that of motions.
-Row: TypeAlias = int | float | np.timedelta64
+# Place on a timeline: the view's row, or a time on that of motions.
+Row: TypeAlias = int | np.timedelta64
 
 # Free space that one more view and the end of the file need at most.
 _ROOM_BYTES = 100_000_000

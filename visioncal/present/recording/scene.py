@@ -146,7 +146,7 @@ class Scene(CellPoses):
             ]
             style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
             stream.log(f"{entity}/reach", style, static=True)
-            send_strips(stream, f"{entity}/reach", rows.values(), lines, timeline)
+            _send_strips(stream, f"{entity}/reach", rows.values(), lines, timeline)
 
     def log_network(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
         """Draws a cell's frame, and its network as a graph: frames, sigmas, and who saw whom."""
@@ -194,7 +194,7 @@ class Scene(CellPoses):
         stream.log(entity, frame, style, static=True)
         unused = [seen[row].view in self.rejected for row in strips]
         colour = [colours.REJECTED if is_unused else colours.DETECTED for is_unused in unused]
-        send_strips(
+        _send_strips(
             stream, entity, strips, [*strips.values()], more=rr.LineStrips3D.columns(colors=colour)
         )
 
@@ -247,7 +247,7 @@ def _log_poses(
         send_rows(stream, entity, known, columns, timeline)
 
 
-def send_strips(
+def _send_strips(
     stream: rr.RecordingStream,
     entity: str,
     rows: Iterable[Row],
