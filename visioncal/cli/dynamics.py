@@ -156,9 +156,9 @@ def _payload(kg: float, *centre_mm: float) -> FloatArray:
         raise DataError(
             f"--payload is of {kg:g} kg; a mass of 0 kg or more is needed.", culprits=["--payload"]
         )
-    x, y, z = (1e-3 * value for value in centre_mm)
-    about = [y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y]
-    return kg * np.array([1.0, x, y, z, *about])
+    centre_m = 1e-3 * np.array([centre_mm])
+    point = Inertias.of_bodies(np.array([kg]), centre_m, np.zeros((1, 3, 3)))
+    return np.asarray(point.values[0])
 
 
 def dynamics_record_command(options: DynamicsRecordOptions) -> None:
