@@ -168,7 +168,7 @@ def read_plan(path: Path | str) -> PlanFile:
     with reading(str(file), "a plan", "Make one with visioncal plan -o FOLDER."):
         DocumentTable(document, str(file)).integer("schema", _SCHEMA, _SCHEMA)
         request = document["request"]
-        start = {key: request[key] for key in ("start_q",) if key in request}
+        start = {"start_q": request["start_q"]} if "start_q" in request else {}
         plan = read(PlanFile, document | start, "")
         cell, count = plan.cell, plan.cell.robot.joint_count
         if "floor_m" not in document["cell"]["limits"]:
