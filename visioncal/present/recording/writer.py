@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
 from visioncal.present.recording import codec, notes, paths
-from visioncal.present.recording.overlays import Overlay, image_frames, log_image_frames
+from visioncal.present.recording.overlays import Overlay, log_image_frames
 from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
@@ -158,12 +158,13 @@ def _draw(
     scene.log_static(stream)
     scene.log_stops(stream)
     scene.log_views(stream, rows)
-    Overlay.of(session, calibration, evidence).log_views(stream, seen)
+    overlay = Overlay.of(session, calibration, evidence)
+    overlay.log_views(stream, seen)
     if calibration is None:
         return
     if calibration.cell is not None:
         scene.log_network(stream, calibration)
-        log_image_frames(stream, paths.IMAGE, image_frames(session, calibration))
+        log_image_frames(stream, paths.IMAGE, overlay.frames)
     scene.log_seen_targets(stream, session, calibration, seen)
     notes.log_static(stream, calibration)
     shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
