@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
-from support.imaged import POSE
 from support.picks import calibration_of
 
 from visioncal.core.transforms import compose, exp, invert
@@ -14,6 +12,7 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.frames.target_pose import Sight
 from visioncal.results import Calibration, CameraResult
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, simulate
 from visioncal.vision.boards.kind import aruco_dictionary
 
@@ -53,11 +52,10 @@ def marked_plate() -> tuple[Calibration, FloatArray, list[Sight]]:
 
 def plate_session(sights: Sequence[Sight]) -> Session:
     """The session of a plate's pictures; its target is a table of the markers' corners."""
-    rows = []
-    for at, sight in enumerate(sights):
-        pose = sight.base_from_flange
-        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        rows.append([str(at), f"{at}.png", *map(repr, [*pose[:3, 3].tolist(), *turn.tolist()])])
+    rows = [
+        [str(at), f"{at}.png", *map(repr, pose_row(sight.base_from_flange).values())]
+        for at, sight in enumerate(sights)
+    ]
     files = {
         f"{at}.png": cv2.imencode(".png", sight.seen)[1].tobytes()
         for at, sight in enumerate(sights)
@@ -95,7 +93,7 @@ def _picture(cam_from_plate: FloatArray, sharper: int = 4) -> np.ndarray:
     canvas = np.full((height * sharper, width * sharper), 180, np.uint8)
     fx, fy, cx, cy = CLEAR.matrix
     for marker, (x, y) in CENTRES.items():
-        tile = cv2.aruco.generateImageMarker(aruco_dictionary("DICT_5X5_100"), marker, 210)
+        tile = cv2.aruco.generateImageMarker(aruco_dictionary(DICTIONARY), marker, 210)
         tile = np.pad(tile, 30, constant_values=255)
         half = 0.02 * 135 / 105
         corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
