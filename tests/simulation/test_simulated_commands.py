@@ -223,6 +223,7 @@ from_stop = 4
         ("[robots.a]", '[robots."a b"]', "robots.a b is no name: letters, digits"),
         ("[instruments.tracker]", "[cameras.b]", "own.toml: there are points and no instrument"),
         ("place_m = [2.0, 0.0, 0.3]", "", "own.toml: instruments.0..place_m is missing"),
+        ("[2.0, 0.0, 0.3]", "[nan, 0.0, 0.3]", "instruments.tracker.place_m is .nan, 0.0, 0.3."),
         ("from_stop = 4", "from_stop = 6", "target_plate is pushed before stop 6; of 6 stops"),
         ('robot = "a"', 'robot = "b"', "a sweep is of robot 'b'; there are a"),
         ('camera = "top"', 'camera = "left"', "a sweep is of camera 'left'; there are top"),

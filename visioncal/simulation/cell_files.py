@@ -37,7 +37,7 @@ _NAMED: Mapping[str, type] = {
     "points": PointAt,
 }
 _LISTED: Mapping[str, type] = {"moved": Moved, "sweeps": Swept, "payloads": Payload}
-# Ranges of numbers; others are of 0 or more, but for those that may be negative.
+# Ranges of numbers; others are of 0 or more, but for lists and for those that may be negative.
 _RANGES = {"scale": (0.5, 2.0), "bow_m": (-0.05, 0.05), "share_seen": (1e-6, 1.0)}
 _SIGNED = ("tilt_rad", "turn_rad", "shift_m", "camera_minus_robot_s")
 
@@ -108,10 +108,13 @@ def _check(kind: type, row: Mapping[str, Any], path: str, tables: tuple[str, ...
         if key in _LISTED:
             for number, part in enumerate(value, start=1):
                 _check(_LISTED[key], part, f"{path}{key} {number}.")
-        low, high = _RANGES.get(key, (-math.inf if key in _SIGNED else 0.0, math.inf))
-        is_number = isinstance(value, int | float)
-        if is_number and not (math.isfinite(value) and low <= value <= high):
-            raise DataError(
-                f"{path}{key} is {value}; a number from {low:g} to {high:g} is needed.",
-                culprits=[f"{path}{key}"],
-            )
+        numbers = value if isinstance(value, list) else [value]
+        least = -math.inf if numbers is value or key in _SIGNED else 0.0
+        low, high = _RANGES.get(key, (least, math.inf))
+        for number in numbers:
+            is_number = isinstance(number, int | float)
+            if is_number and not (math.isfinite(number) and low <= number <= high):
+                raise DataError(
+                    f"{path}{key} is {value}; a number from {low:g} to {high:g} is needed.",
+                    culprits=[f"{path}{key}"],
+                )
