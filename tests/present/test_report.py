@@ -24,11 +24,11 @@ from visioncal.core.number_format import significant
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
-from visioncal.present.network_layout import pairs
 from visioncal.present.recording.notes import view_markdown
 from visioncal.present.report.cell_picture import cell_picture
 from visioncal.present.report.page import render, write_certificate, write_report
 from visioncal.present.report.thumbnails import thumbnail
+from visioncal.present.seen_pairs import pairs
 from visioncal.present.tables import Table, TableRow
 from visioncal.results import ViewResult
 from visioncal.results.views import worst_view

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present.network_layout import pairs
+from visioncal.present.seen_pairs import pairs
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult

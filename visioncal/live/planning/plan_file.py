@@ -46,7 +46,7 @@ def _image_of(stop: PlannedStop) -> str:
 
 
 def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
-    """Builds the content of plan.json; `source` tells the reader where the cell comes from."""
+    """Builds the content of plan.json; `source` says where the cell comes from."""
     request, design, need = plan.request, plan.design, plan.need
     wanted: dict[str, Any] = {
         "purpose": request.purpose.name,

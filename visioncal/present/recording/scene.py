@@ -10,11 +10,11 @@ from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present import result_parts
 from visioncal.present.cell_poses import CellPoses, RobotState
-from visioncal.present.network_layout import pairs, sigma_words
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.recorder import Row, send_rows
 from visioncal.present.result_parts import FrameHierarchy
+from visioncal.present.seen_pairs import pairs, sigma_words
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
