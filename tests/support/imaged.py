@@ -4,18 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numpy as np
-from scipy.spatial.transform import Rotation
 from support.picks import calibration_of
 
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, SimulatedCell, prepare_scene, render, simulate
 from visioncal.simulation.render import encode
 from visioncal.vision.targets import target_document
-
-POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,5 +75,4 @@ def session_of(cell: SimulatedCell, rows: Sequence[Shot], **more: Sequence[str])
 def _cells(pose: FloatArray | None) -> list[str]:
     if pose is None:
         return [""] * len(POSE)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return [repr(float(value)) for value in np.concatenate([pose[:3, 3], turn])]
+    return [*map(repr, pose_row(pose).values())]
