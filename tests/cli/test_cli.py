@@ -53,8 +53,6 @@ from visioncal.simulation import (
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
 from visioncal.simulation.records import cell_session
 
-# As a user has it.
-DRAWS = True
 FILES = ["calibration.json", "recording.rrd", "report.html"]
 # What moves a terminal's cursor, colours it, or turns the direction of its text.
 STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
