@@ -1,4 +1,4 @@
-"""Exports: what others read is the transform that was calibrated, whoever reads it."""
+"""Exports: what others read is the transform that was calibrated, or the tool, or the fixture."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from support import readers
+from support import placed, readers
 from support.beyond import with_field
-from support.commands import started, visioncal
-from support.placed import fixture, tool
+from support.commands import visioncal
+from support.placed import BASE_FROM_FIXTURE, FIXTURE, FLANGE_FROM_TOOL, TOOL, fixture, tool
 from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
 from support.refusals import raised
 from support.rotations import CASES
@@ -20,21 +20,20 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera
-from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document, export
-from visioncal.results import CameraResult, Edge
+from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
+from visioncal.interchange.result_files import load_calibration, load_result_or_frames
+from visioncal.results import Calibration, CameraResult, Edge, FrameFile, Verdict
 from visioncal.vision.camera import normalise, project_with_jacobian
 
-NAMES = [export_format.name for export_format in EXPORT_FORMATS]
-EDGE_NAMES = [name for name in NAMES if name not in readers.ARM_FORMATS]
-ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
-LENSES = {"camera-info", "kalibr"}
+FORMATS = {export_format.name: export_format for export_format in EXPORT_FORMATS}
+FRAME_READERS = TOOL_READERS | FIXTURE_READERS
+# Those of easy_handeye hold the camera alone.
+ANY_EDGE = sorted(set(READERS) - {"easy-handeye", "easy-handeye2"})
+ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan", "kuka-tool", "kuka-base"}
 RNG = np.random.default_rng(3)
-SAMPLE = made_up(5).calibration
-
-
-def poses(kind):
-    rotations = np.array(CASES[kind])
-    return compose(rotations, RNG.uniform(-2, 2, (len(rotations), 3)))
+SAMPLE = replace(made_up(5).calibration, frames={})
+CELL = replace(SAMPLE, frames=tool() | fixture(source="points.csv"))
+ALONE = placed.alone(tool(), fixture())
 
 
 def calibration(matrix, mount="eye-in-hand", **changes):
@@ -47,44 +46,43 @@ def calibration(matrix, mount="eye-in-hand", **changes):
     return replace(SAMPLE, mount=mount, edges=edges, **changes)
 
 
-def with_lens(model, distortion, estimated=False):
-    camera = Camera(model, (1280, 800), np.array([801.1, 802.2, 640.3, 1 / 3]), distortion)
-    return replace(SAMPLE, camera=CameraResult(camera, estimated=estimated))
+def off(name, text, matrix):
+    return float(np.abs((READERS | FRAME_READERS)[name](text) - matrix).max())
 
 
-def off(document, name, matrix):
-    return float(np.abs(READERS[name](document) - matrix).max())
+@pytest.mark.parametrize("name", READERS | FRAME_READERS)
+def test_what_is_read_back_is_the_transform(name):
+    for kind, rotations in CASES.items():
+        # Robots' forms are written to the nanometre and to 1e-8 deg; others to the last digit.
+        tolerance = 1e-9
+        if (kind == "near a pitch of 90" and name in ANGLES) or (kind, name) == ("tiny", "doosan"):
+            # Within 1e-7 rad of its singularity an Euler triple is taken to be singular: twice it.
+            tolerance = 2.1e-7
+        shifts = RNG.uniform(-2, 2, (len(rotations), 3))
+        for at, matrix in enumerate(compose(np.array(rotations), shifts)):
+            # What a lens would be warned of takes longer than all else.
+            found = calibration(matrix, ("eye-in-hand", "eye-to-hand")[at % 2], camera=None)
+            if name in FRAME_READERS:
+                found = placed.alone(tool(matrix) if name in TOOL_READERS else fixture(matrix))
+            assert off(name, export(found, name), matrix) < tolerance, kind
 
 
-@pytest.mark.parametrize("kind", CASES)
-@pytest.mark.parametrize("name", READERS)
-def test_what_is_read_back_is_the_transform(name, kind):
-    # A robot's form is written to the nanometre and to 1e-8 deg; other numbers to the last digit.
-    tolerance = 1e-9
-    if (kind == "near a pitch of 90" and name in ANGLES) or (kind, name) == ("tiny", "doosan"):
-        # Within 1e-7 rad of its singularity an Euler triple is taken to be singular: twice that.
-        tolerance = 2.1e-7
-    for at, matrix in enumerate(poses(kind)):
-        mount = ("eye-in-hand", "eye-to-hand")[at % 2]
-        # What a lens would be warned of takes longer than all else.
-        found = calibration(matrix, mount, camera=None)
-        assert off(export(found, name), name, matrix) < tolerance
-
-
-@pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye", "easy-handeye2"}))
-@pytest.mark.parametrize("edge", ["flange_from_cam", "base_from_target"])
-def test_any_edge_and_its_inverse(name, edge):
-    matrix = SAMPLE.edges[edge].matrix
-    # As above.
-    assert off(export(SAMPLE, name, Selection(edge)), name, matrix) < 1e-9
-    inverse = export(SAMPLE, name, Selection(edge, inverse=True))
-    assert off(inverse, name, invert(matrix)) < 1e-9
+@pytest.mark.parametrize("name", ANY_EDGE)
+def test_any_edge_and_frame_and_its_inverse(name):
+    edges = {edge: found.matrix for edge, found in SAMPLE.edges.items()}
+    frames = {TOOL: FLANGE_FROM_TOOL, FIXTURE: BASE_FROM_FIXTURE}
+    for source, there in ((SAMPLE, edges), (CELL, frames), (ALONE, frames)):
+        for edge, matrix in there.items():
+            # As above.
+            assert off(name, export(source, name, Selection(edge)), matrix) < 1e-9
+            inverse = export(source, name, Selection(edge, inverse=True))
+            assert off(name, inverse, invert(matrix)) < 1e-9
 
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
-    known = set(READERS) | set(TOOL_READERS) | set(FIXTURE_READERS) | LENSES
-    assert set(NAMES) == known | set(readers.ARM_FORMATS)
-    assert len(set(NAMES)) == len(NAMES)
+    known = {*READERS, *FRAME_READERS, *readers.ARM_FORMATS, "camera-info", "kalibr"}
+    assert FORMATS.keys() == known
+    assert len(EXPORT_FORMATS) == len(known)
 
 
 def test_the_inverse_carries_the_covariance_along():
@@ -104,145 +102,150 @@ def test_the_inverse_carries_the_covariance_along():
 def test_frames_stand_where_their_readers_look():
     chosen = Selection(parent="arm/tool-1", child="cam.2")
     transform = yaml.safe_load(export(SAMPLE, "ros", chosen))
-    assert transform["header"]["frame_id"] == "arm/tool-1"
-    assert transform["child_frame_id"] == "cam.2"
     options = readers.launch_arguments(export(SAMPLE, "ros-launch", chosen))
-    assert (options["--frame-id"], options["--child-frame-id"]) == ("arm/tool-1", "cam.2")
     robot = ET.fromstring(export(SAMPLE, "urdf", chosen))
-    assert robot.find("link").get("name") == "cam.2"
     joint = robot.find("joint")
-    assert joint.get("type") == "fixed"
-    assert (joint.find("parent").get("link"), joint.find("child").get("link")) == (
-        "arm/tool-1",
-        "cam.2",
-    )
+    for found in (
+        (transform["header"]["frame_id"], transform["child_frame_id"]),
+        (options["--frame-id"], options["--child-frame-id"]),
+        (joint.find("parent").get("link"), joint.find("child").get("link")),
+    ):
+        assert found == ("arm/tool-1", "cam.2")
+    assert (robot.find("link").get("name"), joint.get("type")) == ("cam.2", "fixed")
 
 
-@pytest.mark.parametrize(
-    ("mount", "kind", "base", "effector"),
-    [
-        ("eye-in-hand", "eye_in_hand", "base", "mine"),
-        ("eye-to-hand", "eye_on_base", "mine", "tool0"),
-    ],
-)
-def test_easy_handeye_has_all_fields_that_its_readers_take(mount, kind, base, effector):
-    chosen = Selection(parent="mine", child="eye")
-    document = yaml.safe_load(export(calibration(np.eye(4), mount), "easy-handeye2", chosen))
-    assert document["parameters"] == {
-        "name": "visioncal",
-        "calibration_type": kind,
-        "robot_base_frame": base,
-        "robot_effector_frame": effector,
-        "tracking_base_frame": "eye",
-        "tracking_marker_frame": "target",
-        "freehand_robot_movement": True,
-        "move_group_namespace": "/",
-        "move_group": "manipulator",
-    }
-    first = yaml.safe_load(export(calibration(np.eye(4), mount), "easy-handeye", chosen))
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_easy_handeye_has_all_fields_that_its_readers_take(mount):
+    in_hand = mount == "eye-in-hand"
     # Its reader takes these by name, and refuses any other.
-    assert first["parameters"] == {
-        "namespace": "/visioncal/",
-        "eye_on_hand": mount == "eye-in-hand",
-        "robot_base_frame": base,
-        "robot_effector_frame": effector,
+    common = {
+        "robot_base_frame": "base" if in_hand else "mine",
+        "robot_effector_frame": "mine" if in_hand else "tool0",
         "tracking_base_frame": "eye",
         "tracking_marker_frame": "target",
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
+    own = {
+        "easy-handeye": {"namespace": "/visioncal/", "eye_on_hand": in_hand},
+        "easy-handeye2": {
+            "name": "visioncal",
+            "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
+            "freehand_robot_movement": True,
+        },
+    }
+    for name, more in own.items():
+        text = export(calibration(np.eye(4), mount), name, Selection(parent="mine", child="eye"))
+        assert yaml.safe_load(text)["parameters"] == common | more
 
+
+def test_a_point_falls_on_its_pixel_in_mujoco():
+    edge, lens = SAMPLE.edges["flange_from_cam"], SAMPLE.camera.camera
+    written = document(SAMPLE, "mujoco")
+    camera = ET.fromstring(written.text).find("worldbody/body/camera")
+    # MuJoCo: w first; x to the right, y up, looking along -z; the middle of the image ahead.
+    w, *vector = map(float, camera.get("quat").split())
+    position = np.array(camera.get("pos").split(), dtype=float)
+    width, height = map(int, camera.get("resolution").split())
+    assert (width, height) == lens.resolution
+    focal_px = height / 2.0 / np.tan(np.deg2rad(float(camera.get("fovy"))) / 2.0)
+    points_m = np.array([[0.1, -0.05, 0.6], [-0.2, 0.1, 0.9], [0.0, 0.0, 0.5]])
+    in_parent = points_m @ edge.matrix[:3, :3].T + edge.matrix[:3, 3]
+    x, y, z = ((in_parent - position) @ readers.of_quaternion(*vector, w)).T
+    seen = np.column_stack([focal_px * x / -z, -focal_px * y / -z])
+    ours = lens.matrix[1] * points_m[:, :2] / points_m[:, 2:]
+    np.testing.assert_allclose(seen, ours, atol=1e-8)
+    assert "distortion" in written.warnings[0]
+
+
+# --- Names.
 
 BAD_NAMES = ['tool"0', "a b", "-x", "/world", "x\nimport os", "x'", "größe", "a<b", "${x}", "."]
+NOT_RAPID = ["2nd", "_tool", "tool.1", "a-b", "a/b", "tool0", "WOBJ0", "Test", "x" * 33]
 
 
-@pytest.mark.parametrize("bad", BAD_NAMES)
-def test_a_frame_name_that_could_end_its_quotes_is_refused(bad):
-    placed = replace(SAMPLE, frames=tool() | fixture())
-    for name in EDGE_NAMES:
-        raised(DataError, "frame's name", export, placed, name, Selection(child=bad))
+def test_a_name_that_its_format_does_not_take_is_refused():
+    edges = [name for name in FORMATS if name not in readers.ARM_FORMATS]
+    cases = [(edges, BAD_NAMES, "frame's name")]
+    cases += [(["abb-tooldata", "abb-wobjdata"], NOT_RAPID, r"RAPID.*--child")]
+    cases += [(["ur-feature"], ["2nd", "a.b", "a-b", "end", "True"], r"URScript.*--child")]
+    for names, bad_names, words in cases:
+        for name in names:
+            for bad in bad_names:
+                raised(DataError, words, export, CELL, name, Selection(child=bad))
+    assert export(CELL, "abb-tooldata", Selection(child="x" * 32))
+    # A call of set_tcp has no name in it.
+    assert export(CELL, "ur-tcp", Selection(child="end"))
 
 
-@pytest.mark.parametrize("name", sorted(READERS))
 @pytest.mark.parametrize(
     "hostile",
     [
         "x\nimport os\n--> ]]> <a/> --- \u2028 \x85",
         'y """ coding: utf-7 +AAo-raise SystemExit',
         "größer {#} */ ; ! -",
+        'x\nset_tcp(p[0])\r\nENDMODULE ; } !\u2028"',
     ],
 )
-def test_no_session_name_leaves_its_comment(name, hostile):
-    named = calibration(poses("any")[0], session_name=hostile)
-    plain = calibration(named.edges["flange_from_cam"].matrix)
-    # The same text is read whatever stands in the comments.
-    assert np.array_equal(READERS[name](export(named, name)), READERS[name](export(plain, name)))
+def test_no_name_of_a_session_or_source_leaves_its_comment(hostile):
+    frames = tool(source=hostile) | fixture(source=hostile)
+    named = replace(CELL, session_name=hostile, frames=frames)
+    for name, read in (READERS | FRAME_READERS).items():
+        # The same is read whatever stands in the comments.
+        assert np.array_equal(read(export(named, name)), read(export(CELL, name))), name
 
 
-LENS_CASES = [
-    ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.7]), "plumb_bob"),
-    ("brown", np.array([0.1, -0.02, 1e-5, -2e-3, 0.7, 0.01, 1e-17, 3.0]), "rational_polynomial"),
-    ("fisheye", np.array([0.1, -0.02, 1e-5, 1 / 7]), "equidistant"),
-]
+# --- Lenses.
 
 
-@pytest.mark.parametrize(("model", "distortion", "ros_model"), LENS_CASES)
-def test_camera_info_holds_the_lens(model, distortion, ros_model):
-    document = yaml.safe_load(export(with_lens(model, distortion), "camera-info"))
-
-    def array(key):
-        entry = document[key]
-        return np.array(entry["data"]).reshape(entry["rows"], entry["cols"])
-
-    k = np.array([[801.1, 0, 640.3], [0, 802.2, 1 / 3], [0, 0, 1]])
-    assert (document["image_width"], document["image_height"]) == (1280, 800)
-    assert document["camera_name"] == "camera"
-    assert document["distortion_model"] == ros_model
-    assert np.array_equal(array("camera_matrix"), k)
-    assert np.array_equal(array("distortion_coefficients"), distortion[None])
-    assert np.array_equal(array("rectification_matrix"), np.eye(3))
-    assert np.array_equal(array("projection_matrix"), np.hstack([k, np.zeros((3, 1))]))
+def with_lens(model, distortion, estimated=False):
+    lens = np.array(distortion, dtype=float)
+    camera = Camera(model, (1280, 800), np.array([801.1, 802.2, 640.3, 1 / 3]), lens)
+    return replace(SAMPLE, camera=CameraResult(camera, estimated=estimated))
 
 
 @pytest.mark.parametrize(
-    ("model", "distortion", "kalibr_model"),
+    ("model", "distortion", "ros_model", "kalibr_model"),
     [
-        ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.0]), "radtan"),
-        ("brown", np.array([0.1, -0.02, 1e-5, 1 / 3, 0.0, 0.0, 0.0, 0.0]), "radtan"),
-        ("fisheye", np.array([0.1, -0.02, 1e-5, 1 / 7]), "equidistant"),
+        ("brown", [0.1, -0.02, 1e-5, 1 / 3, 0.7], "plumb_bob", ""),
+        ("brown", [0.1, -0.02, 1e-5, -2e-3, 0.7, 0.01, 1e-17, 3.0], "rational_polynomial", ""),
+        ("brown", [0.1, -0.02, 1e-5, 1 / 3, 0.0, 0.0, 0.0, 0.0], "rational_polynomial", "radtan"),
+        ("fisheye", [0.1, -0.02, 1e-5, 1 / 7], "equidistant", "equidistant"),
     ],
 )
-def test_kalibr_holds_the_lens(model, distortion, kalibr_model):
-    text = export(with_lens(model, distortion), "kalibr", Selection(child="left"))
-    assert yaml.safe_load(text) == {
-        "cam0": {
-            "camera_model": "pinhole",
-            "intrinsics": [801.1, 802.2, 640.3, 1 / 3],
-            "distortion_model": kalibr_model,
-            "distortion_coeffs": distortion[:4].tolist(),
-            "resolution": [1280, 800],
-            "rostopic": "/left/image_raw",
-        }
+def test_lenses_are_written_to_the_last_digit(model, distortion, ros_model, kalibr_model):
+    source = with_lens(model, distortion)
+    info = yaml.safe_load(export(source, "camera-info"))
+    k = np.array([[801.1, 0, 640.3], [0, 802.2, 1 / 3], [0, 0, 1]])
+    assert (info["image_width"], info["image_height"]) == (1280, 800)
+    assert (info["camera_name"], info["distortion_model"]) == ("camera", ros_model)
+    for key, expected in (
+        ("camera_matrix", k),
+        ("distortion_coefficients", [distortion]),
+        ("rectification_matrix", np.eye(3)),
+        ("projection_matrix", np.hstack([k, np.zeros((3, 1))])),
+    ):
+        entry = info[key]
+        found = np.array(entry["data"]).reshape(entry["rows"], entry["cols"])
+        assert np.array_equal(found, expected)
+    flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+    stored = cv2.FileStorage(export(source, "opencv"), flags)
+    assert np.array_equal(stored.getNode("distortion_coefficients").mat(), [distortion])
+    assert stored.getNode("camera_matrix").mat()[1, 2] == 1 / 3
+    assert stored.getNode("distortion_model").string() == model
+    assert stored.getNode("image_width").real() == 1280
+    if not kalibr_model:
+        with pytest.raises(DataError, match=r"[14] more.*camera-info"):
+            export(source, "kalibr")
+        return
+    assert yaml.safe_load(export(source, "kalibr", Selection(child="left")))["cam0"] == {
+        "camera_model": "pinhole",
+        "intrinsics": [801.1, 802.2, 640.3, 1 / 3],
+        "distortion_model": kalibr_model,
+        "distortion_coeffs": distortion[:4],
+        "resolution": [1280, 800],
+        "rostopic": "/left/image_raw",
     }
-
-
-@pytest.mark.parametrize(
-    ("distortion", "words"),
-    [([0.1, 0, 0, 0, 1e-9], "1 more"), ([0.1, 0, 0, 0, 0, 0.2, 0.3, 0], "2 more")],
-)
-def test_kalibr_refuses_what_radtan_cannot_hold(distortion, words):
-    with pytest.raises(DataError, match=f"{words}.*camera-info"):
-        export(with_lens("brown", np.array(distortion, float)), "kalibr")
-
-
-@pytest.mark.parametrize(("model", "distortion"), [case[:2] for case in LENS_CASES])
-def test_opencv_holds_the_lens_beside_the_transform(model, distortion):
-    text = export(with_lens(model, distortion), "opencv")
-    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    assert np.array_equal(storage.getNode("distortion_coefficients").mat(), distortion[None])
-    assert storage.getNode("camera_matrix").mat()[1, 2] == 1 / 3
-    assert storage.getNode("distortion_model").string() == model
-    assert storage.getNode("image_width").real() == 1280
 
 
 def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens():
@@ -267,41 +270,192 @@ def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens()
     assert np.linalg.norm(taken) < 0.45 * np.linalg.norm(left)
 
 
+# --- What makers themselves have published of tools and fixtures.
+
+# ABB, RAPID reference manual, data types, tooldata and wobjdata: "Examples".
+GRIPPER = """PERS tooldata gripper := [ TRUE, [[97.4, 0, 223.1], [0.924, 0, 0.383 ,0]],
+[5, [23, 0, 75], [1, 0, 0, 0], 0, 0, 0]];"""
+WOBJ2 = """PERS wobjdata wobj2 :=[ FALSE, TRUE, "", [ [300, 600, 200], [1, 0, 0 ,0] ],
+[ [0, 200, 30], [1, 0, 0 ,0] ] ];"""
+# Universal Robots, script manual, `set_tcp` and `pose_trans`: "Example command".
+SET_TCP = "set_tcp(p[0.,.2,.3,0.,3.14,0.])"
+POSE = "p[.2,.5,.1,1.57,0,0]"
+# A KR 210 R2700-2's own $CONFIG.DAT (github.com/HugoDanielson/ChinaMilling, KRC/R1/System).
+TOOL_DATA = "TOOL_DATA[3]={X 409.434326,Y 3.01155138,Z 166.257782,A -90.0000,B 0.0,C 90.0000}"
+BASE_DATA = (
+    "BASE_DATA[1]={X 924.139893,Y 1099.00952,Z 527.833740,"
+    "A -89.7931595,B 0.238999218,C -0.0562113412}"
+)
+
+
+def rounded(text, mark):
+    """A document without comments and spaces, its numbers with three decimals alike."""
+    plain = re.sub(r"\s", "", readers.code(text, mark))
+    return re.sub(r"-?(\d+\.?\d*|\.\d+)", lambda pair: f"{float(pair[0]):.3f}", plain)
+
+
+def test_abb_gripper_of_the_manual():
+    # In the manual's words: turned by 45 deg, 223.1 mm straight out and 97.4 mm along x, 5 kg.
+    matrix = readers.transform(readers.ry(np.pi / 4), [0.0974, 0, 0.2231])
+    # The manual's quaternion has three digits, by which a matrix is off by up to four times that.
+    assert off("abb-tooldata", GRIPPER, matrix) < 2e-3
+    chosen = Selection(child="gripper", load=Load(5.0, (23.0, 0.0, 75.0)))
+    ours = export(placed.alone(tool(matrix)), "abb-tooldata", chosen)
+    kind, name, (held, (position, quaternion), load) = readers.rapid(ours)
+    assert (kind, name) == readers.rapid(GRIPPER)[:2]
+    theirs = readers.rapid(GRIPPER)[2]
+    assert [held, position, load] == [theirs[0], theirs[1][0], theirs[2]]
+    # Their three digits.
+    assert np.abs(np.subtract(quaternion, theirs[1][1])).max() < 5e-4
+
+
+def test_abb_work_object_of_the_manual():
+    # Rounding of doubles.
+    assert off("abb-wobjdata", WOBJ2, readers.transform(np.eye(3), [0.3, 0.8, 0.23])) < 1e-12
+    user = readers.transform(np.eye(3), [0.3, 0.6, 0.2])
+    ours = export(placed.alone(fixture(user)), "abb-wobjdata", Selection(child="wobj2"))
+    kind, name, value = readers.rapid(WOBJ2)
+    # All of the fixture goes into the user frame; the object's own is left where it is.
+    assert readers.rapid(ours) == (kind, name, [*value[:4], [[0, 0, 0], [1, 0, 0, 0]]])
+
+
+def test_ur_tool_and_pose_of_the_script_manual():
+    matrix = readers.transform(readers.of_rotation_vector(0, 3.14, 0), [0, 0.2, 0.3])
+    # Rounding of doubles.
+    assert off("ur-tcp", SET_TCP, matrix) < 1e-12
+    assert rounded(export(placed.alone(tool(matrix)), "ur-tcp"), "#") == rounded(SET_TCP, "#")
+    pose = readers.transform(readers.rx(1.57), [0.2, 0.5, 0.1])
+    assert np.abs(readers.urscript_pose(POSE) - pose).max() < 1e-12
+    ours = export(placed.alone(fixture(pose)), "ur-feature", Selection(child="p_from"))
+    assert rounded(ours, "#") == rounded(f"globalp_from={POSE}", "#")
+
+
+@pytest.mark.parametrize(
+    ("name", "theirs", "number"), [("kuka-tool", TOOL_DATA, 3), ("kuka-base", BASE_DATA, 1)]
+)
+def test_kuka_frames_of_a_controllers_own_file(name, theirs, number):
+    matrix = FRAME_READERS[name](theirs)
+    frames = tool(matrix) if name == "kuka-tool" else fixture(matrix)
+    ours = export(placed.alone(frames), name, Selection(number=number))
+    assert rounded(ours, ";") == rounded(theirs, ";")
+    active = export(placed.alone(frames), name)
+    assert readers.kuka_named(active)[0] == ("$TOOL" if name == "kuka-tool" else "$BASE")
+
+
+# --- What is taken, and what is refused.
+
+
+@pytest.mark.parametrize("name", FRAME_READERS)
+def test_the_only_frame_of_its_kind_is_taken_and_none_of_the_other(name):
+    edge, other = (TOOL, FIXTURE) if name in TOOL_READERS else (FIXTURE, TOOL)
+    for source in (CELL, ALONE):
+        assert export(source, name) == export(source, name, Selection(edge=edge))
+    raised(DataError, f"{other} is none.*--to ", export, CELL, name, Selection(edge=other))
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_what_a_format_has_no_place_for_is_refused(name):
+    given = {"number": {"number": 2}, "load": {"load": Load(1.0, (0.0, 0.0, 1.0))}}
+    for what, chosen in given.items():
+        if what not in FORMATS[name].takes:
+            raised(DataError, "no place for", export, CELL, name, Selection(**chosen))
+
+
+TWO = replace(SAMPLE, frames=tool() | {"flange_from_tool_2": placed.frame(FLANGE_FROM_TOOL)})
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "chosen", "words"),
+    [
+        (SAMPLE, "rso", Selection(), "Did you mean ros"),
+        (SAMPLE, "ros", Selection("flange_from_cm"), "Did you mean flange_from_cam"),
+        (SAMPLE, "ros", Selection("cam_from_flange"), "--edge flange_from_cam --inverse"),
+        (SAMPLE, "ros", Selection(parent="a", child="a"), "two frames"),
+        (SAMPLE, "ur-tcp", Selection(), "visioncal tcp"),
+        (replace(SAMPLE, camera=None), "camera-info", Selection(), "no camera"),
+        (CELL, "kuka-tool", Selection(number=0), "from 1"),
+        (CELL, "abb-tooldata", Selection(load=Load(0.0, (0, 0, 1))), "mass above 0"),
+        (CELL, "ur-tcp", Selection(inverse=True), "the inverse of"),
+        (TWO, "ur-tcp", Selection(), "flange_from_tool, flange_from_tool_2"),
+        (ALONE, "text", Selection(), "flange_from_tool, base_from_fixture"),
+        (FrameFile({}), "text", Selection(), "no frames"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(source, name, chosen, words):
+    with pytest.raises(DataError) as caught:
+        export(source, name, chosen)
+    assert words in str(caught.value)
+
+
+def test_a_frame_has_its_own_origin_worth_and_verdict():
+    # The calibration itself comes from another file, of another day, with another verdict.
+    bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
+    frames = tool(verdict=bad) | fixture(source="points.csv", verdict=Verdict("good"))
+    cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
+    notes = export(cell, "text", Selection(FIXTURE)).splitlines()
+    origin = f"# calibrated by visioncal from 'points.csv', {placed.CREATED}: pivot over 10 touches"
+    edge = frames[FIXTURE].edge
+    worth = f"# verdict good; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"
+    assert notes[:2] == [origin, worth]
+    assert SAMPLE.session_name in export(cell, "text")
+    assert document(cell, "ur-tcp").verdict == bad
+    assert document(cell, "ur-feature").verdict == frames[FIXTURE].verdict
+    assert document(cell, "ros").verdict == cell.verdict
+
+
+# --- Files and the command.
+
+
+def test_a_file_of_frames_is_known_by_its_content(tmp_path):
+    file = tmp_path / "any name"
+    ALONE.save(file)
+    assert isinstance(load_result_or_frames(file), FrameFile)
+    raised(DataError, "no calibration", load_calibration, file)
+    SAMPLE.save(tmp_path / "calibration.json")
+    CELL.save(tmp_path / "frames.json")
+    # The calibration of a folder comes before the frames beside it.
+    assert load_result_or_frames(tmp_path).frames == {}
+    for name in ("calibration.json", "frames.json"):
+        assert isinstance(load_result_or_frames(tmp_path / name), Calibration)
+
+
 def exporting(*arguments):
     return visioncal("export", *arguments)
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    """A folder with a calibration.json."""
-    folder = tmp_path_factory.mktemp("result, größer")
-    SAMPLE.save(folder / "calibration.json")
-    return folder
-
-
-def test_the_command_prints_the_document_and_nothing_else(saved):
-    done = started("export", saved, "--to", "ros")
+def test_the_command_takes_a_load_and_warns_without_one(tmp_path):
+    CELL.save(tmp_path / "calibration.json")
+    load = ["--mass-kg", "5", "--cog-mm", "23", "0", "-75.5"]
+    done = exporting(tmp_path, "--to", "abb-tooldata", *load)
     assert (done.status, done.err) == (0, "")
-    assert done.out == export(SAMPLE, "ros")
+    assert readers.rapid(done.out)[2][2][:2] == [5, [23, 0, -75.5]]
+    done = exporting(tmp_path, "--to", "abb-tooldata").good()
+    assert readers.rapid(done.out)[2][2] == [-1, [0, 0, 0], [1, 0, 0, 0], 0, 0, 0]
+    for words in ("warning:", "LoadIdentify", "--mass-kg"):
+        assert words in done.err
+    assert exporting(tmp_path, "--to", "abb-tooldata", *load[:2]).refused("--cog-mm").out == ""
 
 
-def test_the_command_writes_a_file_once(saved, tmp_path):
-    out = tmp_path / "camera.urdf"
+def test_the_command_prints_the_document_or_writes_it_once(tmp_path):
+    folder, out = tmp_path / "result, größer", tmp_path / "camera.urdf"
+    folder.mkdir()
+    SAMPLE.save(folder / "calibration.json")
+    done = exporting(folder, "--to", "ros")
+    assert (done.status, done.out, done.err) == (0, export(SAMPLE, "ros"), "")
     chosen = ["--edge", "base_from_target", "--inverse", "--parent", "board", "--child", "world"]
-    done = exporting(saved / "calibration.json", "--to", "urdf", "-o", out, *chosen)
+    done = exporting(folder / "calibration.json", "--to", "urdf", "-o", out, *chosen)
     assert (done.status, done.out) == (0, ""), done.err
     written = out.read_text(encoding="utf-8")
     # Written with all digits.
-    assert off(written, "urdf", invert(SAMPLE.edges["base_from_target"].matrix)) < 1e-9
-    exporting(saved, "--to", "text", "-o", out).refused("--force")
+    assert off("urdf", written, invert(SAMPLE.edges["base_from_target"].matrix)) < 1e-9
+    exporting(folder, "--to", "text", "-o", out).refused("--force")
     assert out.read_text(encoding="utf-8") == written
-    assert exporting(saved, "--to", "text", "-o", out, "--force").status == 0
+    assert exporting(folder, "--to", "text", "-o", out, "--force").status == 0
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
 
 
 @pytest.mark.parametrize("name", ["", "session.toml"])
 def test_a_session_is_to_be_calibrated_first(tmp_path, name):
     (tmp_path / "session.toml").write_text("schema = 1\n", encoding="utf-8")
-    done = exporting(tmp_path / name, "--to", "ur")
-    assert (done.status, done.out) == (2, "")
-    assert f"Run visioncal calibrate {tmp_path}" in done.err
+    done = exporting(tmp_path / name, "--to", "ur").refused(f"Run visioncal calibrate {tmp_path}")
+    assert done.out == ""
