@@ -952,7 +952,7 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
     found = visioncal.doctor(cell).findings[0]
     assert found.kind == "misread_joints"
     assert "There is no robot named 'ur10ee'. Did you mean ur10e" in found.words
-    assert found.do.words.startswith("Correct [robot] model in session.toml")
+    assert found.do.words.startswith("Correct the robot's model in session.toml")
     # Without poses there is no result, and that is why.
     rewritten(cell, lambda rows: [row.update(dict.fromkeys(POSE, "")) for row in rows])
     with pytest.raises(DataError) as caught:

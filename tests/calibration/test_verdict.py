@@ -45,6 +45,7 @@ from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
 from visioncal.robot import load_robot, with_base
+from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.vision.targets import load_target
@@ -299,9 +300,12 @@ def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
     robot, camera = cell.robot.base_from_flange, cell.cam_from_target
     assert "mirrored_cell" not in ids(calibrate(pairs_session(mount, robot, camera)).verdict)
     other = MOUNTS[mount == MOUNTS[0]]
-    verdict = calibrate(pairs_session(other, invert(robot), camera)).verdict
-    assert ids(verdict)[:1] == ["mirrored_cell"]
-    assert verdict.status == "check"
+    mirrored = pairs_session(other, invert(robot), camera)
+    named = replace(mirrored, robot_document=read_robot_document("ur10e"))
+    for session in (mirrored, named):
+        verdict = calibrate(session).verdict
+        assert ids(verdict)[:1] == ["mirrored_cell"]
+        assert verdict.status == "check"
 
 
 @pytest.mark.parametrize("freedom", [np.inf, 15.0])

@@ -16,7 +16,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import absence, is_inside, parse_toml, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, Target
-from visioncal.core.verdict import READ_AGAIN
 from visioncal.robot import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session.columns import POSITION
 from visioncal.session.document import KINDS, Declaration, InstrumentTable, Kind, RobotTable
@@ -223,7 +222,7 @@ def read_targets(
     contents: dict[str, Mapping[str, Any]] = {}
     for name, path in paths.items():
         if given is None:
-            targets[name], contents[name] = _load(path, folder)
+            targets[name], contents[name] = read_target(path, folder)
         elif name in given:
             contents[name] = given[name]
             targets[name] = target_from_document(contents[name], Path(path).stem)
@@ -235,17 +234,6 @@ def read_targets(
     if is_only:
         return {"": next(iter(targets.values()))}, next(iter(contents.values()))
     return (targets, contents) if paths else ({}, document)
-
-
-def _load(path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
-    try:
-        return read_target(path, folder)
-    except DataError as error:
-        if "metres, such as" not in error.message:
-            raise
-        # All sizes in millimetres can be converted at once.
-        step = str(READ_AGAIN)
-        raise DataError(error.message, culprits=error.culprits, next_step=step) from error
 
 
 def _declared_targets(declaration: Declaration) -> dict[str, str]:

@@ -66,6 +66,10 @@ def read_cell(name_or_path: str) -> NetworkOptions:
         _check(NetworkOptions, content, "", (*_NAMED,))
         for key, kind in _NAMED.items():
             rows = document.get(key, {})
+            if not (isinstance(rows, dict) and all(isinstance(row, dict) for row in rows.values())):
+                raise DataError(
+                    f"{key} is {rows!r:.60}; tables [{key}.NAME] are needed.", culprits=[key]
+                )
             for name, row in rows.items():
                 if not NAME.fullmatch(name) or name == CELL:
                     raise DataError(

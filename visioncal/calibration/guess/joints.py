@@ -96,7 +96,7 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
         yield replace(entry(words, fix, same), robot=table)
     for model in _built_in_robots():
         if model.name != robot.name and model.joint_count == count:
-            fix = f'In session.toml, write [robot] model = "{model.name}".'
+            fix = f'In session.toml, write model = "{model.name}" for this robot.'
             words = f"the arm a {model.name} and not a {robot.name}"
             yield replace(entry(words, fix, same), robot=model)
 

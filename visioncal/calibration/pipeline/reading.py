@@ -1,5 +1,6 @@
 """Reads what a session has of robots, instruments and clocks: the stages before the fit."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -28,8 +29,8 @@ from visioncal.session import STREAMS, Session
 from visioncal.session.columns import column_warnings
 
 # Place that warnings about the robot's model begin with.
-_OF_MODEL = "session.toml: robot.model:"
-_MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
+_OF_MODEL = re.compile(r"session\.toml: robots?\.(\w+\.)?model: ")
+_MODEL_STEP = "Correct the robot's model in session.toml, or the file that it names."
 
 
 def read_cell_inputs(run: RunState) -> RunState:
@@ -88,7 +89,7 @@ def _suspicious(session: Session) -> Iterator[Finding]:
     # A column that may be misspelt, or the user's own.
     of_columns = [*column_warnings(session.columns, "views.csv")]
     for warning in session.warnings:
-        if warning.startswith(_OF_MODEL):
+        if _OF_MODEL.match(warning):
             yield Finding("misread_joints", warning, Remedy(_MODEL_STEP))
         elif warning in of_columns:
             yield Finding(NOTE, warning)
@@ -107,7 +108,7 @@ def _reported(run: RunState) -> RunState:
     if matched is not None and matched.misread:
         check_level_is_possible(run.level, can=False, misread=matched.misread)
     if not run.base_from_flange:
-        of_model = [warning for warning in session.warnings if warning.startswith(_OF_MODEL)]
+        of_model = [warning for warning in session.warnings if _OF_MODEL.match(warning)]
         step = _MODEL_STEP if of_model else " ".join(session.warnings)
         raise DataError(
             " ".join([*of_model, f"session {session.name!r}: no view has a pose of the robot."]),

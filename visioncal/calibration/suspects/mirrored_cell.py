@@ -15,8 +15,11 @@ _NEAR_M, _RATIO = 0.3, 3.0
 
 
 def _found(run: RunState) -> Iterator[Finding]:
+    if run.mount not in MOUNTS:
+        return
     # Where a model's poses are those of the joints, they are no inverse ones.
-    if run.mount not in MOUNTS or run.reported.matched is not None:
+    matched = run.reported.matched
+    if matched is not None and matched.joints_rad:
         return
     camera, target = (
         (name, float(np.linalg.norm(edge.transform.translation)))
