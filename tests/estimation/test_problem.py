@@ -327,7 +327,7 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     known = problem.prior_information(state)
     weighted = np.linalg.solve(noise, jacobian)
     whitening = Whitening.of(problem, NETWORK_NOISE, linear.by_errors)
-    information, gradient, cost = whitening.equations(problem, state, linear)
+    information, gradient, cost, _ = whitening.equations(problem, state, linear)
     scale = np.sqrt(np.diag(information))
     away = (information - known.information - jacobian.T @ weighted) / np.outer(scale, scale)
     # Rounding, of numbers whose squares differ by ten powers of ten.

@@ -45,10 +45,10 @@ class Whitening:
         """Whitens observations with Jacobian (n, 6, 6 w) by their units' errors."""
         # Observations not in `among` get zero weight.
         (unit_of, members), alone = problem.units, problem.alone
-        own, errors = problem.covariance(noise), problem.error_covariance(noise)
-        jacobian = by_errors[alone]
-        own[alone] += jacobian @ errors[unit_of[alone]] @ np.swapaxes(jacobian, 1, 2)
-        weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, unit_of)
+        weights, errors = problem.weights(noise), problem.error_covariance(noise)
+        own, jacobian = problem.covariance(noise)[alone], by_errors[alone]
+        own += jacobian @ errors[unit_of[alone]] @ np.swapaxes(jacobian, 1, 2)
+        weights[alone], units = np.linalg.inv(own), np.where(alone, -1, unit_of)
         if among is not None:
             weights[~among] = 0.0
         shared, width = units >= 0, by_errors.shape[2]
@@ -72,10 +72,13 @@ class Whitening:
 
     def equations(
         self, problem: Problem, state: State, linear: Linear
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """Information (p, p), gradient (p,) of half the whitened squared error, and that error."""
+    ) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+        """Information (p, p), gradient (p,) of half the whitened squared error, and that error.
+
+        And (u + 1, 6 w, p) sums of the Jacobian times `taken` over each unit; the last one is zero.
+        """
         size, width = linear.size, self.taken.shape[1]
-        total, shared = np.zeros((size + 1, size + 1)), np.zeros((self.count, width, size + 1))
+        total, shared = np.zeros((size + 1, size + 1)), np.zeros((self.count + 1, width, size + 1))
         for block in linear.blocks:
             # Residuals are the last column.
             columns, rows = np.append(block.columns, size), block.rows
@@ -95,6 +98,7 @@ class Whitening:
             total[:-1, :-1] + prior.information,
             total[:-1, -1] + prior.gradient,
             float(total[-1, -1]) + prior.cost,
+            shared[:, :, :-1],
         )
 
 
@@ -105,6 +109,7 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
     by a Schur complement.
     """
     linear, covariance = problem.linear(state), problem.covariance(noise)
+    all_weights = problem.weights(noise)
     unit_of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
@@ -126,7 +131,7 @@ def reduce(problem: Problem, state: State, noise: Noise) -> Reduced:
         rows, augmented = block.rows[~single], augmented[~single]
         if not len(rows):
             continue
-        weights = np.linalg.inv(covariance[rows])
+        weights = all_weights[rows]
         weighted = weights @ augmented
         total[np.ix_(columns, columns)] += gram(augmented, weighted)
         if unit_of[rows[0]] < 0:

@@ -332,11 +332,11 @@ class Problem:
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (d,) of a frame prior, and their Jacobian (d, p)."""
         path, by_edges = self.tree.path(prior.first, prior.second), np.zeros((6, self.size))
-        product, slopes = self._moved_path(path, state, np.zeros(1, dtype=np.int64))
+        back, slopes = self._moved_path(path, state, np.zeros(1, dtype=np.int64))
         for step, slope in zip(path, slopes, strict=True):
             if step.frame in self.unknown:
                 by_edges[:, self.edge_columns(step.frame)] += slope[0]
-        residuals, jacobian = prior.whitened(product[0])
+        residuals, jacobian = prior.whitened(invert(back[0]))
         return residuals, jacobian @ by_edges
 
     def _edge(self, step: PathStep, state: State, rows: IntArray) -> FloatArray:
@@ -361,13 +361,13 @@ class Problem:
     def _moved_path(
         self, path: tuple[PathStep, ...], state: State, rows: IntArray
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """`product`, and Jacobians (m, 6, 6) of its right perturbation by each step's edge's."""
-        product, slopes = np.broadcast_to(np.eye(4), (len(rows), 4, 4)), []
+        """Inverse of `product`, and Jacobians (m, 6, 6) of its right perturbation by each edge's."""
+        back, slopes = np.broadcast_to(np.eye(4), (len(rows), 4, 4)), []
         for step in reversed(path):
-            edge, after = self._edge(step, state, rows), product
-            product = (invert(edge) if step.is_up else edge) @ after
-            slopes.append(-adjoint(invert(product)) if step.is_up else adjoint(invert(after)))
-        return product, slopes[::-1]
+            edge, before = self._edge(step, state, rows), back
+            back = back @ (edge if step.is_up else invert(edge))
+            slopes.append(-adjoint(back) if step.is_up else adjoint(before))
+        return back, slopes[::-1]
 
     def between(self, first: str, second: str, state: State, rows: IntArray) -> FloatArray:
         """(m, 4, 4) `first_from_second` of two frames for m observations."""
@@ -433,7 +433,7 @@ class Problem:
         errors = np.zeros((len(self), 6, members.shape[1], 6))
         for group, effects in groups:
             rows, columns, slopes = group.rows, [6 * len(self.unknown) + effects.values], []
-            product, by_steps = self._moved_path(group.path, state, rows)
+            back[rows], by_steps = self._moved_path(group.path, state, rows)
             by_effects = np.zeros((len(rows), 6, len(effects.values)))
             for step, slope, by_flange in zip(group.path, by_steps, effects.by_steps, strict=True):
                 if step.frame in self.unknown:
@@ -444,7 +444,6 @@ class Problem:
                     errors[rows, :, slots.argmax(axis=1)] += slope
                 if by_flange is not None:
                     by_effects += slope @ by_flange
-            back[rows] = invert(product)
             jacobian = np.concatenate([*slopes, by_effects], axis=2)
             blocks.append(JacobianBlock(rows, np.concatenate(columns), jacobian))
         result = back, errors.reshape(len(self), 6, -1), tuple(blocks)
@@ -505,18 +504,31 @@ class Problem:
                 changes[group.rows] = rest @ error[group.rows] @ invert(rest)
         return changes
 
-    def covariance(self, noise: Noise) -> FloatArray:
-        """Covariances (n, 6, 6) of the observations' own noise."""
-        observations = self.observations
+    def _variances(self, noise: Noise) -> FloatArray:
+        """(n, 1, 1) factors of the observations' own covariances at some noise."""
         # The last level is that of observations with known covariance.
-        level = np.append(noise.sensors, 1.0)[observations.sensors]
-        scale = (self.repeat_counts * level**2)[:, None, None]
-        covariance = np.asarray(scale * observations.covariance)
-        places = np.flatnonzero(~observations.has_rotation)
+        level = np.append(noise.sensors, 1.0)[self.observations.sensors]
+        return np.asarray((self.repeat_counts * level**2)[:, None, None])
+
+    @cached_property
+    def _covariance_and_inverse(self) -> FloatArray:
+        """(2, n, 6, 6) covariances of the observations at levels of one, and `weights`."""
+        covariance = self.observations.covariance.copy()
+        places = np.flatnonzero(~self.observations.has_rotation)
         covariance[places, :3, :] = covariance[places, :, :3] = 0.0
         # The residual and Jacobian rows of a rotation that was not measured are zero.
         covariance[places, :3, :3] = np.eye(3)
-        return covariance
+        inverse, joined = np.zeros_like(covariance), ~self.alone
+        inverse[joined] = np.linalg.inv(covariance[joined])
+        return np.stack([covariance, inverse])
+
+    def covariance(self, noise: Noise) -> FloatArray:
+        """Covariances (n, 6, 6) of the observations' own noise."""
+        return np.asarray(self._variances(noise) * self._covariance_and_inverse[0])
+
+    def weights(self, noise: Noise) -> FloatArray:
+        """Inverses (n, 6, 6) of `covariance`; zero for observations that are `alone`."""
+        return np.asarray(self._covariance_and_inverse[1] / self._variances(noise))
 
     def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:
         """Covariances (n, 6, 6) of the residuals, including the flange errors."""

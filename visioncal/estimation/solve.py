@@ -112,7 +112,7 @@ def solve_problem(
     whitening = Whitening.of(problem, noise, problem.ideal_errors(state))
 
     def linearise(at: State) -> Linearised[State]:
-        information, gradient, cost = whitening.equations(problem, at, problem.linear(at))
+        information, gradient, cost, _ = whitening.equations(problem, at, problem.linear(at))
         free, free_gradient = information[np.ix_(moving, moving)], gradient[moving]
 
         @cache
@@ -138,7 +138,9 @@ def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
     The (n,) mask `kept` is of those that remain.
     """
     whitening = Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
-    information, gradient, _ = whitening.equations(problem, fit.state, problem.linear(fit.state))
+    information, gradient, *_ = whitening.equations(
+        problem, fit.state, problem.linear(fit.state)
+    )
     moving, step = problem.moving, np.zeros(problem.size)
     step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
     return fit.state.moved(step)
@@ -204,13 +206,21 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     """
     own, linear = problem.covariance(noise), problem.linear(state)
     whitening = Whitening.of(problem, noise, linear.by_errors)
-    information, gradient, _ = whitening.equations(problem, state, linear)
+    information, gradient, _, shared = whitening.equations(problem, state, linear)
     fitted = covariance_among(information, problem.moving)
-    jacobian = linear.jacobian
-    left = linear.residuals[:, :, None] - jacobian @ (fitted @ gradient)[:, None]
-    pulled, weighted = whitening.inverse(left), whitening.inverse(jacobian)
-    remaining = whitening.weights - np.swapaxes(whitening.taken, 1, 2) @ whitening.taken
-    remaining -= weighted @ fitted @ np.swapaxes(weighted, 1, 2)
+    # What the unknowns absorb, of each observation alone and through its unit's shared errors.
+    carried, step = shared @ fitted, fitted @ gradient
+    of_unit = np.eye(shared.shape[1]) + carried @ np.swapaxes(shared, 1, 2)
+    weights, taken, units = whitening.weights, whitening.taken, whitening.units
+    left, crossed = linear.residuals[:, :, None].copy(), np.zeros_like(linear.by_errors)
+    for block in linear.blocks:
+        left[block.rows, :, 0] -= block.jacobian @ step[block.columns]
+        through = carried[units[block.rows]][:, :, block.columns]
+        crossed[block.rows] = block.jacobian @ np.swapaxes(through, 1, 2)
+    absorbed = linear.covariance(fitted) @ weights - 2.0 * crossed @ taken
+    remaining = weights - weights @ absorbed
+    remaining -= np.swapaxes(taken, 1, 2) @ of_unit[units] @ taken
+    pulled = whitening.inverse(left)
     squares = np.sum(pulled * (own @ pulled), axis=(1, 2))
     unmeasured = np.where(problem.observations.has_rotation, 0.0, 3.0)
     return squares, np.einsum("nij,nji->n", own, remaining) - unmeasured
