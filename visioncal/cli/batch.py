@@ -10,8 +10,6 @@ from visioncal.core.number_format import counted
 from visioncal.interchange.batch import batch
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-_MOST_NAMED = 5
-
 
 def batch_command(options: BatchOptions) -> None:
     """Runs `visioncal batch`."""
@@ -37,7 +35,7 @@ def batch_command(options: BatchOptions) -> None:
         for row in found.rows
         if row.state == "failed"
     ]
-    for line in failed[:_MOST_NAMED]:
+    for line in failed[:5]:
         answer(f"  {line}")
     answer(f"written: {found.page}, {found.table}")
     if found.is_cut_short:

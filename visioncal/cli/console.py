@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 # 0: a result to use; 1: a bug of ours; 2: the input cannot give a result; 3: the result's verdict
 # is bad, or a check failed (verify).
 _EXIT_BUG, EXIT_NO_RESULT, EXIT_BAD = 1, 2, 3
-_LISTED_CULPRITS = 10
-_LEAST_WIDTH = 110  # of tables
-_SHORT = 12  # culprits of fewer characters share a line
 
 
 def messages() -> "Console":
@@ -86,7 +83,7 @@ def print_table(
         table.add_row(*map(Text, cells), style="bold green" if at == bold else "")
     console = messages() if is_message else answers()
     # Names of cells' frames are long, and are not truncated.
-    console.width = max(console.width, _LEAST_WIDTH)
+    console.width = max(console.width, 110)
     console.print(table)
 
 
@@ -119,12 +116,12 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         print_json({"error": document})
     say(error.message, "error: ", "bold red")
     other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
-    if all(len(name) < _SHORT for name in other_culprits):
+    if all(len(name) < 12 for name in other_culprits):
         other_culprits = [", ".join(other_culprits)] if other_culprits else []
-    for culprit in other_culprits[:_LISTED_CULPRITS]:
+    for culprit in other_culprits[:10]:
         say(f"  - {culprit}")
-    if len(other_culprits) > _LISTED_CULPRITS:
-        say(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
+    if len(other_culprits) > 10:
+        say(f"  - and {len(other_culprits) - 10} more")
     if next_step:
         say(next_step)
 

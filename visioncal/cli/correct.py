@@ -33,9 +33,6 @@ from visioncal.session.columns import column_of
 from visioncal.session.selecting import ARM, EYE
 
 _MOST_SHOWN = 10
-# Away from singularities a millimetre turns joints by some tenths of a degree at most; beyond the
-# second limit the exact value does not matter.
-_SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
 _TOOLS = "flange_from_"
 
 
@@ -198,15 +195,14 @@ def _warn_singular(
 ) -> Iterator[str]:
     """Warns near singularities, where a correction of a millimetre turns a joint far."""
     turns = arm.turns_deg_per_mm(q[rows])
-    near = np.flatnonzero(turns.max(axis=1) > _SINGULAR_DEG)
+    # Away from singularities a millimetre turns joints by some tenths of a degree at most.
+    near = np.flatnonzero(turns.max(axis=1) > 5.0)
     if not len(near):
         return
     worst = near[int(np.argmax(turns[near].max(axis=1)))]
     joint = int(np.argmax(turns[worst]))
     largest_deg = float(turns[worst, joint])
-    turn_words = (
-        f"{largest_deg:.0f}" if largest_deg < _MOST_TURN_DEG else f"over {_MOST_TURN_DEG:.0f}"
-    )
+    turn_words = f"{largest_deg:.0f}" if largest_deg < 90.0 else "over 90"
     yield (
         f"{some_of([targets.places[rows[index]] for index in near])}: nearly singular; at "
         f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "

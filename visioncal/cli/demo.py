@@ -43,10 +43,6 @@ from visioncal.simulation.records import truth_of, write_truth
 
 # The default speed of a UR's program; nobody stands beside this one.
 _TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
-# Fewer candidates than for a real plan, as a demonstration should be short.
-_CANDIDATES = 600
-# The arm begins so near to the first stop, as if guided there by hand [rad].
-_NEAR_RAD = 2e-3
 
 
 def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
@@ -67,7 +63,8 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
     planned = _planned(bench.known, stops, seed, plan)
-    bench.start(planned.stops[0].q + _NEAR_RAD)
+    # As if guided there by hand.
+    bench.start(planned.stops[0].q + 2e-3)
     with closing(bench):
         host = bench.controller.host
         say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
@@ -84,7 +81,8 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
 
 def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> PlanFile:
     """Plans stops from the rough poses, and reads them back as a recording does."""
-    request = PlanRequest(purpose_of("hand-eye"), stops, candidates=_CANDIDATES, seed=seed)
+    # Fewer candidates than for a real plan, as a demonstration should be short.
+    request = PlanRequest(purpose_of("hand-eye"), stops, candidates=600, seed=seed)
     with shown_progress(quiet=False) as progress:
         plan = make_plan(known, request, progress=progress)
         written = write_plan(folder, plan, plan_document(plan, {"kind": "demo"}))
@@ -104,12 +102,6 @@ def _drive(bench: Bench, plan: PlanFile, session: Path) -> None:
         journal = Journal.begin(session, facts, cell.clock.unix_offset_s(), len(plan.stops))
         steps = record_driven(cell, plan, journal, _TAKING, Consent(None), watch)
         check_all(journal, steps)
-
-
-# False-alarm probability of that test, and factor on the sigmas: errors of one board's corners are
-# correlated by hundredths of a pixel, and joints deviate from their encoders, which a covariance of
-# independent noise underestimates.
-_CHANCE, _SIGMA_FACTOR = 1e-3, 1.5
 
 
 def demo_command(options: DemoOptions) -> None:
@@ -160,4 +152,6 @@ def chi_square(calibration: Calibration, truth: Truth) -> tuple[float, float]:
     ]
     twists = np.concatenate(errors)
     squared = float(twists @ np.linalg.solve(calibration.joint_covariance, twists))
-    return squared, _SIGMA_FACTOR**2 * float(chi2_limit(_CHANCE, twists.size))
+    # Errors of one board's corners are correlated by hundredths of a pixel, and joints deviate from
+    # their encoders: a covariance of independent noise underestimates by up to 1.5.
+    return squared, 1.5**2 * float(chi2_limit(1e-3, twists.size))

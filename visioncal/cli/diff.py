@@ -6,10 +6,6 @@ from visioncal.core.number_format import figure
 from visioncal.interchange.result_files import load_result
 from visioncal.results.compare import LensChange, Significance, compare, to_document
 
-# Below a nanometre and a micro-degree differences are rounding.
-_DECIMALS = 6
-_WHOLE_PERCENT, _LEAST_PERCENT = 10.0, 0.01
-
 
 def diff_command(options: DiffOptions) -> None:
     """Runs `visioncal diff`."""
@@ -34,10 +30,11 @@ def diff_command(options: DiffOptions) -> None:
     for finding in comparison.findings:
         answer(f"- {finding}")
     if comparison.edges:
+        # Below a nanometre and a micro-degree differences are rounding.
         rows = [
             (
                 edge.name,
-                f"{round(moved, _DECIMALS):.3g} {unit}",
+                f"{round(moved, 6):.3g} {unit}",
                 f"{figure(sigma)} {unit}",
                 f"{moved / sigma:.1f}" if sigma > 0.0 else "",
                 *_outcome(test),
@@ -82,8 +79,8 @@ def _print_lens(lens: LensChange) -> None:
 
 def _outcome(test: Significance) -> tuple[str, str]:
     percent = 100 * test.p_value
-    chance = f"{percent:.0f} %" if percent > _WHOLE_PERCENT else f"{figure(percent)} %"
+    chance = f"{percent:.0f} %" if percent > 10.0 else f"{figure(percent)} %"
     return (
-        "under 0.01 %" if percent < _LEAST_PERCENT else chance,
+        "under 0.01 %" if percent < 0.01 else chance,
         "changed" if test.is_change else "noise",
     )

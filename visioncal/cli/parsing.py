@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 
-# Digits of a view's number, and of the width or height of an image.
-_MOST_DIGITS = 6
 # A pose of the robot, as typed.
 POSE = "x,y,z,qx,qy,qz,qw"
 FORMS = (
@@ -94,7 +92,7 @@ def _check(is_right: bool, words: str, option: str, needed: str) -> None:
 def _whole_numbers(words: str) -> list[int]:
     """Whole numbers separated by commas; empty where anything else is among them."""
     cells = [part.strip() for part in words.split(",")]
-    are_whole = all(cell.isdecimal() and len(cell) <= _MOST_DIGITS for cell in cells)
+    are_whole = all(cell.isdecimal() and len(cell) <= 6 for cell in cells)
     return [int(cell) for cell in cells] if are_whole else []
 
 

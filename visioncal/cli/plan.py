@@ -50,10 +50,6 @@ from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, sele
 from visioncal.vision.targets import target_from_document
 
 _SHOWN = 12
-# Candidates for a stop to be repeated: not all have a free way to each other.
-_CHOICE = 4
-# Cosine between the z axes of board and base above which only a camera below would see the board.
-_FACE_DOWN = 0.7
 _SESSION = "session.toml"
 # Options without which a cell is not known.
 _NEEDED = ("target", "camera", "cam", "board")
@@ -90,7 +86,7 @@ def plan_command(options: PlanOptions) -> None:
         return
     with shown_progress(quiet=options.as_json) as progress:
         cell, begun = _begin(start, words, (limits, boxes), progress)
-        if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > _FACE_DOWN:
+        if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > 0.7:
             warn(
                 "this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
@@ -120,7 +116,8 @@ def _plan_to_verify(options: PlanOptions, start: Source, words: PlanOptions, kep
     fit, plan = calibration.joint_fit, None
     targets = {} if fit is None else fit.targets
     if spread.q is not None and calibration.robot and (words.target or "" in targets):
-        more = stops_to_repeat(calibration, start.session, _CHOICE * count)
+        # Not all candidates have a free way to each other.
+        more = stops_to_repeat(calibration, start.session, 4 * count)
         with shown_progress(quiet=options.as_json) as progress:
             try:
                 cell = cell_of(start, words, kept)

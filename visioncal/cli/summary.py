@@ -13,10 +13,6 @@ from visioncal.present.facts import solver_table
 from visioncal.results import Calibration, CellResult, Remedy, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
-# Larger predicted errors are meaningless, and not shown [px].
-_MOST_PX = 1e4
-# Smallest noise level that is mentioned.
-_SHOWN_LEVEL = 1.2
 
 
 def print_verdict(verdict: Verdict, name: str) -> None:
@@ -69,11 +65,12 @@ def _print_residuals(calibration: Calibration) -> None:
     """Prints the number of used views, and the errors of held-out predictions."""
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
+    # Larger ones are meaningless.
     answer(
         f"{used} of {len(calibration.views)} views used. "
         f"Checked with views that were not used in the fit: {figure(held.mm)} mm"
         + ("" if held.deg is None else f", {figure(held.deg)} deg")
-        + (f", {figure(held.px)} px" if held.px and held.px < _MOST_PX else "")
+        + (f", {figure(held.px)} px" if held.px and held.px < 1e4 else "")
     )
 
 
@@ -86,7 +83,7 @@ def _print_noise(cell: CellResult) -> None:
             if key != "level"
         ]
         level = levels.get("level", 1.0)
-        if level > _SHOWN_LEVEL or not words:
+        if level > 1.2 or not words:
             words.append(f"{figure(level)} times what is said of it")
         answer(f"noise of {name}: {', '.join(words)}")
 

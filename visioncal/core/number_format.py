@@ -7,7 +7,6 @@ from decimal import ROUND_CEILING, Decimal
 
 # Least figures in sentences, and in tables [mm, deg or px]: smaller ones do not matter.
 _LEAST, _SMALLEST = 1e-3, 1e-4
-_MAX_DECIMALS = 6
 
 
 def figure(value: float) -> str:
@@ -46,10 +45,10 @@ def percent(probability: float) -> str:
 def decimals_for(sigma: float) -> int:
     """Number of decimals that show two significant digits of a standard deviation."""
     if not math.isfinite(sigma) or sigma <= 0.0:
-        return _MAX_DECIMALS
+        return 6
     # Rounded first, because 0.0996 is printed as 0.10.
     exponent = int(f"{sigma:.1e}".partition("e")[2])
-    return min(max(1 - exponent, 0), _MAX_DECIMALS)
+    return min(max(1 - exponent, 0), 6)
 
 
 def matched(value: float, sigma: float) -> str:

@@ -36,8 +36,6 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Least number of views for a separate calibration.
-_FEWEST_ALONE = 6
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
@@ -74,7 +72,7 @@ def exchanging(first: int, second: int) -> Remedy:
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:
     """Advice with the command to calibrate some views alone, if they are enough."""
-    are_enough = len(views) >= _FEWEST_ALONE
+    are_enough = len(views) >= 6
     return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if are_enough else "")
 
 

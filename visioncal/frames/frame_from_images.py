@@ -40,11 +40,6 @@ _COUNTED_TWICE = (
     "the sigma holds the camera's own calibration: a pick by the same camera on a plane of this "
     "frame counts it twice"
 )
-# A target is on the other parent if its scatter exceeds this multiple of the noise, and falls below
-# this share of itself against the other parent.
-_WILD, _STILL = 10.0, 0.1
-# Largest share of unused views without a finding, and the number of reasons listed.
-_LOST_SHARE, _LISTED = 0.25, 3
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 
@@ -170,10 +165,11 @@ def _check_parent(
     other: FrameKind = "fixture" if kind == "tool" else "tool"
     parent = PARENTS[other]
     has_poses = all(sight.base_from_flange is not None for sight in sights)
-    if seen.scatter < _WILD or (needs_robot(eye, parent) and not has_poses):
+    # So much wilder than the noise, and calm against the other parent.
+    if seen.scatter < 10.0 or (needs_robot(eye, parent) and not has_poses):
         return
     alternative = place_target(eye, sights, looks, parent)
-    if alternative.rms_mm < _STILL * seen.rms_mm:
+    if alternative.rms_mm < 0.1 * seen.rms_mm:
         raise DataError(
             f"session {shown.source!r}: target {shown.target.name} moves by "
             f"{figure(seen.rms_mm)} mm against the {PARENTS[kind]}, and stands still to "
@@ -187,11 +183,11 @@ def _check_parent(
 def view_findings(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
     """Finding on a session with many unused views."""
     missing = {view: why for view, why in lost.items() if why != HELD_BACK}
-    if len(missing) > _LOST_SHARE * len(session.views):
+    if len(missing) > 0.25 * len(session.views):
         yield Finding(
             "lost_views",
             f"{len(missing)} of {len(session.views)} views were not used: "
-            f"{'; '.join(by_reason(missing)[:_LISTED])}.",
+            f"{'; '.join(by_reason(missing)[:3])}.",
             views=tuple(missing),
         )
 

@@ -30,8 +30,6 @@ from visioncal.vision.targets import load_target
 # Factor beyond the distances of the views that is named: a board of a third of the image reaches
 # that much nearer or farther than its middle where it is steeply tilted.
 _BEYOND = 1.5
-# Smallest angle between a ray and the plane [rad].
-_PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +154,7 @@ def _depth(cam_pose: CameraPose, plane: Plane, ray: FloatArray, label: str) -> f
     along = cam_pose.base_from_cam[:3, :3] @ ray
     rise = float(plane.normal @ along)
     gap = plane.offset_m - float(plane.normal @ cam_pose.base_from_cam[:3, 3])
-    if abs(rise) < _PARALLEL * np.linalg.norm(along):
+    if abs(rise) < 1e-6 * np.linalg.norm(along):
         raise DataError(
             f"locate: the ray of {label} runs parallel to the plane.", next_step=_LOOK_AT_PLANE
         )

@@ -22,8 +22,6 @@ from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice
 from visioncal.session.table import loads_of
 
-# Largest difference of a stated lens from the calibrated one, as a share of the focal length.
-_OTHER_LENS = 0.03
 _NO_IMAGE = "it has no image"
 _ORIGIN = (0.0, 0.0, 0.0)
 
@@ -85,7 +83,7 @@ def detect_session_target(
         )
     if lens is not None and stated is not None:
         difference = np.abs(stated.matrix - lens.camera.matrix).max()
-        if difference > _OTHER_LENS * lens.camera.matrix[0]:
+        if difference > 0.03 * lens.camera.matrix[0]:
             fx, _, cx, _ = stated.matrix
             warnings.append(
                 f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "

@@ -23,11 +23,6 @@ from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import GREY, poor_image_reason
 from visioncal.vision.targets import corner_positions, rotations
 
-# Ratio of scatter to expected noise that warrants a warning; light and distance explain less.
-_MENTIONED = 2.0
-# Largest number of refits without outlier corners.
-_ROUNDS = 3
-
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidates:
@@ -87,7 +82,8 @@ def target_pose_candidates(
     is_larger = squared_sum > noise_px**2 * float(chi2_limit(FALSE_ALARM, freedom))
     # Rounding of exact corners is no scatter.
     if is_larger and scatter_px >= 1e-6:
-        if scatter_px >= _MENTIONED * noise_px:
+        # Light and distance explain less.
+        if scatter_px >= 2.0 * noise_px:
             warnings = (
                 f"{label}: the corners scatter by {figure(scatter_px)} px around the target's "
                 f"pose, and {figure(noise_px)} px was to be expected: look whether the image is "
@@ -168,7 +164,7 @@ def _fit_poses(
 ) -> tuple[ViewPoses, Corners, float]:
     """Candidate poses, the inlier corners of the best, and their squared residuals' sum [px^2]."""
     positions = corner_positions(target)
-    for _ in range(_ROUNDS):
+    for _ in range(3):
         (poses,) = measure_poses({corners.view: corners}, [target], eye.camera, noise_px)
         stack = _stack(eye, corners, positions, noise_px)
         residuals = _compressed(eye.camera, stack, target, poses.cam_from_target[:1]).residuals

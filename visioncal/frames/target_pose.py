@@ -35,12 +35,6 @@ from visioncal.vision.targets import load_target
 Parent: TypeAlias = Literal["base", "flange"]
 # Squared distance beyond which two poses differ significantly.
 _DIFFERENT = float(chi2_limit(0.05, 6))
-# Relative difference below which scores are equal.
-_SAME = 1e-6
-# The mean converges in a few steps, since the poses are near each other.
-_STEPS, _CONVERGED = 10, 1e-12
-# Significance of images that scatter more than the noise.
-_SCATTER_ALARM = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +208,7 @@ def _start(candidates: _CandidateViews) -> tuple[IntArray, Mask]:
         nearest, picks = _nearest(candidates, seed)
         score = float(np.sort(nearest)[:half].sum())
         # Poses of a symmetric board fit equally, apart from rounding of their fits.
-        if best is None or score < (1.0 - _SAME) * best[0] - 1e-9:
+        if best is None or score < (1.0 - 1e-6) * best[0] - 1e-9:
             best = (score, picks, nearest)
     if best is None:
         raise RuntimeError("there are no images to agree")
@@ -249,10 +243,11 @@ def _fit(candidates: _CandidateViews, picks: IntArray, agrees: Mask) -> _ImageIn
     of_mean = covariance_from(weights.sum(axis=0))
     gains = of_mean @ weights
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
-    for _ in range(_STEPS):
+    # The mean converges in a few steps, since the poses are near each other.
+    for _ in range(10):
         step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
         matrix = matrix @ exp(step)
-        if np.abs(step).max() < _CONVERGED:
+        if np.abs(step).max() < 1e-12:
             break
     errors = log(invert(matrix) @ matrices)
     by_common = np.array([place.by_common for place in chosen])
@@ -449,7 +444,7 @@ def _inlier_warnings(
             f"The images disagree, by up to {_distance_words(fit, worst)}, and with {count} of "
             "them it is not known which are right: take more."
         )
-    elif fit.variance * 6 * (inliers - 1) > chi2_limit(_SCATTER_ALARM, 6 * (inliers - 1)):
+    elif fit.variance * 6 * (inliers - 1) > chi2_limit(1e-4, 6 * (inliers - 1)):
         yield (
             f"The images scatter {figure(np.sqrt(fit.variance))} times as much as the "
             "calibration's noise lets them; the sigmas are that much larger."

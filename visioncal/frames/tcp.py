@@ -30,8 +30,6 @@ from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot
 
 TOUCH_KINDS = ("point", "z", "xz")
-# A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
-_NO_TOOL_M = 2e-3
 
 
 @typed
@@ -124,7 +122,8 @@ def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator
             Remedy("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
         )
     tip_m = float(np.linalg.norm(fit.flange_from_tool[:3, 3]))
-    if tip_m < _NO_TOOL_M:
+    # A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
+    if tip_m < 2e-3:
         yield Finding(
             "active_tool",
             f"The tip is {figure(1e3 * tip_m)} mm from the origin of the "

@@ -20,10 +20,6 @@ from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
 
 # Plausible limits: an arm's reach [m] and a joint's range [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi
-# Smallest plausible distance from the base's origin [m], and largest difference of copied poses.
-_NEAR_M, _COPIED = 0.02, 1e-9
-# Largest difference between a row's reported pose and the model's for the same arm and frame.
-_SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 NO_TOOL = (
     "Find the tip with visioncal tcp first, and name its file with --tool; or say --tool none, "
     "where the controller's tool was active and the poses are of the tip itself."
@@ -171,7 +167,7 @@ def check_lengths(rows: TouchRows) -> None:
             next_step="Say --robot-unit mm, or write metres.",
         )
     farthest = float(np.max(distances, initial=0.0, where=np.isfinite(distances)))
-    if 0.0 < farthest < _NEAR_M:
+    if 0.0 < farthest < 0.02:
         raise DataError(
             f"{rows.source}: all positions are within {figure(1e3 * farthest)} mm of the base's "
             "origin, where no arm works: these look like metres read as millimetres.",
@@ -188,7 +184,7 @@ def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
     """
     numbers = np.nan_to_num(poses.reshape(len(poses), -1))
     differences = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
-    first, second = np.nonzero(np.triu(differences < _COPIED, 1))
+    first, second = np.nonzero(np.triu(differences < 1e-9, 1))
     if len(first):
         names = [places[first[0]], places[second[0]]]
         raise DataError(
@@ -241,7 +237,7 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
     both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
     delta = invert(poses[both]) @ rows.base_from_flange[both]
     off_m, off_rad = np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta)
-    odd = np.flatnonzero((off_m > _SAME_ARM_M) | (off_rad > _SAME_ARM_RAD))
+    odd = np.flatnonzero((off_m > 0.05) | (off_rad > 0.1))
     if len(odd):
         at = odd[0]
         raise DataError(

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 # Tilt up to which a sensor counts as parallel to its lens [deg]: makers of industrial cameras state
 # 0.2 to 0.6 about each axis (Basler, pilot user's manual, 1.5.2.2), which is 0.8 about both.
 _PARALLEL_DEG = 0.8
-# Sigmas by which a tilt differs from none.
-_SIGNIFICANT = 3.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ def _of_lens(lens: CameraResult, camera: str) -> Iterator[Condition]:
     tilt = sensor_tilt(lens)
     if tilt is None or math.degrees(tilt.rad) < _PARALLEL_DEG:
         return
-    if tilt.rad < _SIGNIFICANT * tilt.sigma_rad:
+    if tilt.rad < 3.0 * tilt.sigma_rad:
         return
     of, deg = f"{camera}: " if camera else "", math.degrees(tilt.rad)
     sigma = f" (sigma {figure(math.degrees(tilt.sigma_rad))})" if tilt.sigma_rad else ""

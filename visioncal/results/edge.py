@@ -18,8 +18,6 @@ _SAME = 5e-6
 # Tolerance of correlations for symmetry and definiteness: rounding of J C J^T is amplified where a
 # rotation is known much better than the translation.
 _ROUNDING = 1e-3
-# A tenth of a millidegree, and less of a quaternion or in radians: under any sigma of a camera.
-_DEGREE_DECIMALS, _RADIAN_DECIMALS = 4, 6
 
 
 class PoseSigmas:
@@ -80,7 +78,8 @@ class Edge(PoseSigmas):
         stated = []
         for name, rotation, unit in forms:
             numbers = ROTATION_FORMS[rotation].write(self.matrix[None, :3, :3])[0]
-            decimals = _DEGREE_DECIMALS if unit == "deg" else _RADIAN_DECIMALS
+            # A tenth of a millidegree, and less of quaternions: under any sigma of a camera.
+            decimals = 4 if unit == "deg" else 6
             listed = ", ".join(fixed(number, decimals) for number in numbers)
             stated.append(f"{name} ({listed}) {unit}".strip())
         return ", ".join(stated)

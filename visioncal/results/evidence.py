@@ -7,10 +7,6 @@ import numpy as np
 
 from visioncal.core.types import Corners, FloatArray
 
-_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# Drawn length of an rms residual, as a share of the image's width.
-_SHARE = 0.02
-
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
@@ -45,5 +41,8 @@ def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:
     squared_px2 = float(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1)))
     if not squared_px2 > 0.0:
         return 1
-    wanted = _SHARE * image_width / np.sqrt(squared_px2)
-    return max((step for step in _STEPS if step <= wanted), default=1)
+    # An rms residual is drawn 2 % of the image's width long.
+    wanted = 0.02 * image_width / np.sqrt(squared_px2)
+    return max(
+        (step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if step <= wanted), default=1
+    )

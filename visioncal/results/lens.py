@@ -24,13 +24,6 @@ from visioncal.vision.camera import (
     with_intrinsics,
 )
 
-# Numbers of pixels of a grid along the image's width and height.
-_GRID = (40, 32)
-# Share of the prior variance by which the field must be determined to count as observed.
-_SEEN = 0.5
-# Relative singular value below which a combination of coefficients is undetermined.
-_DETERMINED = 1e-8
-
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)
 
@@ -172,7 +165,8 @@ class CameraResult:
             return 0.0, 0.0
         mean_squares = np.average(displacements**2, axis=0, weights=weights)
         # Where the field is poorly determined everywhere, its best determined part counts.
-        observed = weights > min(_SEEN, 0.5 * weights.max())
+        # Observed: determined to half of the prior variance.
+        observed = weights > min(0.5, 0.5 * weights.max())
         return float(np.sqrt(mean_squares.mean())), float(np.abs(displacements[observed]).max())
 
     def rays_by_lens(
@@ -209,7 +203,7 @@ class CameraResult:
 
 def image_grid(camera: Camera) -> FloatArray:
     """(n, 2) pixels of a grid over the image."""
-    sides = zip(camera.resolution, _GRID, strict=True)
+    sides = zip(camera.resolution, (40, 32), strict=True)
     axes = (np.linspace(0.0, side - 1.0, count) for side, count in sides)
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
@@ -259,7 +253,7 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
     decentred = projected.jacobian_intrinsics[:, :, _DECENTRING].reshape(-1, 2)
-    fitted = np.linalg.lstsq(columns / scale, decentred, rcond=_DETERMINED)[0] / scale[:, None]
+    fitted = np.linalg.lstsq(columns / scale, decentred, rcond=1e-8)[0] / scale[:, None]
     tilt = fitted[:2] @ decentring
     rad = float(np.linalg.norm(tilt))
     # An axis beside the image is no lens's: decentring with hardly any radial distortion.

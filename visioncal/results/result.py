@@ -40,9 +40,6 @@ from visioncal.robot.thermal import ThermalModel
 from visioncal.session.frames import CELL
 from visioncal.session.selecting import PARTS, Choice, Part
 
-# Number of transforms in a card.
-_SHOWN = 8
-
 
 @dataclass(frozen=True, eq=False)
 class Calibration(CalibrationSections):
@@ -245,7 +242,7 @@ class Calibration(CalibrationSections):
             **{
                 name: f"{edge.place_words()}, {edge.rotation_words(self.controller)}, "
                 f"{edge.sigma_words}"
-                for name, edge in [*self.placed.items()][:_SHOWN]
+                for name, edge in [*self.placed.items()][:8]
             },
         }
 

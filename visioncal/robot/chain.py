@@ -16,9 +16,6 @@ FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
 IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
 # Tolerance of rotation matrices, which may be printed to three digits.
 _ROTATION_TOLERANCE = 1e-3
-# Newton steps that invert a joint's function, and the error before the last: its square is
-# rounding.
-_INVERSIONS, _INVERTED = 20, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +82,10 @@ class Chain:
         q = (positions - offset) / ratio
         if not self.is_periodic:
             return np.asarray(q)
-        for _ in range(_INVERSIONS):
+        for _ in range(20):
             error = offset + ratio * q + self._periodic(q, 0) - positions
             q = q - error / (ratio + self._periodic(q, 1))
-            if np.abs(error).max(initial=0.0) < _INVERTED:
+            if np.abs(error).max(initial=0.0) < 1e-8:
                 break
         return np.asarray(q)
 

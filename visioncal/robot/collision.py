@@ -23,24 +23,12 @@ if TYPE_CHECKING:
 
 Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
 
-# Default radius of links over the length of all links: 0.065 m for a UR5e, 0.09 m for a UR10e; its
-# least is that of the motors [m].
-_THICKNESS, _THINNEST_M = 0.05, 0.045
 # Box around a camera with its lens and plug, and how far its centre is behind the lens [m].
 _CAMERA_M, _CAMERA_BEHIND_M = np.array([0.1, 0.1, 0.1]), 0.03
-# Shorter links are inside their neighbours, and get no body [m].
-_SHORTEST_M = 0.01
 # Additional clearance of stops, so that paths between them can depart and arrive [m].
 SLACK_M = 0.004
-# Number of random postures that show which parts are always near one another.
-_SAMPLES = 300
-# Parts of an arm that are near one another in a larger share of postures are so by design: joint
-# limits keep them apart, which the coarse capsules do not show.
-_OFTEN = 0.2
 # Range of joints without limits, to either side [rad], [m].
 _TURN_RAD, _TRAVEL_M = np.pi, 5.0
-# Greatest factor of a joint's eccentricity on its speed.
-_FASTER = 1.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +112,8 @@ def arm_bodies(robot: Robot) -> tuple[Body, ...]:
     )
     complete = {body.link for body in described} - incomplete
     lengths = np.linalg.norm(robot.chain.placements[1:, :3, 3], axis=1)
-    usual = max(_THINNEST_M, _THICKNESS * float(lengths.sum()))
+    # A link is 5 % of the arm's length thick, and at least as its motor [m].
+    usual = max(0.045, 0.05 * float(lengths.sum()))
     bodies = list(described)
     for link, (radius, offset) in enumerate(_thickness(robot, usual)):
         if link not in complete:
@@ -138,7 +127,8 @@ def _link(robot: Robot, link: int, radius_m: float, offset_m: float) -> list[Bod
     offset = offset_m * robot.chain.axes[link - 1] if link else np.zeros(3)
     knots = [np.zeros(3), offset, end + offset, end] if offset_m else [np.zeros(3), end]
     name = body_name(robot, link)
-    if np.abs(np.diff(knots, axis=0)).sum() < _SHORTEST_M:
+    # Shorter links are inside their neighbours.
+    if np.abs(np.diff(knots, axis=0)).sum() < 0.01:
         return []
     return [
         capsule(name, link, start, stop, radius_m, of_arm=True)
@@ -264,7 +254,8 @@ class Collisions:
         """
         begin, stop = self._robot.chain.effective(np.array([start, end], dtype=float))
         needed = self._pairs.needed_m
-        speeds = _FASTER * self._pairs.levers @ np.abs(stop - begin)
+        # A joint's eccentricity makes it faster than its encoder by so much at most.
+        speeds = 1.02 * self._pairs.levers @ np.abs(stop - begin)
         fraction = 0.0
         while True:
             margin_m = self._distances(begin + fraction * (stop - begin)) - needed
@@ -303,7 +294,7 @@ class Collisions:
         chain = self._robot.chain
         range_ = np.where(chain.prismatic, _TRAVEL_M, _TURN_RAD)
         lower, upper = np.maximum(chain.lower, -range_), np.minimum(chain.upper, range_)
-        postures = chain.effective(rng.uniform(lower, upper, (_SAMPLES, len(chain))))
+        postures = chain.effective(rng.uniform(lower, upper, (300, len(chain))))
         margin_m = np.array([self._distances(posture) for posture in postures]) - pairs.needed_m
         near_share = (margin_m < SLACK_M).mean(axis=0)
         of_arm = np.array([*(body.of_arm for body in bodies), False])[pairs.bodies].all(axis=1)
@@ -313,7 +304,8 @@ class Collisions:
         )
         # A cell body that a later link touches in every posture is an error, and must be reported.
         always_near = (near_share == 1.0) & (of_arm | moving | on_first_link)
-        excluded = always_near | (of_arm & (near_share > _OFTEN))
+        # The joints' limits keep them apart, which the coarse capsules do not show.
+        excluded = always_near | (of_arm & (near_share > 0.2))
         left_out = tuple(
             LeftOut(names[a], names[b], f"too near in {100 * share:.0f} % of all postures")
             for (a, b), share in zip(

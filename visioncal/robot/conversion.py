@@ -29,7 +29,6 @@ from visioncal.robot.tables import (
 # Consecutive axes within this of parallel get Hayati's beta [rad]. Their common normal is at their
 # offset over the angle, which magnifies errors of d against those of a.
 PARALLEL_RAD = float(np.deg2rad(5.0))
-_UR_JOINTS = 6
 # Axes within this angle are parallel [rad], and within this distance intersect [m]: a common normal
 # at 1e8 times their offset has lost as many digits as the neglected angle.
 EXACTLY = 1e-8
@@ -189,7 +188,7 @@ def has_ur_axes(robot: Robot) -> bool:
 
     Other arms of six joints cannot run a UR's program.
     """
-    if robot.joint_count != _UR_JOINTS or robot.chain.prismatic.any():
+    if robot.joint_count != 6 or robot.chain.prismatic.any():
         return False
     return np.array_equal(parallel_axes(robot), [False, True, True, False, False])
 

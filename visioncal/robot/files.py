@@ -12,8 +12,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import find_described, read_text, read_toml
 from visioncal.robot.model import Robot
 
-# Far above the size of any arm's URDF.
-_MAX_URDF_BYTES = 10_000_000
 # Suffixes of robot files; a .json is a chain, as a calibration writes it.
 ROBOT_SUFFIXES = (".toml", ".urdf", ".json")
 
@@ -65,7 +63,7 @@ def read_robot_document(
         "schema": 1,
         "name": path.stem,
         "tip": tip or "",
-        "urdf": read_text(path, _MAX_URDF_BYTES),
+        "urdf": read_text(path, 10_000_000),
     }
 
 

@@ -35,8 +35,6 @@ PARAMETER_NAMES = (
 )
 # Indices of xx, xy, yy, xz, yz, zz in a symmetric matrix.
 _ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
-# Least eigenvalue of a pseudo-inertia over its greatest, for bodies without extent [-].
-_THIN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +182,8 @@ class LogCholesky:
                 culprits=[f"joint {index + 1}" for index in inconsistent],
                 next_step="Check mass_kg, com_m and inertia_kg_m2 (about the centre of mass).",
             )
-        raised = np.maximum(values, _THIN * values[:, -1:])
+        # Bodies may have no extent.
+        raised = np.maximum(values, 1e-6 * values[:, -1:])
         roots = np.linalg.cholesky((vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2))
         units = pseudo_inertias(np.eye(10))
         moved = roots[:, None] @ units @ np.swapaxes(roots, 1, 2)[:, None]

@@ -22,27 +22,18 @@ if TYPE_CHECKING:
 
 # Greatest error of a reached pose [m] and [rad]; rounding is a thousandth of it.
 _REACHED = 1e-9
-# Sum of squared errors [m^2 + rad^2] at which iterations end; another step would be rounding.
-_DONE = 1e-20
 # With fewer than six joints the position is reached, and the rotation may be off by this [rad]:
 # errors of links are far smaller.
 _TURN_LEFT_RAD = float(np.deg2rad(1.0))
 # Weight of a radian against a metre for these arms, near the solution: the rotation error moves the
 # position by its square.
 _ROTATION_WEIGHT = 1e-4
-# Random starts where the given one does not converge to the pose; an arm of six joints has up to
-# sixteen solutions, and half of the starts find one.
-_STARTS = 40
-_STEPS = 80
-# Relative gain in the sum of squares at which a search ends, and the final search from the nearest
-# posture.
-_SEARCH, _POLISH = 1e-3, 1e-9
+# Relative gain in the sum of squares at which the final search from the nearest posture ends.
+_POLISH = 1e-9
 _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 # Half range of random starts for joints without limits [rad or m].
 _SPREAD = float(np.pi)
 _TURN = 2 * np.pi
-# Regularises singular systems; far below the square of any relevant singular value.
-_FLOOR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +124,9 @@ class Inverse:
         if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
         # The same random postures every time.
-        starts = self.starts(_STARTS, np.random.default_rng(0), wanted)
+        # Random starts where the given one does not converge to the pose; an arm of six joints has
+        # up to sixteen solutions, and half of the starts find one.
+        starts = self.starts(40, np.random.default_rng(0), wanted)
         candidates = [first, *(self._descend(goal, start, wanted) for start in starts)]
         reached = [posture for posture in candidates if posture.reached]
         if reached:
@@ -174,7 +167,7 @@ class Inverse:
         start: FloatArray,
         wanted: FloatArray,
         *,
-        settle: float = _SEARCH,
+        settle: float = 1e-3,
     ) -> Posture:
         """Searches from a start; the result is turned by whole turns towards `wanted`."""
         bounds, underactuated = self._bounds, len(start) < 6
@@ -195,12 +188,14 @@ class Inverse:
         damping = 1.0
         error, rotation = self._error(goal, positions, weight)
         size = float(error @ error)
-        for _ in range(_STEPS):
-            if size < _DONE or damping > _MOST_DAMPING:
+        for _ in range(80):
+            # Another step would be rounding.
+            if size < 1e-20 or damping > _MOST_DAMPING:
                 break
             jacobian = self._jacobian(rotation, weight)
             while damping <= _MOST_DAMPING:
-                moved = _moved(positions, error, jacobian, damping * size + _FLOOR, self._bounds)
+                # Regularises singular systems.
+                moved = _moved(positions, error, jacobian, damping * size + 1e-13, self._bounds)
                 next_error, rotation = self._error(goal, moved, weight)
                 next_size = float(next_error @ next_error)
                 if next_size < size:

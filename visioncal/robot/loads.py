@@ -22,12 +22,6 @@ if TYPE_CHECKING:
 MASS_KEYS = ("mass_kg", "com_m")
 # Keys of the limits in a joint's table.
 RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
-STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
-# Fixed-point iterations of the deflection: a deflection changes torques by about as large a share,
-# so that the remaining error is below its cube.
-_ITERATIONS = 3
-# Number of random postures, and relative singular value below which functions are dependent.
-_POSTURES, _RANK = 200, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +141,7 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
         DataError: It is no vector of three numbers, or not that of the Earth.
     """
     if "gravity_m_s2" not in document:
-        return np.array(STANDARD_GRAVITY)
+        return np.array([0.0, 0.0, -9.80665])
     row = DocumentTable(document, label)
     gravity = np.array(row.numbers("gravity_m_s2", 3))
     if not 9.5 < float(np.linalg.norm(gravity)) < 10.1:
@@ -202,7 +196,9 @@ def deflected_joints(
     bent = np.asarray(q, dtype=float)
     if not compliance.any() and moments is None:
         return bent
-    for _ in range(_ITERATIONS):
+    # Fixed-point iterations of the deflection: a deflection changes torques by about as large a
+    # share, so that the remaining error is below its cube.
+    for _ in range(3):
         bent = q + joint_deflections(robot, bent, compliance, loads, moments)
     return bent
 
@@ -236,12 +232,12 @@ class WeightFunctions:
     @classmethod
     def of(cls, robot: "Robot") -> "WeightFunctions":
         """Finds the functions of an arm, over random postures."""
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, robot.joint_count))
         jacobian = np.moveaxis(robot.weight_jacobian(q), 1, 0)
         parts = []
         for derivatives in jacobian:
             _, sizes, vectors = np.linalg.svd(derivatives, full_matrices=False)
-            kept = sizes > _RANK * max(float(sizes.max(initial=0.0)), 1.0)
+            kept = sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1.0)
             parts.append(np.sqrt(len(q)) * vectors[kept].T / sizes[kept])
         return cls(tuple(parts))
 

@@ -42,9 +42,6 @@ ARM_KEYS = ("gravity_m_s2", "repeatability_mm", "repeatability_deg")
 # Standard deviation of an industrial arm's flange from stop to stop [mm], [deg].
 REPEATABILITY = (0.1, 0.01)
 
-# Tolerance of parallel axes, for calibrated arms.
-_PARALLEL = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Robot:
@@ -212,7 +209,8 @@ class Robot:
         """Whether the flange can rotate about more than one direction, unlike a four-axis arm's."""
         axes = self.joint_jacobian(np.zeros((1, self.joint_count)))[0, :3]
         sizes = np.linalg.svd(axes, compute_uv=False)
-        return int(np.sum(sizes > _PARALLEL * sizes[0])) > 1
+        # Axes of calibrated arms are parallel within this.
+        return int(np.sum(sizes > 0.05 * sizes[0])) > 1
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian of the flange over the joint function coefficients.

@@ -28,10 +28,6 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 # Lever by which rotations are weighted against positions [m].
 _LEVER_M = 0.3
-# Gauss-Newton steps; corrections are some thousandths, so that two suffice for a micrometre.
-_STEPS = 4
-# Relative singular value below which twists of links are undetermined, and stay.
-_DETERMINED = 1e-6
 
 
 def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
@@ -223,13 +219,15 @@ def fit_links(
     """
     count, units = robot.joint_count, np.repeat([1.0, _LEVER_M], 3)
     row_weights = np.sqrt(weights)[:, None] * np.repeat([_LEVER_M, 1.0], 3)
-    for _ in range(_STEPS):
+    # Corrections are some thousandths: two suffice for a micrometre.
+    for _ in range(4):
         residual = log(invert(robot.base_from_flange(q)) @ base_from_flange)
         links = robot.placement_jacobian(q)[:, :, 6:] * np.tile(units, count)
         offsets = robot.function_jacobian(q).reshape(len(q), 6, count, -1)[..., 0]
         columns = row_weights[:, :, None] * np.concatenate([offsets, links], axis=2)
+        # Undetermined twists stay.
         step = np.linalg.lstsq(
-            columns.reshape(-1, 7 * count), (row_weights * residual).ravel(), rcond=_DETERMINED
+            columns.reshape(-1, 7 * count), (row_weights * residual).ravel(), rcond=1e-6
         )[0]
         functions, placements = np.zeros((count, 4)), np.zeros((count + 1, 6))
         functions[:, 0] = step[:count]

@@ -18,8 +18,6 @@ from visioncal.vision.boards.imaging import encode_png
 from visioncal.vision.targets import target_document
 
 Poses: TypeAlias = RigidTransform | FloatArray | Sequence[RigidTransform]
-# Tolerance of a rotation matrix, for entries rounded to three decimals.
-_ROUGH = 5e-3
 _KEPT_PLACE = (
     "A view in which nothing was found keeps its place: give (None, None) for its corners."
 )
@@ -104,7 +102,8 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
             next_step=_KEPT_PLACE if what == "corners" else "",
         )
     for at, matrix in enumerate(matrices):
-        if fault := rigid_fault(matrix, _ROUGH):
+        # Entries may be rounded to three decimals.
+        if fault := rigid_fault(matrix, 5e-3):
             name = f"base_from_flange[{at}]"
             raise DataError(f"{name} is no rigid transform: {fault}.", culprits=[name])
     stacked = np.array(matrices).reshape(-1, 4, 4)

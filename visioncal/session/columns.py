@@ -63,8 +63,6 @@ _HEAVIEST_KG = 2500.0
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 # Limit in other columns, so that squares and products do not overflow.
 _LARGEST = 1e60
-# Smallest similarity of a misspelt name; that of `status` and `stamp_s` is 0.62.
-_MISSPELT = 0.76
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -169,5 +167,6 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
         # A known word with a suffix, as target_id, is not misspelt.
         is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
         in_radians = name.replace("_deg", "_rad")
-        if hint := "" if is_other else did_you_mean(in_radians, known, _MISSPELT):
+        # That of `status` and `stamp_s` is 0.62.
+        if hint := "" if is_other else did_you_mean(in_radians, known, 0.76):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

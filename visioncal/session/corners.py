@@ -25,8 +25,6 @@ _MOST_CORNERS = 1_000_000
 # Standard deviations of corners [px]: the finest templates reach a hundredth, and few images are
 # larger than the upper limit. Squares of others overflow, or leave nothing of the other corners.
 _LEAST_PX, _MOST_PX = 1e-4, 1e4
-# Smallest number of corners that determine a pose.
-_FEWEST = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +215,8 @@ def _without_deleted(table: CornerTable, rows: Mapping[int, View]) -> CornerTabl
     # number with fewer corners than determine a pose is mistyped.
     seen, counts = np.unique(table.views, return_counts=True)
     lost = {value for value in seen.tolist() if value not in rows}
-    few = {*seen[counts < _FEWEST].tolist()}
+    # A pose takes four.
+    few = {*seen[counts < 4].tolist()}
     if not lost or lost & few or any(row not in seen and not rows[row].image for row in rows):
         return table
     return table.of_views(list(rows))

@@ -186,9 +186,6 @@ KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 # Names that can be part of a frame's name: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
-# Largest plausible offsets on a flange and in a cell [m]; offsets of more than 3 mm and 100 mm that
-# are written in millimetres exceed them.
-_MOST_ON_FLANGE_M, _MOST_M = 3.0, 100.0
 _EDGES = (
     *("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target"),
     *("base_from_instrument", "flange_from_probe"),
@@ -334,7 +331,8 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
 def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
     for edge, prior in declaration.prior.items():
         on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
-        most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
+        # Lengths written in millimetres exceed these.
+        most, where = (3.0, "on a flange") if on_flange else (100.0, "in a cell")
         for axis in ("x_m", "y_m", "z_m"):
             place = getattr(prior, axis)
             if place is not None and abs(place) > most:

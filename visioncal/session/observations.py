@@ -16,10 +16,6 @@ from visioncal.session.table import View
 
 # Largest difference between reports of one robot's pose at one stop [mm, deg, rad].
 APART_MM, APART_DEG, APART_RAD = 1.0, 0.1, 2e-3
-# Largest difference between reports of a robot that stands still, by noise of its readings.
-_STILL_M, _STILL_RAD = 1e-4, 1e-4
-# Views of one pose that are farther apart in time are of different stops [s].
-LONG_S = 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +78,7 @@ def _still_since(views: Iterable[View]) -> dict[int, int]:
     for view in views:
         both = view.stamp_s is not None and last_s is not None
         # So far apart in time, the robot may have moved in between.
-        is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > LONG_S
+        is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > 120.0
         if first is None or _moved(first, view) or is_late:
             first = view
         last_s, run_starts[view.number] = view.stamp_s, first.number
@@ -100,11 +96,12 @@ def _moved(first: View, second: View) -> bool:
         units = [[value / math.hypot(*pose[3:]) for value in pose[3:]] for pose in (before, after)]
         # Quaternions q and -q are the same rotation; its angle is twice that between quaternions.
         chord = min(math.dist(units[0], [sign * unit for unit in units[1]]) for sign in (1.0, -1.0))
-        return math.dist(before[:3], after[:3]) > _STILL_M or 2.0 * chord > _STILL_RAD
+        # Readings of a robot that stands still are noisy.
+        return math.dist(before[:3], after[:3]) > 1e-4 or 2.0 * chord > 1e-4
     joints = first.joints_rad, second.joints_rad
     if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
         return True
-    return bool(np.abs(joints[0] - joints[1]).max() > _STILL_RAD)
+    return bool(np.abs(joints[0] - joints[1]).max() > 1e-4)
 
 
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:

@@ -20,10 +20,6 @@ from visioncal.session import columns as cols
 
 FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
-# Samples are missing where steps exceed this multiple of the median, and this time [s].
-_GAP_RATIO, _GAP_S = 2.5, 0.02
-# Largest size of all streams together: half an hour of twenty columns at 500 Hz.
-_MOST_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +77,7 @@ class Stream:
         steps = np.diff(self.stamps_s)
         if not len(steps):
             return np.zeros(0, dtype=np.int64)
-        return np.flatnonzero(steps > max(_GAP_RATIO * float(np.median(steps)), _GAP_S))
+        return np.flatnonzero(steps > max(2.5 * float(np.median(steps)), 0.02))
 
     def fact(self) -> dict[str, object]:
         """Content for the session's digest, independent of the numbers' formatting."""
@@ -94,7 +90,8 @@ class Stream:
 def read_streams(folder: Path) -> dict[str, Stream]:
     """Reads the streams of a session's folder, by name; raises DataError."""
     paths = sorted((folder / FOLDER).glob("*.csv"))
-    streams, bytes_left = {}, _MOST_BYTES
+    # Of all streams together: half an hour of twenty columns at 500 Hz.
+    streams, bytes_left = {}, 300_000_000
     for path in paths:
         text = read_text_inside(folder, f"{FOLDER}/{path.name}", bytes_left)
         bytes_left -= len(text)

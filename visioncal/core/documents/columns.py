@@ -17,9 +17,6 @@ from visioncal.core.verdict import READ_AGAIN
 
 # Tolerance of a quaternion's norm, for four digits.
 _NORM_TOLERANCE = 1e-3
-# From this norm on they are taken for another form of rotation.
-_FAR_FROM_UNIT = 1.5
-_SHOWN_PROBLEMS = 10
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 
 _T = TypeVar("_T")
@@ -103,7 +100,8 @@ class NumberChecks:
             return
         # hypot does not overflow.
         norms = np.hypot.reduce([self.values[name] for name in names])
-        is_far = norms.max(initial=0.0, where=np.isfinite(norms)) > _FAR_FROM_UNIT
+        # Beyond, they are taken for another form of rotation.
+        is_far = norms.max(initial=0.0, where=np.isfinite(norms)) > 1.5
         other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
         for row in np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist():
             self.report(
@@ -215,11 +213,11 @@ def as_whole(cell: str) -> int:
 def problems_error(problems: Sequence[TableProblem], next_step: str = "") -> DataError:
     """Error that lists the problems of a table, of many the first of each column."""
     steps = {problem.step for problem in problems}
-    each = len(problems) <= _SHOWN_PROBLEMS and steps == {""}
+    each = len(problems) <= 10 and steps == {""}
     groups: dict[str, list[TableProblem]] = defaultdict(list)
     for problem in problems:
         groups[problem.place if each else problem.place.partition(", column ")[2]].append(problem)
-    shown = list(groups.values())[:_SHOWN_PROBLEMS]
+    shown = list(groups.values())[:10]
     where = problems[0].place.partition(", column ")[0]
     step = "" if len(problems) > 1 else f"Correct it, or delete {where}."
     lines = [

@@ -67,12 +67,6 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
     return arrays
 
 
-# Longer integers are read as floats: Python parses them in quadratic time.
-_MAX_DIGITS = 18
-# Squares and products of larger numbers may overflow.
-_LARGEST = 1e60
-
-
 def read_json(path: Path) -> object:
     """Reads a JSON file; NaN and Infinity, as Python writes them, are accepted.
 
@@ -88,10 +82,11 @@ def parse_json(text: str, where: str, largest: float | None = None) -> object:
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
         raise too_many(where)
     try:
+        # Longer integers are read as floats: Python parses them in quadratic time.
         value: object = json.loads(
             text,
             object_pairs_hook=lambda pairs: _unique(pairs, where),
-            parse_int=lambda digits: int(digits) if len(digits) <= _MAX_DIGITS else float(digits),
+            parse_int=lambda digits: int(digits) if len(digits) <= 18 else float(digits),
         )
     except json.JSONDecodeError as error:
         raise DataError(
@@ -129,7 +124,8 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
             next_step="Name its file, as calibration.json, or its folder; nothing need be changed "
             "in this one.",
         )
-    document = parse_json(text, label, _LARGEST)
+    # Squares and products of larger numbers may overflow.
+    document = parse_json(text, label, 1e60)
     if not isinstance(document, dict):
         raise DataError(f"{label} is {shown(document)}; a table is needed.", culprits=[label])
     return document

@@ -298,8 +298,6 @@ def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> It
     yield from rows_of(waiting, workers, scheduler)
 
 
-# Timeout of the scheduler [s].
-_TIMEOUT_S = 10
 # Errors of rows: the process died, and the scheduler went away.
 DIED, LOST = "WorkerDied", "SchedulerLost"
 
@@ -412,7 +410,7 @@ def _cluster(scheduler: str | None) -> Iterator[Executor]:
     log_level = log.level
     log.setLevel(logging.CRITICAL)
     try:
-        client = distributed.Client(scheduler, timeout=_TIMEOUT_S, set_as_default=False)
+        client = distributed.Client(scheduler, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(
             f"no scheduler answers at {scheduler}: {error}", culprits=["--scheduler"]

@@ -35,9 +35,6 @@ from visioncal.robot.writing import (
 
 # Number of postures for fitting constant links.
 _FITTED = 800
-# Weight of the workspace relative to the measured ranges: links fitted to a small range alone would
-# have large errors beyond it.
-_WORKSPACE_WEIGHT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +147,8 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     if form.links_alone and (unexportable_functions(arm.robot) or _sag_mm(source)):
         robot = without_functions(arm.robot)
         # They are fitted over its measured ranges, where these are known, and the workspace.
-        samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
+        # Postures all over the workspace, as a fit to the stops alone may have large errors beyond.
+        samples = [(postures(robot, 2 * _FITTED), 0.1)]
         if arm.measured:
             lower, upper = np.array([(joint.lower, joint.upper) for joint in arm.measured]).T
             rng = np.random.default_rng(0)
@@ -183,8 +181,6 @@ def _sag_mm(calibration: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
 
 
-# Tolerance of the flange's pose, below which no note is needed [mm, deg].
-_TOLERANCE = 1e-4
 # Placeholder for an unknown hash, which no controller has.
 _NO_HASH = "calib_visioncal"
 
@@ -210,7 +206,7 @@ def _warn_ur(content: ArmContent) -> Iterator[str]:
     difference = log(ur_flange(content.written, content.nominal_table))
     turned = np.rad2deg(np.linalg.norm(difference[:3]))
     moved = 1e3 * np.linalg.norm(difference[3:])
-    if max(turned, moved) > _TOLERANCE:
+    if max(turned, moved) > 1e-4:
         yield (
             f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
             "for that: a comment in the file has its pose. What sits on the flange goes behind it."

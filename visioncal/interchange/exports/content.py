@@ -15,10 +15,6 @@ from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
 
-# Smallest rms of a lens's field that a note names [px].
-_NOTICED_PX = 0.01
-
-
 Source: TypeAlias = Calibration | FrameFile
 
 # Name of the camera's or the instrument's transform by its mount.
@@ -243,7 +239,7 @@ class Content(Placement):
     def field_error_words(self) -> str:
         """What matrix and coefficients leave of a lens's field, in words; empty without one."""
         rms_px, most_px = (0.0, 0.0) if self.lens is None else self.lens.beyond_model_px()
-        if rms_px < _NOTICED_PX:
+        if rms_px < 0.01:
             return ""
         return (
             "the lens departs from its model, and matrix and coefficients are those that come "

@@ -17,7 +17,6 @@ from visioncal.interchange.exports.content import Content, ExportFormat, Holds, 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
 _ROTATION_DECIMALS = {"rotation-vector": 10, "quaternion-wxyz": 10}
-_DEGREE_DECIMALS = 8
 # By form of poses: what starts a comment, empty where nothing does, and the pose's numbers.
 _LANGUAGES: Mapping[str, tuple[str, str]] = {
     # Universal Robots, script manual.
@@ -80,7 +79,7 @@ def _write(language: str, statement: str, content: Content) -> str:
     """Writes a statement: {pose}, {child}, {load}, {active} and {number} are filled in."""
     form, (mark, shape) = POSE_FORMS[language], _LANGUAGES[language]
     pose = write_pose(content.matrix, form)
-    decimals = _ROTATION_DECIMALS.get(form.rotation, _DEGREE_DECIMALS)
+    decimals = _ROTATION_DECIMALS.get(form.rotation, 8)
     numbers = [fixed(value, _DECIMALS[form.unit]) for value in pose[:3]]
     numbers += [fixed(value, decimals) for value in pose[3:]]
     # A FlexPendant writes this mass into a new tool whose load is still to be given.

@@ -49,10 +49,6 @@ _ENDINGS = (".bag", ".mcap", ".db3")
 # Frames of a robot that are preferred where TF has several, by what they are.
 _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "link_base", "link_0", "world")
 _TIPS = ("tool0", "flange", "panda_link8", "fr3_link8", "link_eef", "ee_link", "tcp")
-# Most frames of a motion without stops.
-_MOST_FRAMES = 600
-# Frames are of another stop where the flange has moved by this [rad, m].
-_MOVED = 1e-3
 # Conversions of raw images to what an image file holds, by encoding.
 _COLOURS: Mapping[str, int | None] = {
     **dict.fromkeys(("mono8", "8UC1", "mono16", "16UC1", "bgr8", "8UC3"), None),
@@ -539,8 +535,9 @@ def _chosen(stamps_s: FloatArray, flange: Trajectory) -> tuple[IntArray, str]:
     order = np.argsort(stamps_s, kind="stable")
     still = order[is_standing_still(flange, stamps_s[order])]
     poses = flange.at(stamps_s[still])
-    moved = np.abs(log(invert(poses[:-1]) @ poses[1:])).max(axis=1) > _MOVED
-    return frames_to_take(order, still, moved, _MOST_FRAMES)
+    # Another stop: a milliradian or a millimetre further.
+    moved = np.abs(log(invert(poses[:-1]) @ poses[1:])).max(axis=1) > 1e-3
+    return frames_to_take(order, still, moved, 600)
 
 
 def _mount(contents: _Contents, frames: Sequence[str], tip: str) -> Mount | None:

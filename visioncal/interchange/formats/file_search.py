@@ -9,9 +9,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside, natural
 from visioncal.session.images import IMAGE_ENDINGS
 
-# Length that suffices to recognise a text file.
-_HEAD_BYTES = 16_384
-
 
 def number_in(name: str) -> int | None:
     """Last number in a file's name without its ending; None where there is none."""
@@ -52,7 +49,8 @@ def head(path: Path) -> str:
     """The beginning of a text file; empty where it is not text."""
     try:
         with path.open("rb") as file:
-            data = file.read(_HEAD_BYTES)
+            # Length that suffices to recognise a text file.
+            data = file.read(16_384)
     except (OSError, ValueError):
         return ""
     return "" if b"\0" in data else data.decode("utf-8", "ignore")

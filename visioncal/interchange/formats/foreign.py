@@ -14,9 +14,6 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.session import ImageStore
 
-# Fewest stops that make a recording one of stops.
-_FEWEST_STOPS = 5
-
 
 @dataclass(frozen=True)
 class PoseImportOptions:
@@ -146,7 +143,7 @@ def frames_to_take(
         most: Most frames of a motion without stops.
     """
     runs = np.split(still, np.flatnonzero(moved) + 1)
-    if len(runs) >= _FEWEST_STOPS:
+    if len(runs) >= 5:
         # The middle of each rest, where clocks that differ a little have no effect.
         chosen, how = np.array([run[len(run) // 2] for run in runs]), "one a stop of the robot"
     else:

@@ -91,8 +91,6 @@ _DISTORTION_KEYS = (
 )
 _FOUR = ("fx", "fy", "cx", "cy")
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
-# Largest skew relative to the focal length; more is another camera model.
-_MOST_SKEW = 1e-6
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
 
@@ -161,7 +159,8 @@ def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
     k = numbers.reshape(3, 3) if numbers.size == 9 else np.zeros((3, 3))
     last = [0.0, 0.0, 1.0]
     k = k.T if not np.array_equal(k[2], last) and np.array_equal(k[:, 2], last) else k
-    if not np.array_equal(k[2], last) or k[1, 0] or abs(k[0, 1]) > _MOST_SKEW * abs(k[0, 0]):
+    # Largest skew relative to the focal length; more is another camera model.
+    if not np.array_equal(k[2], last) or k[1, 0] or abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
         raise DataError(
             f"{where} is {np.array2string(numbers.reshape(-1)[:9], precision=6)}; the nine numbers "
             "fx, 0, cx, 0, fy, cy, 0, 0, 1 are needed.",

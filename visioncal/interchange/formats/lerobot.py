@@ -37,8 +37,6 @@ _GRIPPERS, _WRISTS = ("gripper", "finger", "hand"), ("wrist", "hand", "gripper",
 # A stop: joints stay within the first for the time before and after [rad, s]; those of another
 # stop differ by more than the second.
 _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad(3.0))
-# Most frames of a motion without stops.
-_MOST_FRAMES = 60
 
 
 class FrameImages(ListedImages[tuple[Path, int] | bytes]):
@@ -200,7 +198,7 @@ def _chosen(joints: FloatArray, episodes: FloatArray, fps: float) -> tuple[IntAr
     )
     still = np.flatnonzero(is_still)
     moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
-    return frames_to_take(at, still, moved, _MOST_FRAMES)
+    return frames_to_take(at, still, moved, 60)
 
 
 def _starts(

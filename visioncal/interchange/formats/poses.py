@@ -154,7 +154,6 @@ _JOINT_NAME = re.compile(
     r"(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
-_LEAST_JOINTS = 5
 
 _ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
@@ -285,7 +284,7 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
             counted[match.group(1, 3)][int(match[2])] = name
     for by_number in counted.values():
         # Four numbers q1 ... may be a quaternion.
-        if len(by_number) >= _LEAST_JOINTS and [*by_number] == [*range(1, len(by_number) + 1)]:
+        if len(by_number) >= 5 and [*by_number] == [*range(1, len(by_number) + 1)]:
             return tuple(by_number.values())
     return ()
 

@@ -24,10 +24,7 @@ _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timesta
 # each pose a position with a quaternion or a matrix by rows.
 _LAYOUTS = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
 _LAYOUTS |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
-_MOST_LISTED = 40
 _NORM_TOLERANCE = 0.01
-# Row counts are whole and below this; seconds of an epoch are not.
-_LARGEST_COUNT = 1e6
 # A pose with its covariance has fewer numbers; lists of corners and images have more.
 _MOST_NUMBERS = 200
 
@@ -108,7 +105,7 @@ class Fields:
             else name
             for name in names
         ]
-        return some_of(words, _MOST_LISTED)
+        return some_of(words, 40)
 
 
 def fields_of_table(table: TextTable, path: Path) -> Fields:
@@ -247,8 +244,8 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     # In a table without a header, the poses follow the times.
     for name in unnamed["time"] if set(unnamed["robot"]) <= set(taken) else ():
         numbers = fields.column(name)[:, 0]
-        # Numbers that count rows, possibly with gaps, are no times.
-        if (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= _LARGEST_COUNT:
+        # Numbers that count rows, possibly with gaps, are no times; those of an epoch are larger.
+        if (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6:
             return name
     named = (
         name

@@ -40,10 +40,6 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
-# Least number and correlation of pose steps by which joints and poses are of one log.
-_FEWEST_STEPS, _LEAST_CORRELATION = 4, 0.9
-# Rotations with larger numbers are in degrees [rad].
-_LARGEST_RAD = 7.0
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
@@ -143,7 +139,7 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
     form = "quaternion-xyzw"
     if rotations.shape[1] == 3:
         largest = float(np.nanmax(np.abs(rotations), initial=0.0))
-        form = "euler-xyz-deg" if largest > _LARGEST_RAD else "rotation-vector"
+        form = "euler-xyz-deg" if largest > 7.0 else "rotation-vector"
     kept = [name for name in columns if name not in names]
     plain = []
     for row_cells, position in zip(cells, positions, strict=True):
@@ -264,9 +260,10 @@ def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:
         for positions in (chain[:, :3, 3], robot.positions)
     ]
     finite = np.isfinite(steps).all(axis=0)
-    if finite.sum() < _FEWEST_STEPS:
+    if finite.sum() < 4:
         return True
-    return bool(np.corrcoef(steps[0][finite], steps[1][finite])[0, 1] > _LEAST_CORRELATION)
+    # Joints and poses are of one log where their steps correlate.
+    return bool(np.corrcoef(steps[0][finite], steps[1][finite])[0, 1] > 0.9)
 
 
 def _replace_cells(

@@ -31,13 +31,6 @@ Poses: TypeAlias = FloatArray | RigidTransform
 
 # Plausible limits: an arm's reach [m] and a joint's range [rad].
 FAR_M, WIDE_RAD = 20.0, 4 * np.pi
-# Rotation matrices that deviate by more are made orthonormal: they were written with few digits.
-_ROUNDED = 1e-12
-
-# Number of nearest positions of the map that a sigma is interpolated from.
-_AROUND = 4
-# Share of the stops' joint ranges by which these are extended: random stops seldom reach the ends.
-_MARGIN = 0.05
 # Smallest number of joints that reach any position.
 _LEAST_JOINTS = 3
 
@@ -147,7 +140,8 @@ def predicted_sigma_mm(
     if q is None or not arm.measured_map:
         return sigma_mm
     lower, upper = np.array([(joint.lower, joint.upper) for joint in arm.measured]).T
-    margin = _MARGIN * (upper - lower)
+    # Random stops seldom reach the ends.
+    margin = 0.05 * (upper - lower)
     measured = np.all((lower - margin <= q) & (q <= upper + margin), axis=1)
     return np.where(measured, _interpolated(p_base, arm.measured_map), sigma_mm)
 
@@ -156,7 +150,7 @@ def _interpolated(p_base: FloatArray, rows: Sequence[WorkspacePlace]) -> FloatAr
     """(m,) sigmas [mm] at (m, 3) positions [m], by inverse squared distance to a map's nearest."""
     positions = np.array([(row.x_m, row.y_m, row.z_m) for row in rows])
     distances = np.linalg.norm(p_base[:, None] - positions, axis=2)
-    near = np.argsort(distances, axis=1)[:, :_AROUND]
+    near = np.argsort(distances, axis=1)[:, :4]
     # Limits the weight at a position of the map itself.
     weights = 1.0 / np.maximum(np.take_along_axis(distances, near, axis=1), 1e-6) ** 2
     sigmas = np.array([row.sigma_mm for row in rows])[near]
@@ -296,7 +290,8 @@ def _matrices(poses: Poses) -> FloatArray:
             culprits=[f"target {at}"],
             next_step="Positions are in metres.",
         )
-    if off.max(initial=0.0) > _ROUNDED:
+    # Matrices written with few digits are made orthonormal.
+    if off.max(initial=0.0) > 1e-12:
         return compose(nearest_rotation(rotations), matrices[:, :3, 3])
     return matrices
 
