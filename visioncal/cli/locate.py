@@ -14,6 +14,7 @@ from visioncal.cli.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import LocateOptions
 from visioncal.core.errors import DataError
+from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
@@ -30,8 +31,6 @@ from visioncal.session.selecting import EYE, Choice, has_several, select
 from visioncal.vision.boards.imaging import read_image
 from visioncal.vision.targets import target_from_document
 
-# Rounding to four digits keeps a unit quaternion's norm within this of 1.
-_NORM_TOLERANCE = 1e-3
 _LEAD = "base_from_"
 
 
@@ -113,10 +112,10 @@ def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
 def _flange(values: Sequence[float]) -> FloatArray:
     """Checks a pose of the robot, (4, 4) `base_from_flange` [m]."""
     norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1.0) > _NORM_TOLERANCE:
+    if abs(norm - 1.0) > NORM_TOLERANCE:
         raise DataError(
             f"--pose: the quaternion's norm is {norm:.6g}, but must be 1 to within "
-            f"{_NORM_TOLERANCE:g}.",
+            f"{NORM_TOLERANCE:g}.",
             culprits=["--pose"],
             next_step=f"Give {POSE}: metres, and a unit quaternion.",
         )

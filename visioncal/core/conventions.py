@@ -13,14 +13,10 @@ from visioncal.core.choices import POSE_FORMS as POSE_FORMS
 from visioncal.core.choices import UNITS_M as UNITS_M
 from visioncal.core.choices import PoseForm as PoseForm
 from visioncal.core.errors import DataError
+from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
-
-# Tolerance of rotations: with three written digits a quaternion's norm is within 9e-4 of 1 and a
-# matrix within 8e-4 of a rotation (views.csv has the same limit). Larger errors mean a wrong form
-# or order.
-_NORM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
     def read(numbers: FloatArray) -> FloatArray:
         # Clipped, because squares of the largest numbers overflow.
         norms = np.linalg.norm(np.clip(numbers, -2.0, 2.0), axis=1)
-        invalid = np.abs(norms - 1.0) > _NORM_TOLERANCE
+        invalid = np.abs(norms - 1.0) > NORM_TOLERANCE
         unit = np.where(invalid[:, None] | ~np.isfinite(numbers), 0.5, numbers)
         rotations = Rotation.from_quat(unit[:, to_xyzw]).as_matrix()
         return _without(rotations, np.asarray(invalid) | ~_finite_rows(numbers))
@@ -97,7 +93,7 @@ def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
         finite = _finite_rows(rotations.reshape(-1, 9))
         safe = np.where(finite[:, None, None], rotations, np.eye(3))
         nearest = nearest_rotation(safe)
-        invalid = np.abs(nearest - safe).max(axis=(1, 2)) > _NORM_TOLERANCE
+        invalid = np.abs(nearest - safe).max(axis=(1, 2)) > NORM_TOLERANCE
         return _without(nearest, np.asarray(invalid) | ~finite)
 
     return RotationForm(

@@ -28,27 +28,11 @@ from visioncal.dynamics.regression import NoiseBlock
 from visioncal.estimation.linalg import covariance_from
 from visioncal.robot import Inertias, LogCholesky
 
-# Number of random states, and their greatest speeds [rad/s] and accelerations [rad/s^2], at which
-# gravity, speed and acceleration contribute about equally to the torques.
-_STATES, _FASTEST, _HARDEST = 200, 3.0, 10.0
 # A column is dependent where less than this share of it is left, and has no effect where its norm
 # is less than this share of the largest. True shares are above 1e-3, rounding 1e-13.
 _RANK = 1e-8
-# Tie-break of the pivoting: equal columns, as those of a rotor and of its link about the first
-# joint, are chosen in their order whatever rounding says, since pivoting weights decrease by this
-# much.
-_TIE = 1e-4
-# Coefficients below this, between columns of unit length, are rounding.
-_ROUNDING = 1e-9
 # Avoids division by zero for parameters without effect.
 _TINY = 1e-12
-# A joint that never exceeds this speed stands still, and its speed is noise [rad/s].
-_STILL_RAD_S = 0.01
-# Directions with less than this share of a full motion's information are undetermined.
-# Fast multi-sines have 1e-4 of it in the worst direction, motion about one axis 1e-16.
-_UNDETERMINED = 1e-9
-# Parameters with this share of an undetermined direction are named with it.
-_SHARE = 0.3
 _NEXT = (
     "Let all joints move at once, to and fro, fast and over a wide range: visioncal dynamics plan "
     "writes such a motion."
@@ -56,7 +40,6 @@ _NEXT = (
 # Standard deviation of the prior in each log-Cholesky coordinate: 30 % of a link's extent, twice
 # that of its mass.
 PRIOR_SIGMA = 0.3
-_SETTLED = 1e-9
 # Prefixes of the joint parameters that cannot be negative.
 _POSITIVE = ("Fc", "Fv", "Ia")
 
@@ -77,7 +60,8 @@ class BaseModel:
         matrix = _random_regressor(model, rng or np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
         effective = np.flatnonzero(lengths > _RANK * lengths.max())
-        weights = 1.0 - _TIE * np.arange(len(effective)) / len(effective)
+        # Breaks ties in favour of earlier parameters.
+        weights = 1.0 - 1e-4 * np.arange(len(effective)) / len(effective)
         upper, order = qr(
             matrix[:, effective] * (weights / lengths[effective]), mode="r", pivoting=True
         )
@@ -106,7 +90,7 @@ class BaseModel:
                 culprits=[model.robot.name],
             )
         coefficients = solve_triangular(upper, projected)
-        coefficients[np.abs(coefficients) < _ROUNDING] = 0.0
+        coefficients[np.abs(coefficients) < 1e-9] = 0.0
         norms = np.where(np.isfinite(lengths), lengths, 0.0)
         dependence = coefficients * norms / lengths[independent][:, None]
         dependence[:, independent] = np.eye(len(independent))
@@ -141,9 +125,10 @@ def _random_regressor(model: DynamicModel, rng: np.random.Generator) -> FloatArr
 
 def random_motion(model: DynamicModel, rng: np.random.Generator) -> JointMotion:
     """Random states over the full ranges of angle, speed and acceleration."""
-    shape = (_STATES, model.robot.joint_count)
-    q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, _FASTEST, _HARDEST))
-    return JointMotion(np.arange(float(_STATES)), q, dq, ddq)
+    # Gravity, speed and acceleration contribute about equally to the torques.
+    shape = (200, model.robot.joint_count)
+    q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, 3.0, 10.0))
+    return JointMotion(np.arange(200.0), q, dq, ddq)
 
 
 def _sum_text(names: tuple[str, ...], row: FloatArray, kept: int) -> str:
@@ -196,7 +181,8 @@ def check_joints_move(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         [np.abs(piece.measured.motion.dq).max(axis=0) for item in streams for piece in item.pieces],
         axis=0,
     )
-    still = np.flatnonzero(fastest < _STILL_RAD_S)
+    # A joint that never exceeds this stands still, and its speed is noise.
+    still = np.flatnonzero(fastest < 0.01)
     if not len(still):
         return
     names = base.model.robot.joint_names
@@ -245,9 +231,10 @@ def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
     column_rms = np.sqrt(np.mean(base.regressor(states).reshape(-1, base.rank) ** 2, axis=0))
     relative = information / np.outer(column_rms, column_rms) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
-    undetermined = np.flatnonzero(values < _UNDETERMINED)
+    # Fast multi-sines have 1e-4 in the worst direction, motion about one axis 1e-16.
+    undetermined = np.flatnonzero(values < 1e-9)
     shares = np.sqrt(np.sum(vectors[:, undetermined] ** 2, axis=1))
-    return [int(index) for index in np.flatnonzero(shares > _SHARE)]
+    return [int(index) for index in np.flatnonzero(shares > 0.3)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,7 +300,7 @@ def fit_consistent(
     own = slopes(start)[: base.rank, count:]
     start[count:] = np.linalg.lstsq(own, -residuals(start)[: base.rank], rcond=None)[0]
     fit = least_squares(
-        residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=_SETTLED
+        residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=1e-9
     )
     free = fit.active_mask == 0
     estimate = np.where(free, fit.x, 0.0)

@@ -22,34 +22,13 @@ from visioncal.dynamics.reading import (
 # many times the motion's bandwidth; below the least there is little to estimate noise from, above
 # the most gears and links resonate [Hz]. The motion's smoothing is at most so many times wider.
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
-# Angles are interpolated over gaps of at most this share of a smoothing polynomial's window, where
-# the other samples determine it.
-_BRIDGED = 0.25
-# Torques that stay at an extreme for so many samples, within this share of the range, are
-# saturated.
-_FLAT_SAMPLES, _FLAT = 5, 1e-6
-_MOST_AT_LIMIT = 0.2
-# A joint stands still where its mean speed over this time stays below this for as long [rad/s],
-# [s].
-_REST_RAD_S, _REST_S = 1e-3, 0.1
 # Samples whose regressors are held in memory at a time.
 _SAMPLES_AT_ONCE = 20_000
-# A filter output is not used where more than this share of its weights is on invalid samples.
-_MOST_INVALID = 0.02
-# Nor where more than this share is on missing samples.
-_MOST_MISSING = 0.5
 
-# Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
-_BETA, _SPAN = 5.65, 1.81
-# Outputs with less than this weight on present samples are not normalised.
-_LEAST_WEIGHT = 0.1
-# A motion's bandwidth ends where the power of its accelerations stays under this share of its peak,
-# searched in so many bins an octave, over joints that move at least this share of the fastest one.
-_OUT_OF_BAND, _PARTS, _MOVING = 0.03, 4, 0.05
+# Half the length of a filter with that attenuation, by Kaiser's design, over rate and cut-off.
+_SPAN = 1.81
 # Polynomials of fourth order pass a sixth of their own bandwidth to a few parts in ten thousand.
 _ORDER, WIDER = 4, 6.0
-# Reported speeds may deviate from the angles' derivatives by this share, and this much [rad/s].
-_DEVIATION, _DEVIATION_RAD_S = 0.1, 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +48,8 @@ class LowPass:
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
         half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
-        taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), _BETA)
+        # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
+        taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), 5.65)
         return cls(taps / taps.sum(), step)
 
     @property
@@ -99,7 +79,7 @@ class LowPass:
             return self._weighted_sums(values, self.taps)
         axes = (-1,) + (1,) * (values.ndim - 1)
         weights = self._weighted_sums(present.astype(float), self.taps)
-        weights = np.where(np.abs(weights) < _LEAST_WEIGHT, 1.0, weights)
+        weights = np.where(np.abs(weights) < 0.1, 1.0, weights)
         return self._weighted_sums(values * present.reshape(axes), self.taps) / weights.reshape(
             axes
         )
@@ -123,10 +103,10 @@ def bandwidth(q: FloatArray, rate_hz: float) -> float:
     frequencies = np.asarray(np.fft.rfftfreq(len(q), 1.0 / rate_hz)[1:], dtype=float)
     spectrum = np.fft.rfft((q - q.mean(axis=0)) * np.hanning(len(q))[:, None], axis=0)[1:]
     speeds = np.sqrt(np.sum(np.abs(spectrum * frequencies[:, None]) ** 2, axis=0))
-    moving = speeds >= _MOVING * speeds.max()
+    moving = speeds >= 0.05 * speeds.max()
     power = np.abs(spectrum[:, moving] * frequencies[:, None] ** 2) ** 2
     octaves = np.log2(frequencies / frequencies[0])
-    bins = (_PARTS * octaves).astype(np.int64)
+    bins = (4 * octaves).astype(np.int64)
     return max(_band_edge(column, bins, frequencies) for column in power.T)
 
 
@@ -134,7 +114,8 @@ def _band_edge(power: FloatArray, bins: IntArray, frequencies: FloatArray) -> fl
     """Frequency above its peak at which a joint's power falls below the limit [Hz]."""
     slow = frequencies < 0.02 * frequencies[-1]
     peak = int(np.argmax(np.where(slow, power, 0.0)))
-    limit = _OUT_OF_BAND * power[peak]
+    # The bandwidth ends where the power of the accelerations stays under 3 % of its peak.
+    limit = 0.03 * power[peak]
     for bin_ in range(int(bins[peak]) + 1, int(bins[-1]) + 1):
         inside = bins == bin_
         if inside.any() and power[inside].max() < limit:
@@ -186,9 +167,7 @@ def smoothed_motion(
     reported = fitted(dq, 0)
     inner = slice(window // 2, -(window // 2))
     deviation = np.sqrt(np.mean((reported - speeds)[inner] ** 2, axis=0))
-    if np.any(
-        deviation > _DEVIATION * np.sqrt(np.mean(speeds[inner] ** 2, axis=0)) + _DEVIATION_RAD_S
-    ):
+    if np.any(deviation > 0.1 * np.sqrt(np.mean(speeds[inner] ** 2, axis=0)) + 0.005):
         return derived, False
     noise = [
         _derivative_noise(q - smooth, window, 2, step),
@@ -245,9 +224,10 @@ class Piece:
         """(k, n) which of the filtered torques can be used."""
         used = np.ones((len(self.times_s), self.invalid.shape[1]), dtype=bool)
         if self.invalid.any():
-            used &= self.lowpass.share_of(self.invalid) <= _MOST_INVALID
+            # Outputs are not used that weigh invalid or missing samples too much.
+            used &= self.lowpass.share_of(self.invalid) <= 0.02
         if not self.present.all():
-            used &= self.lowpass.share_of(~self.present)[:, None] <= _MOST_MISSING
+            used &= self.lowpass.share_of(~self.present)[:, None] <= 0.5
         return used
 
     def advanced(self, lag_s: float) -> Self:
@@ -384,14 +364,15 @@ def condition(
 
 def _resting(motion: JointMotion, rate_hz: float) -> Mask:
     """(m, n) where a joint stands still: friction then holds it by any torque up to its bound."""
-    samples = max(round(_REST_S * rate_hz), 1)
-    slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < _REST_RAD_S
+    samples = max(round(0.1 * rate_hz), 1)
+    slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < 1e-3
     return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
 
 
 def _longest_gap(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
     """Longest gap over which polynomials of that cut-off may interpolate angles [s]."""
-    return _BRIDGED * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
+    # Over so short gaps the other samples of a polynomial's window determine the angles.
+    return 0.25 * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
 
 
 def _saturated(recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]) -> Mask:
@@ -400,7 +381,7 @@ def _saturated(recorded: RecordedSamples, limits_nm: FloatArray | None, notes: l
     if limits_nm is not None:
         beyond = np.abs(recorded.torques_nm) >= 0.999 * limits_nm
         # Torques that are beyond the limits often are not saturated, but in another unit.
-        flat |= beyond & (beyond.mean(axis=0) < _MOST_AT_LIMIT)
+        flat |= beyond & (beyond.mean(axis=0) < 0.2)
     if flat.any():
         joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(flat.sum(axis=0)) if n]
         notes.append(
@@ -414,7 +395,8 @@ def _flat_tops(values: FloatArray) -> Mask:
     """(m,) where torques stay at their extremes for longer than anywhere else: saturation."""
     flat = np.zeros(len(values), dtype=bool)
     span = float(np.ptp(values))
-    same = np.abs(np.diff(values)) <= _FLAT * span
+    # Torques that stay at an extreme are saturated.
+    same = np.abs(np.diff(values)) <= 1e-6 * span
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     runs = bounds.reshape(-1, 2)
     lengths = runs[:, 1] - runs[:, 0] + 1
@@ -423,6 +405,6 @@ def _flat_tops(values: FloatArray) -> Mask:
     top = np.minimum(values.max() - values[runs[:, 0]], values[runs[:, 0]] - values.min())
     extreme = top <= 1e-3 * span
     others = int(lengths[~extreme].max(initial=1))
-    for begin, end in runs[extreme & (lengths >= max(_FLAT_SAMPLES, 3 * others))]:
+    for begin, end in runs[extreme & (lengths >= max(5, 3 * others))]:
         flat[begin : end + 1] = True
     return flat

@@ -19,15 +19,13 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import JointMotion, Measured, sign
 from visioncal.robot import Inertias, Robot, joint_torques
 
-# Samples of a test, and the least number: sweeps of single joints have fewer.
-_SAMPLES, _LEAST = 250, 100
+# Least number of a test's samples: sweeps of single joints have fewer.
+_LEAST = 100
 # A mistake is reported where undoing it divides the torques' unexplained power by this factor, and
 # leaves at most this share unexplained in the joints concerned: by known inertias, by the best fit.
 # Best fits of correct recordings improve by a factor of 1.2 at most. Mistakes that are nearly as
 # likely are named, too: slow sweeps hardly separate swapped torques from swapped angles.
 _BETTER, _LEFT = 10.0, {True: 0.5, False: 0.1}
-# Least share of a joint's torque power that counts as unexplained: noise, and wrong inertias.
-_FLOOR = 0.01
 # Torques whose scale to the predicted ones is outside these factors are in other units, such as
 # motor-side torques; only joints of whose torque the links make up at least this share are tested.
 _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
@@ -56,7 +54,7 @@ def _sampled(stream: Conditioned) -> Measured:
     """Unfiltered samples, spread over a stream, at which all torques are valid."""
     piece = max(stream.pieces, key=lambda value: len(value.measured))
     good = np.flatnonzero(piece.present & ~piece.invalid.any(axis=1))
-    return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
+    return piece.measured.chosen(good[:: max(len(good) // 250, 1)])
 
 
 def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known: bool) -> None:
@@ -158,7 +156,8 @@ def _joint_fit(measured: Measured, predicted: FloatArray, joint: int) -> tuple[F
     sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     factors, left = nnls(columns / sizes, centred)
     power = max(float(centred @ centred), 1e-24)
-    return factors / sizes, max(left**2 / power, _FLOOR)
+    # Noise, and wrong inertias.
+    return factors / sizes, max(left**2 / power, 0.01)
 
 
 def _named(joints: tuple[int, ...]) -> str:

@@ -31,31 +31,16 @@ SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
 # Sharpness of the smoothed condition and penalty weight of the limits, round by round.
 _ROUNDS = ((1.0, 10.0), (4.0, 80.0), (15.0, 640.0))
-# Share of the limits that random motions use, and number of random postures tried for their start.
-_MODEST, _POSTURES = 0.5, 2000
-# They are halved at most so many times until they are free of collisions: a descent that begins
-# inside a body may never come out of it.
-_HALVINGS, _CLEAR_HZ = 8, 10.0
-# A motion that exceeds a limit is scaled by this at most so many times before it is given up.
-_SMALLER, _TRIES = 0.97, 5
+# Sampling of the check for collisions.
+_CLEAR_HZ = 10.0
 # Sampling of the condition numbers, which do not change with more.
 _FIGURES_HZ = 100.0
-# Random motions whose condition is reported for comparison.
-_COMPARED = 20
-# Exceeded limits that a message names.
-_NAMED = 3
 
 # Samples of the regressor per period of the highest harmonic, and how many times denser limits and
 # distances are sampled.
 _SAMPLES, _LIMIT_DENSITY = 10, 3
-# Dry friction is smoothed over this share of the greatest speed, so that the objective is smooth.
-_SPREAD = 0.03
 # Finite-difference steps of regressor and distances [rad and its rates], far above rounding.
 _STEP, _STEP_CLEAR = 1e-6, 1e-5
-# Margins for peaks between samples: a share of the limits, and of the distances [m].
-_EARLIER, _BUFFER_M = 0.03, 0.03
-# Scale of the distances' penalty: as costly as exceeding a limit by its own size [m].
-_SHORT_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -142,7 +127,8 @@ class Objective:
         """Prepares the samples; weights (n,) are the inverse of each joint's torque noise."""
         self.harmonics = harmonics
         self._allowed, self._weights = allowed, weights
-        terms = replace(base.model.terms, slow_rad_s=_SPREAD * float(allowed.speed.max()))
+        # Smooth, so that the objective is.
+        terms = replace(base.model.terms, slow_rad_s=0.03 * float(allowed.speed.max()))
         self._base = replace(base, model=DynamicModel(base.model.robot, terms))
         count = _SAMPLES * harmonics.count
         # Between the ends, where speeds are zero and have no sign.
@@ -206,7 +192,8 @@ class Objective:
 
     def _penalty(self, coefficients: FloatArray) -> tuple[float, list[FloatArray]]:
         """Penalty of exceeded limits and distances, with gradients (m, n)."""
-        allowed, less = self._allowed, 1.0 - _EARLIER
+        # A margin for peaks between samples.
+        allowed, less = self._allowed, 0.97
         q, dq, ddq = (array @ coefficients.T for array in self._limit_basis)
         position, by_q = _hinge(q - allowed.middle, less * allowed.half)
         speed, by_dq = _hinge(dq, less * allowed.speed)
@@ -231,8 +218,9 @@ class Objective:
     def _shortfall(self, posture: FloatArray) -> FloatArray:
         """(k,) shortfall of each pair's distance, over its scale; zero for those far apart."""
         collisions = self._allowed.collisions
-        left = collisions.distances(posture) - collisions.needed_m() - _BUFFER_M
-        return np.maximum(-left / _SHORT_M, 0.0)
+        left = collisions.distances(posture) - collisions.needed_m() - 0.03
+        # As costly as exceeding a limit by its own size.
+        return np.maximum(-left / 0.1, 0.0)
 
 
 def _hinge(values: FloatArray, limits: FloatArray) -> tuple[float, FloatArray]:
@@ -335,7 +323,7 @@ class _ExcitationSearch:
         if self._best is None:
             raise DegenerateError(
                 f"robot {self._allowed.robot.name}: no motion was found that keeps the limits; of "
-                f"the last one tried, {some_of(self._breaches, _NAMED)}.",
+                f"the last one tried, {some_of(self._breaches, 3)}.",
                 culprits=self._breaches,
                 next_step="Search from more starts (--starts), or leave the motion more room: "
                 "--duration, --margin-deg, --clearance-mm, --floor.",
@@ -381,7 +369,7 @@ class _ExcitationSearch:
     def _keep(self, free: FloatArray) -> None:
         """Keeps a motion if it is the best yet and within the limits, shrunk where needed."""
         series = _shrunk_to_limits(self._allowed, self._objective.series(free))
-        for _ in range(_TRIES):
+        for _ in range(5):
             condition = self._figures(series)
             if self._best is not None and condition >= self._best[0]:
                 return
@@ -390,7 +378,7 @@ class _ExcitationSearch:
             if not kept.breaches:
                 self._best = condition, series, kept
                 return
-            series = series.shrunk(_SMALLER)
+            series = series.shrunk(0.97)
 
     def _figures(self, series: Series) -> float:
         return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
@@ -398,7 +386,8 @@ class _ExcitationSearch:
     def _start(self) -> FloatArray:
         """Coefficients (k,) of a random motion without collisions, or nearly at rest."""
         motion = self._modest(self._posture())
-        for _ in range(_HALVINGS):
+        # A descent that begins inside a body may never come out of it.
+        for _ in range(8):
             q = motion.sampled(_CLEAR_HZ).q
             if (self._allowed.collisions.first_contact(q) < 0).all():
                 break
@@ -410,7 +399,7 @@ class _ExcitationSearch:
         allowed = self._allowed
         half = np.minimum(np.pi, allowed.half)
         contacts: Sequence[int] = ()
-        drawn = self._rng.uniform(-half, half, (_POSTURES, len(half))) + allowed.middle
+        drawn = self._rng.uniform(-half, half, (2000, len(half))) + allowed.middle
         for posture in drawn:
             contact = int(allowed.collisions.first_contact(posture[None])[0])
             if contact < 0:
@@ -418,7 +407,7 @@ class _ExcitationSearch:
             contacts = (*contacts, contact)
         names = allowed.collisions.names[int(np.bincount(contacts).argmax())]
         raise DegenerateError(
-            f"robot {allowed.robot.name}: none of {_POSTURES} postures within the limits is clear; "
+            f"robot {allowed.robot.name}: none of 2000 postures within the limits is clear; "
             f"{' and '.join(names)} are too near one another in most.",
             culprits=names,
             next_step="Look at --floor, --box and --clearance-mm, and at the base's frame.",
@@ -441,12 +430,12 @@ class _ExcitationSearch:
                 (moved.q, np.full(len(posture), np.pi)),
             )
         ]
-        scaled = _MODEST * np.min(shares, axis=0)[:, None] * free
+        scaled = 0.5 * np.min(shares, axis=0)[:, None] * free
         return Series(self._harmonics, scaled + np.outer(posture, resting[0]))
 
     def _random(self) -> float:
         """Median condition of random motions, for comparison."""
-        drawn = [self._figures(self._modest(self._posture())) for _ in range(_COMPARED)]
+        drawn = [self._figures(self._modest(self._posture())) for _ in range(20)]
         return float(np.median(drawn))
 
 

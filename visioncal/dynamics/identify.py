@@ -40,10 +40,6 @@ SLOW_RAD_S = 1e-4
 _LIMITS = DynamicsLimits()
 # Greatest lag [s].
 _LARGEST_S = 0.25
-# A lag is significant from so many sigmas on, if the median residual of the joints is at most this
-# share of the torques' range: larger residuals have other causes.
-_SIGMAS, _LEFT = 5.0, 0.3
-_ROUNDS, _SETTLED = 15, 0.1
 
 
 @dataclass(frozen=True)
@@ -172,12 +168,12 @@ def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms)
 
 def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
     lag_s = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(15):
         lagged = [_lagged(*pair, lag_s) for pair in zip(streams, blocks, strict=True)]
         fit = regress(lagged)
         change, sigma = float(fit.values[-1]), float(np.sqrt(fit.covariance[-1, -1]))
         lag_s -= change
-        if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
+        if abs(change) < 0.1 * sigma or abs(lag_s) > _LARGEST_S:
             break
     # Greatest change of a joint's torques by the lag, over their range.
     changes = [
@@ -192,8 +188,9 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
         for residual, block in zip(fit.residuals, fit.blocks, strict=True)
         for std in (std_of(block.y, block.used),)
     ]
-    significant = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
-    return lag if significant and np.median(residual_shares) < _LEFT else None
+    # Larger residuals have other causes than a lag.
+    significant = 5.0 * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
+    return lag if significant and np.median(residual_shares) < 0.3 else None
 
 
 def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:

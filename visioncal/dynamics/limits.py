@@ -14,8 +14,6 @@ from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
 from visioncal.robot.collision import Body, Collisions, arm_bodies
 
 CHECK_HZ = 1000.0
-# Tolerance for rounding, since motions are scaled to reach their limits exactly.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -242,7 +240,8 @@ class MotionExtremes:
             ("acceleration", self.acceleration, allowed.acceleration, "rad/s^2"),
             *([("torque", self.torque, allowed.torque, "N m")] if self.torque is not None else []),
         ):
-            beyond = np.flatnonzero(used > limit + _ROUNDING * np.maximum(1.0, np.abs(limit)))
+            # Motions are scaled to reach their limits exactly, but for rounding.
+            beyond = np.flatnonzero(used > limit + 1e-9 * np.maximum(1.0, np.abs(limit)))
             messages += [
                 f"{what} of {names[joint]} reaches {abs(used[joint]):.3g} {unit}, "
                 f"{abs(limit[joint]):.3g} is allowed"

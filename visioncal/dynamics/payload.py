@@ -24,19 +24,10 @@ from visioncal.dynamics.model import FrictionTerms, JointMotion
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, symmetric_entries
 
-# Relative sigma from which on a mass does not differ from none [-].
-_WORST = 0.5
 # Correlation of the gain errors of an arm's drives: of the 12 % of GAIN_SIGMA about 11 % are common
 # to all joints [-].
 _GAIN_CORRELATION = 0.8
-# Relative standard deviation of gravity about the standard value, over inhabited places; a mass is
-# as uncertain where gravity is not stated [-].
-_GRAVITY_SIGMA = 5e-4
 _HOW = "Drive the exciting trajectory of visioncal dynamics plan with the payload on the flange."
-# Relative sigma from which on a gain is not determined [-].
-_WORST_GAIN = 0.1
-# Relative pivot below which a column is dependent [-].
-_RANK = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +140,8 @@ def estimate_payload(
         rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
         float(np.sqrt(gains_covariance[0, 0])),
     )
-    if not payload.mass_sigma_kg < _WORST * payload.mass_kg:
+    # A mass so uncertain does not differ from none.
+    if not payload.mass_sigma_kg < 0.5 * payload.mass_kg:
         raise DegenerateError(
             f"payload: a mass of {figure(payload.mass_kg)} kg, with a sigma of "
             f"{figure(payload.mass_sigma_kg)} kg, does not differ from none.",
@@ -193,7 +185,8 @@ def _gravity_covariance(identified: Identified, fit: Regression) -> FloatArray:
     """(10, 10) covariance that unstated gravity adds to the mass and the first moments."""
     sigmas = np.zeros(10)
     if "gravity_m_s2" not in identified.robot.document:
-        sigmas[:4] = _GRAVITY_SIGMA * fit.values[:4]
+        # Gravity's relative standard deviation over inhabited places.
+        sigmas[:4] = 5e-4 * fit.values[:4]
     return np.outer(sigmas, sigmas)
 
 
@@ -226,7 +219,7 @@ class Gains:
     @property
     def determined(self) -> FloatArray:
         """(n,) gains that are determined to a tenth of their value."""
-        return np.asarray(self.sigma < _WORST_GAIN * np.abs(self.nm_per_a))
+        return np.asarray(self.sigma < 0.1 * np.abs(self.nm_per_a))
 
 
 @on_one_blas_thread
@@ -284,7 +277,7 @@ def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[floa
     lengths = np.linalg.norm(own[:, effective], axis=0)
     directions, upper, _ = qr(own[:, effective] / lengths, mode="economic", pivoting=True)
     pivots = np.abs(np.diag(upper))
-    directions = directions[:, pivots > _RANK * pivots[0]]
+    directions = directions[:, pivots > 1e-8 * pivots[0]]
     load = load - directions @ (directions.T @ load)
     currents = currents - directions @ (directions.T @ currents)
     square = float(load @ load)

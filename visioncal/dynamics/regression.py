@@ -25,15 +25,8 @@ from visioncal.dynamics.model import JointMotion, sign
 
 # Rows of a QR decomposition at a time, so that they stay in the processor's cache.
 _CHUNK = 2000
-_ROUNDS, _SETTLED = 30, 1e-4
-# Autocorrelations count up to the first insignificant one (in sigmas), and over this share of
-# samples.
-_LOST, _FOLLOWED = 3.0, 0.1
-# Least power of the noise's spectrum, over that of white noise.
-_LEAST_POWER = 0.02
 # Start values and bounds of the Stribeck speed [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
-_HUMP_SETTLED, _HUMP_ROUNDS = 1e-3, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +126,7 @@ def _weighted(
     joints = [_decomposed(block) for block in blocks]
     size = blocks[0].x.shape[2]
     sigmas = [np.ones(len(joint)) for joint in joints]
-    for turn in range(_ROUNDS):
+    for turn in range(30):
         values, root = _solved(joints, sigmas, size)
         before = sigmas
         sigmas = [
@@ -143,7 +136,7 @@ def _weighted(
             for factors, olds in zip(joints, before, strict=True)
         ]
         pairs = zip(before, sigmas, strict=True)
-        if turn and all(np.allclose(old, new, rtol=_SETTLED) for old, new in pairs):
+        if turn and all(np.allclose(old, new, rtol=1e-4) for old, new in pairs):
             break
     return values, tuple(sigmas), root
 
@@ -227,7 +220,7 @@ def _scores(rows: FloatArray, correlations: FloatArray) -> FloatArray:
     kernel = np.zeros(size)
     kernel[0] = 1.0
     kernel[1 : len(correlations) + 1] = kernel[-1 : -len(correlations) - 1 : -1] = correlations
-    power = np.maximum(rfft(kernel).real, _LEAST_POWER)
+    power = np.maximum(rfft(kernel).real, 0.02)
     # All frequencies of a real signal's spectrum but the ends count twice.
     power[1 : (size + 1) // 2] *= 2.0
     waves = rfft(rows, size, axis=0) * np.sqrt(power / size)[:, None]
@@ -241,10 +234,11 @@ def _correlations(residuals: FloatArray, used: Mask, of_filter: FloatArray) -> F
     correlations = list(of_filter)
     if not size or count < 20:
         return of_filter
-    for lag in range(1, int(_FOLLOWED * count)):
+    # Autocorrelations count up to the first insignificant one.
+    for lag in range(1, int(0.1 * count)):
         sample = float(residuals[lag:] @ residuals[:-lag]) / size
         expected = correlations[lag - 1] if lag <= len(correlations) else 0.0
-        if abs(sample - expected) * np.sqrt(count) < _LOST:
+        if abs(sample - expected) * np.sqrt(count) < 3.0:
             break
         if lag <= len(correlations):
             correlations[lag - 1] = sample
@@ -311,13 +305,13 @@ def fit_stribeck(
         starts = [Stribeck(joints, ones, start * ones, slow_rad_s) for start in _STARTS]
         humps = min(starts, key=lambda start: _cost(regress(_with_humps(streams, blocks, start))))
         # Gauss-Newton steps of the logarithms of the speeds.
-        for _ in range(_HUMP_ROUNDS):
+        for _ in range(20):
             fit = regress(_with_humps(streams, blocks, replace(humps, hump_nm=ones)))
             hump_nm, slopes = np.split(fit.values[-2 * len(joints) :], 2)
             steps = np.clip(slopes / hump_nm, -1.0, 1.0)
             speeds = np.clip(humps.speed_rad_s * np.exp(steps), _SLOWEST, _FASTEST)
             humps = replace(humps, hump_nm=hump_nm, speed_rad_s=speeds)
-            if np.abs(steps).max() < _HUMP_SETTLED:
+            if np.abs(steps).max() < 1e-3:
                 break
         fit = regress(_with_humps(streams, blocks, humps))
         humps = replace(humps, hump_nm=fit.values[-2 * len(joints) : -len(joints)])

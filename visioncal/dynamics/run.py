@@ -28,8 +28,6 @@ from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
 
 # Share of the fastest motion, at its end, held out for validation where no other stream is.
 HELD_OUT = 0.3
-# Rotors are kept where they reduce the error of some joint's held-out torques to this share.
-_ROTORS = 0.75
 
 
 @dataclass(frozen=True)
@@ -302,7 +300,8 @@ def _with_rotors(robot: Robot, split: _Split | None, request: IdentificationRequ
             fit = identify(robot, split.fitted, _quick(options, with_rotors))
             predicted = predict(fit.identified, split.held_out)
             errors.append(predicted.rms_nm(predicted.predicted_nm))
-        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < _ROTORS)
+        # Rotors are kept where they help some joint clearly.
+        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < 0.75)
     return replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
 
 

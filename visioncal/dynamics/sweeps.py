@@ -24,12 +24,6 @@ REST_S = 0.2
 _UNHURRIED = 0.2
 # Greatest range of a sweep, and step of the search for a joint's free range [rad].
 _WIDEST_RAD, _STEP_RAD = 2.4, 0.1
-# Number of random postures, and of the best of them that are planned in full.
-_POSTURES, _PLANNED = 300, 20
-# Least range of a joint that is swept [rad].
-_LEAST_RAD = 0.2
-# Sampling of the check, for torques alone: paths are checked in full, ramps and speeds are exact.
-_FIGURES_HZ = 200.0
 
 
 @dataclass(frozen=True)
@@ -127,12 +121,13 @@ def plan_sweeps(allowed: MotionLimits, request: SweepRequest) -> Sweeps:
     """
     rng = np.random.default_rng(request.seed)
     half = np.minimum(np.pi, allowed.half)
-    drawn = allowed.middle + rng.uniform(-half, half, (_POSTURES, len(half)))
+    drawn = allowed.middle + rng.uniform(-half, half, (300, len(half)))
     clear = drawn[allowed.collisions.first_contact(drawn) < 0]
     ranges = np.array([_free_ranges(allowed, value) for value in clear]).reshape(-1, len(half), 2)
     order = np.argsort(-np.sort(ranges[:, :, 1] - ranges[:, :, 0], axis=1)[:, 0], kind="stable")
     breaches: tuple[str, ...] = ("everywhere something is too near",)
-    for row in order[:_PLANNED].tolist():
+    # The best are planned in full.
+    for row in order[:20].tolist():
         sweeps = _in_posture(allowed, request, clear[row], ranges[row])
         if sweeps.strokes and not sweeps.extremes.breaches:
             return sweeps
@@ -153,11 +148,12 @@ def _in_posture(
     left_out = []
     for joint, name in enumerate(allowed.robot.joint_names):
         low, high = _checked_range(allowed, home, joint, *ranges[joint].tolist())
-        if high - low < _LEAST_RAD:
+        if high - low < 0.2:
             left_out.append(name)
             continue
         strokes += _joint_strokes(allowed, request, joint, float(home[joint]), low, high)
-    kept = motion_extremes(allowed, _sampled(home, tuple(strokes), _FIGURES_HZ))
+    # For torques alone: paths are checked in full, ramps and speeds are exact.
+    kept = motion_extremes(allowed, _sampled(home, tuple(strokes), 200.0))
     return Sweeps(home, tuple(strokes), kept, tuple(left_out))
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
 
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform
-
-# No arm reaches this far [m]: such numbers are in millimetres.
-FAR_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.transforms import invert, rotation_angle, skew
 from visioncal.core.types import FloatArray, Mask
@@ -18,8 +19,6 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
 
-# Plausible limits: an arm's reach [m] and a joint's range [rad].
-_FAR_M, _WIDE_RAD = 20.0, 4 * np.pi
 NO_TOOL = (
     "Find the tip with visioncal tcp first, and name its file with --tool; or say --tool none, "
     "where the controller's tool was active and the poses are of the tip itself."
@@ -158,11 +157,11 @@ def check_lengths(rows: TouchRows) -> None:
     """
     # Squares of the largest numbers overflow.
     distances = np.hypot.reduce(rows.base_from_flange[:, :3, 3], axis=1)
-    far = np.flatnonzero(distances > _FAR_M)
+    far = np.flatnonzero(distances > FAR_M)
     if len(far):
         raise DataError(
             f"{rows.places[far[0]]}: its position is {distances[far[0]]:.4g} m from the base, and "
-            f"no arm reaches {_FAR_M:g} m: these look like millimetres.",
+            f"no arm reaches {FAR_M:g} m: these look like millimetres.",
             culprits=[rows.places[index] for index in far],
             next_step="Say --robot-unit mm, or write metres.",
         )
@@ -211,7 +210,7 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
         return has_joints, poses
     has_joints = np.asarray(np.isfinite(rows.joints_rad).all(axis=1))
     largest = np.abs(np.where(has_joints[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
-    wide = np.flatnonzero(largest > _WIDE_RAD)
+    wide = np.flatnonzero(largest > WIDE_RAD)
     if len(wide):
         raise DataError(
             f"{rows.places[wide[0]]}: a joint stands at {largest[wide[0]]:.4g} rad, more than two "

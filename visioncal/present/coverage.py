@@ -12,9 +12,6 @@ from visioncal.results.evidence import ViewEvidence
 
 # Columns and rows of the image's grid, to show where no corner lies.
 _CELLS = (8, 5)
-# Rings of equal angle in the charts of directions and axes [deg].
-DIRECTIONS_RINGS_DEG = (15, 30, 45, 60)
-AXES_RINGS_DEG = (30, 60, 90)
 # The axes of smaller rotations are mostly noise.
 _MIN_ROTATION_RAD = np.deg2rad(1.0)
 
@@ -67,7 +64,7 @@ def directions_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
     }
     if not points:
         return None
-    return _disc_chart("directions", points, DIRECTIONS_RINGS_DEG)
+    return _disc_chart("directions", points, (15, 30, 45, 60))
 
 
 def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
@@ -88,7 +85,7 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
         if angle_rad > _MIN_ROTATION_RAD:
             axis = rotvec / (angle_rad if rotvec[2] > 0 else -angle_rad)
             points[view] = _disc(axis[None])
-    return _disc_chart("rotation_axes", points, AXES_RINGS_DEG) if points else None
+    return _disc_chart("rotation_axes", points, (30, 60, 90)) if points else None
 
 
 def _disc(directions: FloatArray) -> FloatArray:

@@ -31,8 +31,6 @@ SOURCES = {
     "noise_level": "how well the robot's noise is known",
     "lens_field": "the lens beyond its model",
 }
-# As a share of the total sigma: a hundredth of the variance.
-_LEAST_SHARE = 0.1
 
 
 def readable_time(created: str) -> str:
@@ -155,12 +153,11 @@ def source_table(calibration: Calibration) -> Table | None:
     if not budgets:
         return None
     names = dict.fromkeys(name for budget in budgets.values() for name in budget)
+    # A hundredth of the variance.
     shown = [
         name
         for name in names
-        if any(
-            budget.get(name, 0.0) > _LEAST_SHARE * budget["total"] for budget in budgets.values()
-        )
+        if any(budget.get(name, 0.0) > 0.1 * budget["total"] for budget in budgets.values())
     ]
     edge_rows = [
         (edge, *(significant(budget.get(name)) for name in shown))

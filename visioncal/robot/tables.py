@@ -11,6 +11,7 @@ from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
+from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, joint_function, joint_tables, subtable
@@ -18,8 +19,6 @@ from visioncal.robot.chain import Chain, joint_function, joint_tables, subtable
 # Keys of a joint function; the offset is in theta_offset_rad or d_m.
 _FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
 _POSE_KEYS = ("xyz_m", "rpy_rad")
-# Greatest length a of a link [m]; d of nearly parallel axes is not limited.
-_LONGEST_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,11 +245,11 @@ def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, f
         )
     beta = row.number("beta_rad", 0.0)
     length_m = row.number("a_m")
-    if abs(length_m) > _LONGEST_M:
+    if abs(length_m) > FAR_M:
         raise row.refuse(
             "a_m",
             length_m,
-            f"a number of metres, under {_LONGEST_M:g},",
+            f"a number of metres, under {FAR_M:g},",
             "It looks like millimetres: multiply a_m and d_m of all joints by 0.001.",
         )
     return length_m, row.number("alpha_rad"), beta, float(parallel)

@@ -17,6 +17,7 @@ from pydantic import (
 )
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera, CameraKind, CameraMount, Need
 
@@ -33,8 +34,6 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
 
-# Largest plausible reach of an arm [m].
-_FAR_M = 20.0
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 
 
@@ -117,9 +116,9 @@ class ClockTable(TableModel):
 def _place(at: object) -> object:
     numbers = at if isinstance(at, list) else []
     is_place = len(numbers) == 3 and all(type(number) in (int, float) for number in numbers)
-    if at != "views" and not (is_place and all(abs(number) <= _FAR_M for number in numbers)):
+    if at != "views" and not (is_place and all(abs(number) <= FAR_M for number in numbers)):
         raise ValueError(
-            f'is {at!r}, but must be "views" or [x, y, z] in the base, in metres (under {_FAR_M:g})'
+            f'is {at!r}, but must be "views" or [x, y, z] in the base, in metres (under {FAR_M:g})'
         )
     return at
 

@@ -27,8 +27,6 @@ _TEETH = 200
 # Nodes per turn of the joints' error functions, which are linear in between.
 _NODES = 1440
 GRAVITY = np.array([0.0, 0.0, -9.80665])
-# Iterations of deflection and torques: each changes the levers by about a hundredth.
-_ROUNDS = 8
 # Masses [kg] and centres of mass [m] in the link frames, from Universal Robots, "DH parameters for
 # calculations of kinematics and dynamics"; round numbers for the other arm.
 BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
@@ -66,8 +64,6 @@ BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     ),
 }
 _JOINTS = 6
-# Thermal expansion of steel and of aluminium [1/K].
-STEEL_PER_K, ALUMINIUM_PER_K = 12e-6, 23e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +317,8 @@ def loaded_joints(
         (m, n) equivalent angles of a rigid arm [rad].
     """
     sagged = joints
-    for _ in range(_ROUNDS if any(compliance) else 0):
+    # Each changes the levers by about a hundredth.
+    for _ in range(8 if any(compliance) else 0):
         sagged = joints + np.array(compliance) * load_torques(arm, sagged, payloads)
     return sagged
 
@@ -452,11 +449,12 @@ class Heat:
         """Draws an arm whose joints warm up by 10 to 35 K within hours."""
         rng = np.random.default_rng([99, seed])
         duty = rng.uniform(1.5, 4.0, _JOINTS)
+        # Expansion of steel and of aluminium.
         return cls(
             duty,
             rng.uniform(10.0, 35.0, _JOINTS) / duty**2,
             rng.uniform(1500.0, 3600.0, _JOINTS),
-            rng.uniform(STEEL_PER_K, ALUMINIUM_PER_K, _JOINTS),
+            rng.uniform(12e-6, 23e-6, _JOINTS),
             rng.normal(0.0, 5e-6, _JOINTS),
         )
 

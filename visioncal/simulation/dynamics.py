@@ -19,8 +19,6 @@ from visioncal.simulation.records import write_truth
 
 # Harmonics of a periodic motion.
 _HARMONICS = 5
-# Relative standard deviation of masses and inertias from the published values.
-_INERTIA_ERROR = 0.2
 # Principal moments of inertia about the centres of mass [kg m^2], in the link frames: Universal
 # Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
 _INERTIA: Mapping[str, Sequence[Sequence[float]]] = {
@@ -35,7 +33,6 @@ _INERTIA: Mapping[str, Sequence[Sequence[float]]] = {
 }
 # Typical Coulomb [N m] and viscous friction [N m s/rad] of each joint.
 _COULOMB, _VISCOUS = (9.0, 10.0, 7.0, 1.6, 1.5, 1.4), (12.0, 13.0, 9.0, 1.5, 1.4, 1.3)
-_MOTOR_INERTIA = (1.1, 1.2, 0.9, 0.08, 0.08, 0.07)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +140,11 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
         0.1 * coulomb * rng.standard_normal(count),
         coulomb * rng.uniform(0.2, 1.0, count) * stribeck,
         rng.uniform(0.01, 0.05, count),
-        around(_MOTOR_INERTIA),
+        around((1.1, 1.2, 0.9, 0.08, 0.08, 0.07)),
     )
     return replace(
         nominal,
-        bodies=tuple(_disturbed(body, _INERTIA_ERROR, rng) for body in nominal.bodies),
+        bodies=tuple(_disturbed(body, 0.2, rng) for body in nominal.bodies),
         gears=gears,
     )
 

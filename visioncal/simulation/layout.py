@@ -20,8 +20,6 @@ from visioncal.simulation.poses import Motion, Viewpoints
 # Centre of the cell, which robots face [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
 CELL = "cell"
-# Time between stops, at an operator's pace [s].
-_PACE_S = 4.0
 # Board names in the session of a cell with two boards.
 _TWO_BOARDS = ("first", "second")
 
@@ -71,8 +69,6 @@ _KEPT = (
     *(RandomStream.MOUNTING, RandomStream.ARM, RandomStream.LENS),
     *(RandomStream.MOUNTINGS, RandomStream.ARMS, RandomStream.LENS_VIEWS),
 )
-# Distinguishes a recording's randomness.
-_RECORDING = 1000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,7 +86,8 @@ class DrawOptions:
         """Generator of one source of randomness; `index` is of the thing or the view."""
         extra = []
         if self.recording and purpose not in _KEPT:
-            extra = [_RECORDING, self.recording]
+            # Distinguishes a recording's randomness.
+            extra = [1000, self.recording]
         return np.random.default_rng([self.seed, int(purpose), *extra, *index])
 
 
@@ -360,6 +357,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
         sheets = [Sheet(target=self.target, scale=self.board_scale, bow_m=self.board_bow_m)]
         sheets += [self.second] if self.second else []
         names = _TWO_BOARDS if self.second else ("",)
+        # At an operator's pace.
         return NetworkOptions(
             robots=(
                 RobotAt("", (0.0, 0.0, 0.0), wrong_stops=self.wrong_views, **self.part(ArmOptions)),
@@ -370,7 +368,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
                 for name, sheet in zip(names, sheets, strict=True)
             ),
             stops=self.views,
-            pace_s=_PACE_S,
+            pace_s=4.0,
             **self.part(DrawOptions),
         )
 

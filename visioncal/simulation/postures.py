@@ -26,17 +26,10 @@ from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
 
 # Smallest dexterity at which a posture is far enough from a singularity.
 LEAST_DEXTERITY = 0.04
-# Offset of a second board on the flange [m].
-_ASIDE_M = 0.10
 # Bounds of the smallest and of the largest distance of a fixed camera [m].
 _NEAR_M, _FAR_M = (0.7, 1.0), (1.0, 1.2)
-# Minimum height of links over the base, or over the table under a board [m].
-_LEAST_HEIGHT_M, _ABOVE_TABLE_M = 0.02, 0.05
-_TRIES_SINGLE, _TRIES = 50, 60
 # Number of tries before another camera or board is chosen.
 _CHANGE = 6
-# Number of stops tried to decide whether a moving board is within reach.
-_STOPS_TRIED = 6
 # Range of a held board's distance from a fixed camera's aim [m].
 _DEPTH_M = 0.15
 
@@ -111,7 +104,7 @@ def mounted_single(options: CellOptions) -> dict[str, FloatArray]:
             leant = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ rotation_z
         else:
             aside = rotation_z @ np.array([1.0, 0.0, 0.0])
-            position = middle + _ASIDE_M * aside
+            position = middle + 0.10 * aside
             lean = np.cross([0.0, 0.0, 1.0], aside)
             leant = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix()
         rotation = leant @ target[:3, :3]
@@ -142,11 +135,12 @@ def postures_single(options: CellOptions, placed: Mapping[str, FloatArray]) -> F
             return cam @ cam_from_target @ invert(target)
 
         # The arm must stay above the table under the board, and above the robot's own.
-        floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + _ABOVE_TABLE_M
+        # The links' least height over the table under a board.
+        floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + 0.05
         views = _viewpoints(options, board)
         home = home_posture(arm, flange(views.mean()[None]), rng)
         kept: list[FloatArray] = []
-        for _ in range(_TRIES_SINGLE):
+        for _ in range(50):
             drawn = views.draw(4 * len(stops), rng)
             if not len(drawn):
                 continue
@@ -266,7 +260,7 @@ class _Aim:
     def home(self, arm: DhArm, rng: np.random.Generator, stops: int) -> FloatArray | None:
         """(n,) a central posture; None if the arm cannot reach it."""
         straight = self.views.mean()[None]
-        for stop in range(min(stops, 1 if self.cell_from_other is None else _STOPS_TRIED)):
+        for stop in range(min(stops, 1 if self.cell_from_other is None else 6)):
             try:
                 return home_posture(arm, self.flanges(np.array([stop]), straight), rng)
             except DataError:
@@ -327,7 +321,7 @@ def _aimed(
     chosen = rng.permutation(np.resize(np.array(reachable, dtype=np.int64), count))
     joints = np.zeros((count, arm.a.size))
     pending = np.ones(count, dtype=bool)
-    for attempt in range(_TRIES if reachable else 0):
+    for attempt in range(60 if reachable else 0):
         if attempt % _CHANGE == _CHANGE - 1:
             # The robot may be unable to reach the other component's pose.
             chosen[pending] = rng.choice(reachable, int(pending.sum()))
@@ -339,7 +333,7 @@ def _aimed(
             stops = stops[: len(views)]
             goals = aim.flanges(stops, views[: len(stops)])
             starts = np.tile(homes[index], (len(stops), 1))
-            moved, good = _reachable(arm, goals, starts, _LEAST_HEIGHT_M)
+            moved, good = _reachable(arm, goals, starts, 0.02)
             joints[stops[good]] = moved[good]
             pending[stops[good]] = False
         if not pending.any():

@@ -57,12 +57,6 @@ EDGE_PX = 2.0
 _LEAST_COSINE = 0.5
 # Corresponding sources of randomness in cells with several robots.
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
-# Minimum number of corners, and smallest cosine of obliqueness, of a recorded frame.
-_FEWEST_OF_CELL, _FACING = 12, 0.5
-# Iterations of a corner's row and its time, which converge by some thousandths each.
-_ROUNDS = 5
-# Minimum number of corners for a pose.
-_FEWEST_CORNERS = 8
 
 
 def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
@@ -425,7 +419,8 @@ class Passage:
         """
         corners, optics = corners_m(sheet), camera.camera
         delays_s = np.zeros(len(corners))
-        for _ in range(_ROUNDS if self.options.readout_s else 1):
+        # They converge by some thousandths each.
+        for _ in range(5 if self.options.readout_s else 1):
             points = apply_each(before(self.path(taken_s + delays_s)), corners)
             px = project(optics, points)
             delays_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
@@ -455,7 +450,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    min_corners = _FEWEST_OF_CELL if is_seen_in_part(board.target) else len(corners_m(board))
+    min_corners = 12 if is_seen_in_part(board.target) else len(corners_m(board))
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
     used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
     first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)
@@ -468,7 +463,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         seen = partial(before, robot.options.jitter(1, rng))
         exact = passage.frame(taken_s, seen, camera, board, first_view + len(sights))
         middle = seen(passage.path([taken_s]))[0]
-        if len(exact.ids) < min_corners or middle[2, 2] < _FACING:
+        if len(exact.ids) < min_corners or middle[2, 2] < 0.5:
             continue
         corners = detected(board, exact, options.pixel_sigma_px, rng)
         ahead_s = swept.camera_minus_robot_s + swept.jitter_s * stamp_noise.standard_normal()
@@ -524,7 +519,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCel
     frames = simulate(options, passage.path(passage.taken_s))
     if how.readout_s:
         frames = _rolling_shutter(frames, passage)
-    seen = [sight.view for sight in frames.sights if len(sight.exact.ids) >= _FEWEST_CORNERS]
+    seen = [sight.view for sight in frames.sights if len(sight.exact.ids) >= 8]
     if len(seen) < 2:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
     taken_s = passage.taken_s[[frames.sights[view].stop for view in seen]]

@@ -31,17 +31,10 @@ from visioncal.simulation.textures import (
     margin_m,
 )
 
-# Distance of knots [rad].
-_KNOT_RAD = 0.01
 # Sub-pixels along a pixel's side.
 _SAMPLES = 3
 # Rows of pixels that are processed at a time, to stay in the processor's cache.
 _BAND_PX = 48
-_BLACK_LEVEL, _FLOOR = 4.0, 118.0
-# Cosine of an angle beyond every lens's field of view: 84 degrees.
-_LEAST_COSINE = 0.1
-# Image shift below the accuracy of corner detection [px].
-_STILL_PX = 0.003
 
 
 @dataclass(frozen=True)
@@ -78,7 +71,7 @@ class Raster:
 
 def trace(camera: Camera, patch: Patch, samples: int = _SAMPLES) -> Raster:
     """Traces rays over a patch, with `samples` sub-pixels along a pixel's side."""
-    knot_px = _KNOT_RAD * float(camera.matrix[0])
+    knot_px = 0.01 * float(camera.matrix[0])
     x, across = _spline(patch.left, patch.right, knot_px, samples)
     y, down = _spline(patch.top, patch.bottom, knot_px, samples)
     px = np.stack(np.meshgrid(x, y), axis=-1)
@@ -201,7 +194,7 @@ def light_on(
         light = np.asarray(
             cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
         )
-    light += np.float32(_BLACK_LEVEL)
+    light += np.float32(4.0)
     return light
 
 
@@ -249,9 +242,9 @@ def _background(
     light = background.astype(np.float32)
     if scene.backdrop.moves:
         # Towards the horizon, the table fades into an even floor.
-        light -= np.float32(_FLOOR)
+        light -= np.float32(118.0)
         light *= raster.between(np.exp(-((distance2 / 8.0) ** 2)))
-        light += np.float32(_FLOOR)
+        light += np.float32(118.0)
     centre = 0.5 * np.array(camera.resolution) - 0.5
     edge = ((raster.px - centre) ** 2).sum(axis=-1) / (centre**2).sum()
     lamp = 0.78 + 0.30 / (1.0 + distance2)
@@ -319,7 +312,7 @@ def _board_patch(camera: Camera, board: Sheet, cam_from_target: FloatArray) -> P
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     width, height = camera.resolution
     # Points that the lens model folds back, or beside or behind the camera, do not bound the sheet.
-    ahead = points_cam[:, 2] > _LEAST_COSINE * np.linalg.norm(points_cam, axis=1)
+    ahead = points_cam[:, 2] > 0.1 * np.linalg.norm(points_cam, axis=1)
     if not ahead.all() or not sees(camera, points_cam, -np.inf).all():
         return Patch(0, 0, width, height)
     px = project(camera, points_cam)
@@ -370,7 +363,8 @@ class LiveView:
         stands for a stationary arm.
         """
         pose = self.cam_from_target(joints[len(joints) // 2, None])[0]
-        if self._rest is None or self._moved_px(self._rest[0], pose) > _STILL_PX:
+        # Below the accuracy of corner detection.
+        if self._rest is None or self._moved_px(self._rest[0], pose) > 0.003:
             shows_board = _faces(self._cell, pose)
             self._rest = (pose, light_on(self._scene, pose, shows_board=shows_board))
         self._count += 1

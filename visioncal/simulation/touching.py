@@ -20,8 +20,6 @@ from visioncal.simulation.cell import SimulatedCell, SimulatedRobot
 from visioncal.simulation.layout import RandomStream
 from visioncal.simulation.postures import LEAST_DEXTERITY, home_posture, lowest_m
 
-# Contact error per axis [m], and largest tilt of the flange from vertical [rad].
-_CONTACT_M, _CONE_RAD = 5e-5, 0.75
 # Points of the drawing, in the fixture's frame [m].
 _DRAWN_M = np.array(
     [
@@ -35,10 +33,6 @@ _DRAWN_M = np.array(
         [0.06, 0.11, 0.02],
     ]
 )
-# Iterations that compensate deflection; each reduces the error by the ratio of deflection.
-_ROUNDS = 6
-_EXACT = 1e-8
-_TRIES = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +134,16 @@ def _touched(
     rng: np.random.Generator,
 ) -> Touched:
     """Touches points in the base (n, 3) with points of the tool (n, 3) [m], at random tilts."""
-    contacts = places + _CONTACT_M * rng.standard_normal(places.shape)
+    contacts = places + 5e-5 * rng.standard_normal(places.shape)
     on_flange = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), contacts[0] - down.apply(on_flange[0]))
     home = home_posture(robot.arm, straight[None], rng)
     joints = np.zeros((len(contacts), robot.arm.a.size))
     pending = np.ones(len(contacts), dtype=bool)
-    for _ in range(_TRIES):
+    for _ in range(40):
         count = int(pending.sum())
-        tilt = _CONE_RAD * np.sqrt(rng.uniform(0.0, 1.0, count))
+        tilt = 0.75 * np.sqrt(rng.uniform(0.0, 1.0, count))
         lean, spin = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.0, 1.0, count)
         axes = np.stack([np.cos(lean), np.sin(lean), np.zeros(count)], axis=1)
         rotations = Rotation.from_rotvec(tilt[:, None] * axes) * down
@@ -176,13 +170,14 @@ def _inverse_with_deflection(
 ) -> tuple[FloatArray, Mask]:
     """(m, n) joints that bring the real arm to (m, 4, 4), and (m,) mask of valid ones."""
     joints, aims = np.tile(home, (len(goals), 1)), goals
-    for _ in range(_ROUNDS):
+    # Each reduces the error by the ratio of deflection.
+    for _ in range(6):
         reach = inverse(robot.true_arm, aims, joints)
         joints = reach.joints
         poses = robot.flange_at(joints)
         aims = goals @ invert(poses) @ aims
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
-    good &= np.abs(poses - goals).max(axis=(1, 2)) < _EXACT
+    good &= np.abs(poses - goals).max(axis=(1, 2)) < 1e-8
     return joints, good & (lowest_m(robot.arm, joints) > 0.0)
 
 

@@ -38,15 +38,8 @@ _DRAWN_PX = 0.5
 _EDGE = cv2.BORDER_REPLICATE
 # White paper around the print, and how much of it is fitted [squares].
 _PAPER, _RIM = 2, 0.25
-# Prior sigma of the relative radial distortion at the image's corner, which some views leave open.
-_BENDING = 0.3
-# Most steps of the fit, and the relative fall of the cost that ends it.
-_STEPS, _SETTLED = 40, 1e-5
 # Fewest corners that are worth a view, as for detected ones.
 _FEWEST = 6
-# Least share of the board's variance that the fit explains. A board shifted by a square, turned or
-# another one explains at most 0.8, as its markers or its rim differ.
-_LEAST_EXPLAINED = 0.9
 # A corner's contrast relative to the model's, its largest shift [squares], and the largest variance
 # of its pixels over the median: elsewhere, something else is in the image.
 _CONTRAST, _MOST_SHIFT, _MOST_VARIANCE = (0.5, 2.0), 0.15, 4.0
@@ -225,19 +218,20 @@ class _Fit:
         if not np.isfinite(cost):
             return values, 0.0
         # In proportion to the noise, as the prior of what some views leave open.
-        weight = np.sqrt(cost / used.sum()) / _BENDING
+        weight = np.sqrt(cost / used.sum()) / 0.3
 
         def residuals(values: FloatArray) -> FloatArray:
             return np.append(self.residuals(values, used), weight * values[8])
 
-        fit = least_squares(residuals, values, x_scale="jac", ftol=_SETTLED, max_nfev=_STEPS)
+        fit = least_squares(residuals, values, x_scale="jac", ftol=1e-5, max_nfev=40)
         explained = float(np.var(self.image[used]) * used.sum())
         return fit.x, 1.0 - float(np.sum(self.residuals(fit.x, used) ** 2)) / explained
 
     def corners(self) -> DenseCorners | None:
         """The corners; None where the board explains too little of the image."""
         values, explained = self.solved()
-        if explained < _LEAST_EXPLAINED:
+        # Another board explains at most 0.8, as its markers or its rim differ.
+        if explained < 0.9:
             return None
         gain, board = self.light @ values[15:18], self.on_board(values)
         blurred = self.blurred(values)

@@ -12,11 +12,10 @@ import numpy as np
 
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError
+from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import READ_AGAIN
 
-# Tolerance of a quaternion's norm, for four digits.
-_NORM_TOLERANCE = 1e-3
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 
 _T = TypeVar("_T")
@@ -103,12 +102,12 @@ class NumberChecks:
         # Beyond, they are taken for another form of rotation.
         is_far = norms.max(initial=0.0, where=np.isfinite(norms)) > 1.5
         other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
-        for row in np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist():
+        for row in np.flatnonzero(np.abs(norms - 1.0) > NORM_TOLERANCE).tolist():
             self.report(
                 row,
                 f"{names[0]} ... {names[-1]}",
                 f"the quaternion's norm is {norms[row]:.6g}, but must be 1 to within "
-                f"{_NORM_TOLERANCE:g}",
+                f"{NORM_TOLERANCE:g}",
                 other if is_far else "",
             )
 

@@ -18,15 +18,6 @@ from visioncal.robot import Robot
 
 # Cells of the image in which coverage is counted.
 _ACROSS, _DOWN = 8, 5
-# Assumed corner noise for the pose of a view [px]; advice needs no better.
-_PIXEL_PX = 0.2
-# Tilt that some views must exceed, to separate the board's distance from the focal length [deg].
-_LEANING_DEG = 20.0
-# Number of views before advice is given on tilt and distance.
-_FIRST = 3
-# Ratio below which the greatest and the least distance count as one.
-_ONE_DISTANCE = 1.25
-_COVERED = 0.8
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2
 
@@ -56,7 +47,8 @@ class Coach:
             return
         try:
             by_view = {corners.view: corners}
-            views = measure_poses(by_view, (self.target,), self.camera, _PIXEL_PX)
+            # Assumed corner noise; advice needs no better.
+            views = measure_poses(by_view, (self.target,), self.camera, 0.2)
         except VisioncalError:
             return
         for view in views:
@@ -83,16 +75,17 @@ class Coach:
         return next(self._advice(), "")
 
     def _advice(self) -> Iterator[str]:
-        if self._views < _FIRST:
+        if self._views < 3:
             yield "another place, with the board large in the image"
             return
         if self._normals:
             tilts = self._tilts
-            if tilts.max() < _LEANING_DEG:
+            # Tilted views separate the board's distance from the focal length.
+            if tilts.max() < 20.0:
                 yield f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
-            if max(self._distances) < _ONE_DISTANCE * min(self._distances):
+            if max(self._distances) < 1.25 * min(self._distances):
                 yield f"another distance: all views are about {self._distances[0]:.2f} m away"
-        if self._covered_cells.mean() < _COVERED:
+        if self._covered_cells.mean() < 0.8:
             yield "bring the board to where it was not yet in the image, near the edges too"
 
 

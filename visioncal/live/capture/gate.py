@@ -17,12 +17,6 @@ from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.path import order_stops
 from visioncal.robot import Robot
 
-# Polling interval of the arm while it moves [s].
-_POLL_S = 0.02
-# Polling interval of camera and disk [s]: a failure is noticed within a second.
-_GLANCE_S = 0.3
-# A motion has failed after this factor times its expected duration plus this [s].
-_DURATION_FACTOR, _DURATION_EXTRA_S = 1.5, 3.0
 # Largest joint error at the end of a motion [rad]; an arm that was stopped nearer to its goal gives
 # as good a view.
 _ARRIVED_RAD = 2e-2
@@ -151,7 +145,7 @@ class Gate:
             self.live.state()
             if not arm.moving():
                 return
-            if elapsed_s > _DURATION_FACTOR * expected_s + _DURATION_EXTRA_S:
+            if elapsed_s > 1.5 * expected_s + 3.0:
                 raise DriverError(
                     f"{arm.name}: still moving after {elapsed_s:.1f} s, where {expected_s:.1f} s "
                     "were expected.",
@@ -159,10 +153,11 @@ class Gate:
                     next_step="Check the speed slider on the pendant, and whether somebody holds "
                     "the arm.",
                 )
-            if clock.now() - last_look > _GLANCE_S:
+            # A failure of camera or disk is noticed within a second.
+            if clock.now() - last_look > 0.3:
                 look()
                 last_look = clock.now()
-            clock.sleep(_POLL_S)
+            clock.sleep(0.02)
 
 
 def check_same_arm(live: LiveCell, robot: Robot, q: FloatArray) -> None:

@@ -38,12 +38,8 @@ from visioncal.vision.targets import load_target, stored_target, target_document
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
 _IMAGES, _TABLE, _TARGET_FILE = "images", "views.csv", "target.toml"
-# Low compression: noise hardly compresses, and speed matters more.
-_PNG_EFFORT = 1
 # Reserve for tables, folders and the disk's own use.
 _SPARE_BYTES = 256_000
-# Length of a digest, which messages shorten.
-_DIGEST = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +267,8 @@ class Journal:
         """
         image = f"{_IMAGES}/{number:03d}.png"
         view = self._facts.view_of(number, image, taken, self._offset_s)
-        _, png = cv2.imencode(".png", taken.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_EFFORT])
+        # Low compression: noise hardly compresses, and speed matters more.
+        _, png = cv2.imencode(".png", taken.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         data = png.tobytes()
         self._check_room(len(data), f"view {number}")
         self._write(image, data)
@@ -326,6 +323,6 @@ class Journal:
 
 
 def _short(value: object) -> str:
-    if isinstance(value, str) and len(value) == _DIGEST:
+    if isinstance(value, str) and len(value) == 64:
         return f"{value[:8]}..."
     return json.dumps(value) if value not in ("", None) else "none"

@@ -9,8 +9,6 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Arm, ArmState
 from visioncal.session import Stream
 
-# Speed from which a joint counts as moving [rad/s].
-_MOVING_RAD_S = 0.005
 # Rest that is kept before and after a motion, for filters to settle [s].
 _LEAD_S = 1.0
 
@@ -74,4 +72,4 @@ def _moves(state: ArmState, name: str) -> bool:
             culprits=[name],
             next_step="See the pendant, and record the motion again from its beginning.",
         )
-    return state.dq is not None and bool(np.abs(state.dq).max() > _MOVING_RAD_S)
+    return state.dq is not None and bool(np.abs(state.dq).max() > 0.005)

@@ -25,15 +25,6 @@ from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 from visioncal.vision.boards.imaging import decode_image
 
-# Typical duration of a stop besides the motion to it [s].
-_STOP_S = 1.5
-# Timeout of a picture while the arm moves, and polling interval of a guided arm [s].
-_FRAME_S, _POLL_S = 0.5, 0.05
-# Largest joint difference at which an arm counts as being at a posture [rad].
-_ARRIVED_RAD = 5e-3
-# Least distance of a new pose from all others [mm], [deg].
-_NEW_MM, _NEW_DEG = 20.0, 5.0
-
 
 @dataclass(frozen=True, eq=False)
 class CaptureEvent:
@@ -228,7 +219,7 @@ def motion_summary(
     first = checked_path(plan, stops[0], here)
     postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
-    duration_s = sum(travel_s(options, *ends) for ends in pairwise(postures)) + _STOP_S * len(stops)
+    duration_s = sum(travel_s(options, *ends) for ends in pairwise(postures)) + 1.5 * len(stops)
     return MotionSummary(stops, first, float(turns.max()), duration_s)
 
 
@@ -261,7 +252,7 @@ def record(
 
     def look() -> None:
         # A failure is reported now, not at the end of a long motion.
-        cell.camera.frame(timeout_s=_FRAME_S)
+        cell.camera.frame(timeout_s=0.5)
         journal.check_room()
 
     with capture.halting():
@@ -283,7 +274,7 @@ def checked_path(plan: PlanFile, stop: Stop, q: FloatArray) -> tuple[FloatArray,
     """
 
     def is_at(posture: FloatArray) -> bool:
-        return q.shape == posture.shape and bool(np.abs(q - posture).max() < _ARRIVED_RAD)
+        return q.shape == posture.shape and bool(np.abs(q - posture).max() < 5e-3)
 
     if is_at(stop.q):
         return (stop.q,)
@@ -307,14 +298,14 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
 
     def is_new(state: ArmState) -> bool:
         apart = (pose_difference(pose, state.base_from_flange) for pose in visited)
-        return all(mm >= _NEW_MM or deg >= _NEW_DEG for mm, deg in apart)
+        return all(mm >= 20.0 or deg >= 5.0 for mm, deg in apart)
 
     with capture.halting():
         try:
             while not count or len(capture.journal.views) < count:
                 first = cell.state()
                 while True:
-                    cell.clock.sleep(_POLL_S)
+                    cell.clock.sleep(0.05)
                     state = cell.state()
                     if why_arm_moves(first, state, still):
                         first = state

@@ -18,18 +18,6 @@ from visioncal.vision.boards import blur_of
 
 # Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02
-# Attempts per view, as frames during which something moved are discarded.
-_ROUNDS = 3
-# Number of tracked points, and their window [px].
-_POINTS, _WINDOW_PX = 80, 21
-# With fewer points the image is featureless, and gives no view anyway.
-_FEWEST = 8
-# With less contrast [grey levels] there is only noise to track.
-_CONTRAST = 20
-# Least share of points that must be found again.
-_FOUND_SHARE = 0.5
-# Greatest difference of grey levels between matching windows.
-_GREY_DIFFERENCE = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +83,8 @@ def take(cell: LiveCell, target: Target, view: int, options: CaptureOptions) -> 
         DriverError: A device fails, or the arm is stopped.
     """
     reason = ""
-    for _ in range(_ROUNDS):
+    # Frames during which something moved are discarded.
+    for _ in range(3):
         rest = _settled(cell, options)
         if isinstance(rest, Missed):
             return rest
@@ -181,16 +170,18 @@ def image_motion_px(first: Image, latest: Image) -> float:
     It is zero without features, and infinite where most points are lost.
     """
     low, high = np.percentile(first[::4, ::4], [1, 99])
-    if high - low < _CONTRAST:
+    # With less contrast there is only noise to track.
+    if high - low < 20:
         return 0.0
-    points = cv2.goodFeaturesToTrack(first, _POINTS, 0.05, _WINDOW_PX)
-    if points is None or len(points) < _FEWEST:
+    points = cv2.goodFeaturesToTrack(first, 80, 0.05, 21)
+    # With fewer points the image is featureless, and gives no view anyway.
+    if points is None or len(points) < 8:
         return 0.0
     moved, status, error = cv2.calcOpticalFlowPyrLK(
-        first, latest, points, np.empty_like(points), winSize=(_WINDOW_PX, _WINDOW_PX)
+        first, latest, points, np.empty_like(points), winSize=(21, 21)
     )
-    matched = (status[:, 0] == 1) & (error[:, 0] < _GREY_DIFFERENCE)
-    if matched.mean() < _FOUND_SHARE:
+    matched = (status[:, 0] == 1) & (error[:, 0] < 25.0)
+    if matched.mean() < 0.5:
         return float("inf")
     shifts: FloatArray = np.asarray((moved - points)[matched, 0], dtype=float)
     return float(np.median(np.linalg.norm(shifts, axis=1)))

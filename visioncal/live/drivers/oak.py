@@ -19,13 +19,9 @@ from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 # The camera that every OAK has: the colour camera, or the only one.
 _SOCKET = "CAM_A"
 
-# The default resolution is the sensor's, divided by a whole number to at most this width [px].
-_WIDTH_PX = 2048
 _RATE_HZ = 10.0
-# Time for automatic exposure and focus before they are held, and timeout of the first picture [s].
-_SETTLE_S, _FIRST_S = 1.5, 5.0
-# Polling interval of waiting callers [s].
-_GLANCE_S = 0.05
+# Time for automatic exposure and focus before they are held [s].
+_SETTLE_S = 1.5
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
 
 
@@ -54,7 +50,7 @@ class OakCamera:
                 sensor = _sensor(opened)
                 self.name = f"{opened.getDeviceName()} {_SOCKET} ({sensor.sensorName})"
                 # The sensor's whole view that USB can carry, in even numbers of pixels.
-                parts = math.ceil(sensor.width / _WIDTH_PX)
+                parts = math.ceil(sensor.width / 2048)
                 whole = sensor.width // parts // 2 * 2, sensor.height // parts // 2 * 2
                 self.resolution = requested.resolution or whole
                 calibration = opened.readCalibrationOrDefault()
@@ -84,7 +80,7 @@ class OakCamera:
         with _worded(self._dai, self.name):
             self._queue.tryGetAll()
         while True:
-            message = self._message(min(timeout_s, _GLANCE_S))
+            message = self._message(min(timeout_s, 0.05))
             if message is None:
                 if waiting.read() > timeout_s:
                     raise DriverError(
@@ -127,7 +123,7 @@ class OakCamera:
         self, dai: ModuleType, requested: DeviceSetup, sensor: Handle, control_queue: Handle
     ) -> dict[str, str | float]:
         """Fixes the settings that the camera determined by itself, and returns them."""
-        frame = self._message(_FIRST_S)
+        frame = self._message(5.0)
         until = time.monotonic() + _SETTLE_S
         while frame is not None and time.monotonic() < until:
             frame = self._message(1.0)

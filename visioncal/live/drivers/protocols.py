@@ -10,9 +10,6 @@ from typing import Literal, Protocol, runtime_checkable
 
 from visioncal.core.types import Camera, FloatArray, Image
 
-# Most time that counts between two readings [s]: waiting callers read more often, and anything
-# longer is a stall of this computer.
-_LONGEST_S = 0.2
 # Whether the arm may move; `reduced` still moves, slowly.
 Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "fault"]
 
@@ -143,6 +140,7 @@ class Stopwatch:
     def read(self) -> float:
         """Time since its start without stalls [s]."""
         now = self._now()
-        self._sum_s += min(now - self._read_s, _LONGEST_S)
+        # Longer is a stall of this computer.
+        self._sum_s += min(now - self._read_s, 0.2)
         self._read_s = now
         return self._sum_s

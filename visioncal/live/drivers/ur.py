@@ -40,15 +40,10 @@ _RATE_HZ = 125.0
 # Timeout of a call [s]; it takes three or four states, 30 ms.
 _CALL_S = 0.9
 _CLOSE_S = 0.9
-# Timeout of a last stop command to a controller that sends no more states [s].
-_LAST_STOP_S = 0.3
 # The controller ends its program, and stops the arm, where this computer is silent for 1 s.
 _LEAST_HZ, _KICK_S = 1.0, 0.1
 # Timeout of the start of an asynchronous motion [s].
 _BEGIN_S = 0.5
-# Deceleration of `halt`: a joint at 1 rad/s stops within a quarter of a second.
-_BRAKE_RAD_S2 = 4.0
-_STILL_RAD_S = 1e-3
 # The client library's limits [rad/s, rad/s^2].
 _SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
@@ -71,17 +66,9 @@ _VARIABLES = (
 # Variables of newer controllers, and the first version, by major version.
 _PAYLOAD = ("payload", "payload_cog")
 _REPORTS_PAYLOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
-# Silence after which a controller, which sends every 8 ms, counts as lost [s].
-_SILENCE_S = 0.8
-_POLL_S = 0.0005
-# Time over which the shortest delay from the controller is taken [s]: clocks drift by less than a
-# millisecond in it.
-_DELAYS_S = 10.0
 T = TypeVar("T")
 # Python exceptions for the C++ ones that the library throws.
 _THROWN = (RuntimeError, ValueError)
-# Polling interval of waiting callers [s].
-_GLANCE_S = 0.05
 
 
 class CallThread:
@@ -111,7 +98,7 @@ class CallThread:
         self._jobs.put(run)
         waiting = Stopwatch()
         try:
-            while not wait([future], _GLANCE_S).done:
+            while not wait([future], 0.05).done:
                 if waiting.read() > limit_s:
                     raise DriverError(
                         f"{self._name} did not {what} within {limit_s:.1f} s.",
@@ -173,7 +160,8 @@ class StateStream:
         if stamp != self._newest:
             self._newest = stamp
             self._silence.restart()
-        return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
+        # It sends every 8 ms.
+        return bool(self.client.isConnected()) and self._silence.read() < 0.8
 
     def check(self) -> None:
         """Checks that states arrive.
@@ -207,12 +195,13 @@ class StateStream:
         before = self.client.getTimestamp()
         while (stamp := float(self.client.getTimestamp())) == before:
             self.check()
-            time.sleep(_POLL_S)
+            time.sleep(0.0005)
         now = time.monotonic()
         self._newest = stamp
         self._silence.restart()
         self._delays.append((now, now - stamp))
-        while self._delays[0][0] < now - _DELAYS_S:
+        # Clocks drift by less than a millisecond in 10 s.
+        while self._delays[0][0] < now - 10.0:
             self._delays.popleft()
         return stamp
 
@@ -368,7 +357,7 @@ class UrArm:
         self._check_open()
         self._states.check()
         if self._moves_before is None:
-            return bool(np.abs(self._states.client.getActualQd()).max() > _STILL_RAD_S)
+            return bool(np.abs(self._states.client.getActualQd()).max() > 1e-3)
         self._check_safety()
         if not self._control.isProgramRunning():
             self._moves_before = None
@@ -394,12 +383,13 @@ class UrArm:
         if self._states.alive:
             with suppress(DriverError):
                 # The call returns when the arm starts to brake.
+                # A joint at 1 rad/s stops within a quarter of a second.
                 self._line.call(
-                    lambda: self._control.stopJ(_BRAKE_RAD_S2, True), limit_s=_CALL_S, what="stop"
+                    lambda: self._control.stopJ(4.0, True), limit_s=_CALL_S, what="stop"
                 )
                 return
         # A controller whose states no longer arrive may still receive commands.
-        with suppress(DriverError), Dashboard(self._host, _LAST_STOP_S) as dashboard:
+        with suppress(DriverError), Dashboard(self._host, 0.3) as dashboard:
             dashboard.ask("stop")
 
     def close(self) -> None:

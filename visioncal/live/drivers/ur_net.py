@@ -27,7 +27,6 @@ _HEADER = struct.Struct(">HB")
 _PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
 # Primary interface: the read-only port is open where the other may not be.
 _PORTS = (30011, 30001)
-_WAIT_S = 1.0
 _PRIMARY_HEADER = struct.Struct(">IB")
 _ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
@@ -36,8 +35,6 @@ _MAX_BYTES = 1 << 20
 _VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)\.\d+")
 # Oldest versions with the floating-point registers that ur-rtde's control script needs.
 _LEAST = {3: (3, 4), 5: (5, 4)}
-# First version that reports whether it is in remote control.
-_REPORTS_REMOTE = (5, 6)
 _RUNNING = "RUNNING"
 # Models that exist in two series, of which the dashboard reports only the size.
 _MODELS_OF_TWO_SERIES = ("UR3", "UR5", "UR10", "UR16")
@@ -210,7 +207,7 @@ def read_tool_offset(host: str) -> list[float]:
     Raises:
         DriverError: The controller cannot be reached, or does not report it.
     """
-    ends_s = time.monotonic() + _WAIT_S
+    ends_s = time.monotonic() + 1.0
     try:
         link = connect(host, _PORTS[0], "the primary interface")
     except DriverError:
@@ -297,9 +294,8 @@ def read_condition(host: str) -> Condition:
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
         query = "safetystatus" if version >= (5, 4, 0) else "safetymode"
         safety = dashboard.ask(query).rpartition(":")[2].strip()
-        remote = (
-            version < _REPORTS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
-        )
+        # Earlier versions do not report it.
+        remote = version < (5, 6) or "true" in dashboard.ask("is in remote control").lower()
     series = "e" if version[0] == 5 and model in _MODELS_OF_TWO_SERIES else ""
     return Condition(host, version, f"{model}{series}", mode, safety, remote)
 

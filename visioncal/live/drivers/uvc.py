@@ -18,21 +18,11 @@ from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 from visioncal.vision.boards.imaging import decode_image
 
-# Timeout of the first picture [s]; of opening a stream, and of a picture of it [ms].
-_OPENING_S, _OPEN_MS, _READ_MS = 5.0, 5000, 1500
 # OpenCV's format of packets as they come, and the code of JPEG files.
 _UNDECODED, _JPEG = -1, cv2.VideoWriter.fourcc(*"MJPG")
-# V4L2's value for manual exposure, and its unit [s].
-_MANUAL_EXPOSURE, _EXPOSURE_UNIT_S = 1.0, 1e-4
-# A driver's timestamp no older than this is taken as one of this host's clock [s].
-_RECENT_S = 10.0
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
 # requested one, and one more for network jitter; and the pictures of which the mean counts.
 _INTERVALS, _PACED = 3.0, 50
-# A picture that comes after less than this share of an interval had waited in a buffer.
-_BURST = 0.3
-# Timeout of the thread's end, and polling interval of waiting callers [s].
-_JOIN_S, _GLANCE_S = 2.0, 0.05
 
 
 class UvcCamera:
@@ -76,7 +66,7 @@ class UvcCamera:
         )
         self._thread.start()
         try:
-            first = self._wait(_OPENING_S)
+            first = self._wait(5.0)
             self._check_resolution(first, requested.resolution, "gives")
         except BaseException:
             self.close()
@@ -104,7 +94,7 @@ class UvcCamera:
         """Ends the thread, which releases the camera; may be called twice."""
         self._is_closing = True
         # One that hangs in a driver ends with the process.
-        self._thread.join(_JOIN_S)
+        self._thread.join(2.0)
 
     def _wait(self, timeout_s: float) -> Frame:
         waiting = Stopwatch()
@@ -115,7 +105,7 @@ class UvcCamera:
                 limit_s = max(timeout_s, _INTERVALS * self._interval_s())
                 if waiting.read() > limit_s:
                     raise self._timeout_error(waiting.read())
-                self._news.wait(_GLANCE_S)
+                self._news.wait(0.05)
             stamp_s, image = self._answer
         return Frame(image, stamp_s - 0.5 * self._exposure_s, self._exposure_s or None)
 
@@ -137,10 +127,11 @@ class UvcCamera:
         reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         before_s = self._arrivals_s[-1] if self._arrivals_s else -math.inf
         # Only V4L2 of Linux reports the kernel's timestamp.
-        if now_s - _RECENT_S < reported_s <= now_s:
+        # So recent a timestamp is one of this host's clock.
+        if now_s - 10.0 < reported_s <= now_s:
             return reported_s, reported_s - self._exposure_s
         # Otherwise it began after the picture before had arrived, unless it waited in a buffer.
-        waited = now_s - before_s < _BURST * self._interval_s()
+        waited = now_s - before_s < 0.3 * self._interval_s()
         return now_s, -math.inf if waited else before_s
 
     def _handle(self, stamp_s: float, began_s: float) -> None:
@@ -230,8 +221,8 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
         )
     if is_url:
         # The default timeout is half a minute, and decoding in n threads delays by n pictures.
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS]
-        limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS, cv2.CAP_PROP_N_THREADS, 1]
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000]
+        limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1500, cv2.CAP_PROP_N_THREADS, 1]
         undecoded = [*limits, cv2.CAP_PROP_FORMAT, _UNDECODED]
         capture = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG, undecoded)
         if capture.isOpened() and int(capture.get(cv2.CAP_PROP_FOURCC)) != _JPEG:
@@ -271,8 +262,9 @@ def _configure(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, s
     if requested.focus is not None:
         capture.set(cv2.CAP_PROP_FOCUS, requested.focus)
     if requested.exposure_us is not None:
-        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
-        capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / _EXPOSURE_UNIT_S))
+        # V4L2's value for manual exposure.
+        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0)
+        capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / 1e-4))
     if requested.gain is not None:
         capture.set(cv2.CAP_PROP_GAIN, requested.gain)
     values = {

@@ -20,15 +20,8 @@ _SHARES = (0.99, 0.97, 0.9, 0.7, 0.5)
 # Views or postures per draw; draws before the next share is tried, and how many where next to none
 # are found: less than this share of the requested number.
 _BATCH, _DRAWS, _FIRST_DRAWS, _NEXT_TO_NONE = 2000, 100, 8, 0.03
-# A lower share is tried only where the guesses' uncertainty rejects this share of the tries, and
-# fewer stops than this share of the requested number were found: few good ones are better.
-_DOUBTED, _ENOUGH = 0.5, 0.2
-# Fewer than this share of the requested number, or than a plan needs, are too few.
-_LEAST_SHARE, _LEAST = 0.1, 12
 # Number of stops from which the range of useful distances is taken.
 _SAMPLE = 100
-# An arm with fewer joints reaches a drawn view only by chance: its postures are drawn instead.
-_FULL_JOINTS = 6
 # A joint cannot pass a range of angles at least this wide [rad] in which no stop has it and this
 # share of postures collides.
 _WIDE_RAD, _BARRED, _TURN = np.pi / 3.0, 0.5, 2.0 * np.pi
@@ -98,7 +91,7 @@ def candidates(
     """
     search = _CandidateSearch(cell, count, seed)
     search.run(progress)
-    if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
+    if len(search.kept) < (least or max(0.1 * count, min(12, count))):
         raise search.error()
     q = _unwind(cell, search.collisions, np.array([posture for posture, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
@@ -124,7 +117,9 @@ class _CandidateSearch:
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""
         narrowed = False
-        in_views = self._cell.robot.joint_count >= _FULL_JOINTS
+        # With fewer joints an arm reaches a drawn view only by chance: its postures are drawn
+        # instead.
+        in_views = self._cell.robot.joint_count >= 6
         draw = self._from_views if in_views else self._from_postures
         for self._least_share in _SHARES:
             for draws in range(_DRAWS):
@@ -139,8 +134,9 @@ class _CandidateSearch:
                     narrowed = True
                 if progress is not None:
                     progress("candidates", min(len(self.kept), self._count), self._count)
-            doubted = self.lost[GUESS] >= _DOUBTED * self.tried[GUESS]
-            if not doubted or len(self.kept) >= _ENOUGH * self._count:
+            # Few good stops are better than many that the guess makes doubtful.
+            doubted = self.lost[GUESS] >= 0.5 * self.tried[GUESS]
+            if not doubted or len(self.kept) >= 0.2 * self._count:
                 break
         del self.kept[self._count :]
 

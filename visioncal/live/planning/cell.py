@@ -26,18 +26,10 @@ from visioncal.vision.targets import (
 
 # Greatest angle between the line of sight and a board's normal [rad].
 _STEEPEST_RAD = 1.4
-# Deviation from a rotation of a matrix that was typed with three digits.
-_ROTATION_TOLERANCE = 1e-3
 # Noise of well-kept arms and cameras, where none is stated [rad, m and px].
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
-# Least sigmas of a calibrated cell, in which somebody may have touched something since [rad and m].
-_TOUCHED_RAD, _TOUCHED_M = 5e-3, 2e-3
 # Thickness of the plate under a board, and its rim around the print [m].
 _PLATE_M, _RIM_M = 0.01, 0.02
-# Radius of the holder of the camera or the board on the flange [m].
-_HOLDER_RADIUS_M = 0.02
-# Standard deviations of the guesses that are added to the clearance.
-_KEEP_OFF_SIGMAS = 2.0
 
 
 Pose: TypeAlias = Annotated[FloatArray, Array((4, 4))]
@@ -186,7 +178,8 @@ class PlanCell:
 
 
 def _check_pose(what: str, pose: FloatArray) -> None:
-    if fault := rigid_fault(np.asarray(pose), _ROTATION_TOLERANCE):
+    # It may be typed with three digits.
+    if fault := rigid_fault(np.asarray(pose), 1e-3):
         raise DataError(
             f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed: {fault}.",
             culprits=[what],
@@ -232,6 +225,7 @@ def cell_of_calibration(
     # Few stops may underestimate the noise by chance.
     noise = replace(noise, robots=np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots))
     budget = calibration.budget
+    # Somebody may have touched something since the calibration.
     return PlanCell(
         calibration.mount,
         arm,
@@ -239,8 +233,8 @@ def cell_of_calibration(
         target,
         x.matrix,
         z.matrix,
-        max(float(sigma_rad), _TOUCHED_RAD),
-        max(float(sigma_m), _TOUCHED_M),
+        max(float(sigma_rad), 5e-3),
+        max(float(sigma_m), 2e-3),
         noise,
         calibration.noise.get("pixel_px", TYPICAL_PX),
         limits,
@@ -258,7 +252,7 @@ def collision_model(cell: PlanCell) -> Collisions:
     in_hand = cell.mount == "eye-in-hand"
     flange = cell.robot.chain.placements[-1]
     held, fixed = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
-    unsure_m = _KEEP_OFF_SIGMAS * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
+    unsure_m = 2.0 * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
     if in_hand:
         carried = camera_body(hand, flange @ held, unsure_m)
         standing = _board(cell.target, 0, fixed, unsure_m)
@@ -268,7 +262,7 @@ def collision_model(cell: PlanCell) -> Collisions:
     middle = carried.link_from_body[:3, 3]
     bodies = [
         *arm_bodies(cell.robot),
-        capsule("holder", hand, flange[:3, 3], middle, _HOLDER_RADIUS_M, unsure_m=unsure_m),
+        capsule("holder", hand, flange[:3, 3], middle, 0.02, unsure_m=unsure_m),
         carried,
         standing,
         *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),

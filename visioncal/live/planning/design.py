@@ -20,8 +20,6 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.live.planning.information import WEAK_SIGMA, World
 
-# Least relative gain of an exchange; there is at most one for each stop.
-_GAIN = 1e-4
 # A sigma above this comes from the weak prior alone: no data determine it [rad or m].
 OPEN_SIGMA = 0.25 * WEAK_SIGMA
 
@@ -205,7 +203,7 @@ def _exchanged(state: _Selection) -> _Selection:
     for _ in state.rows:
         if not state.left:
             break
-        enough = (1.0 - _GAIN) * state.variances[0]
+        enough = (1.0 - 1e-4) * state.variances[0]
         exchanged = state.with_best().without_least()
         if not exchanged.variances[0] < enough:
             exchanged = state.without_least().with_best()

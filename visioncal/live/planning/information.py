@@ -44,8 +44,6 @@ WORLDS = 4
 # A calibration does not use the guesses. This weak prior on the edges only keeps the information
 # invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
-# Least number of corners with which a partly visible ChArUco board is detected.
-_FEWEST_CORNERS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +324,8 @@ def _predicted_corners(
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
     in_part = is_seen_in_part(cell.target)
-    fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
+    # A partly visible ChArUco board is detected by six corners.
+    fewest = min(6, len(positions)) if in_part else len(positions)
     shows = visible.sum(axis=1) >= fewest
     view, corner = np.nonzero(visible[shows])
     counts = visible[shows].sum(axis=1)

@@ -10,16 +10,8 @@ from visioncal.core.types import FloatArray
 from visioncal.live.planning.cell import PlanCell, collision_model
 from visioncal.robot.collision import Collisions
 
-# Least gain of a reversal [rad], and the most passes over a tour.
-_GAIN_RAD, _ROUNDS = 1e-9, 50
-# Nearest stops beside which a postponed stop is tried again.
-_PLACES = 3
-# A tour that reaches no more than this share of the stops is started at another one, this often.
-_MOST, _STARTS = 0.5, 3
 # Draws per search, and the length of one step [rad].
 _DRAWS, _STEP_RAD = 120, 0.7
-# After this many failed searches only straight paths are tried.
-_MOST_FAILED = 60
 # How far a detour may leave the joint box of both postures [rad].
 _ASIDE_RAD = 1.5
 
@@ -77,7 +69,8 @@ class _Detours:
         blocked = self._collisions.path_contact(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
-        detour = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
+        # After so many failures only straight paths are tried.
+        detour = self._rrt_connect(start, end) if self._failed_searches < 60 else None
         if detour is None:
             self._failed_searches += 1
             return blocked
@@ -157,13 +150,14 @@ def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed:
     detours = _Detours(cell, collisions, seed)
     best: _Tour | None = None
     first = int(np.linalg.norm(q - np.median(q, axis=0), axis=1).argmax()) if len(q) else 0
-    for _ in range(1 if start_q is not None else _STARTS):
+    for _ in range(1 if start_q is not None else 3):
         order = _short_order(start_q, q, first)
         tour = _Tour(detours, start_q, q)
         tour.walk(order)
         if best is None or len(tour.order) > len(best.order):
             best = tour
-        if len(best.order) > _MOST * len(q):
+        # A tour that reaches so few stops is started at another one.
+        if len(best.order) > 0.5 * len(q):
             break
         first = next((row for row in order if row not in best.order), first)
     if best is None:
@@ -187,7 +181,7 @@ class _Tour:
         for row in postponed:
             apart = [float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order]
             # After its nearest neighbours, or before them.
-            places = [place + after for place in np.argsort(apart)[:_PLACES] for after in (1, 0)]
+            places = [place + after for place in np.argsort(apart)[:3] for after in (1, 0)]
             any(self._insert(row, int(place)) for place in dict.fromkeys(places))
 
     def route(self, collisions: Collisions) -> Route:
@@ -241,7 +235,7 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
         order.append(min(remaining, key=lambda row: distance[last, row]))
         remaining.remove(order[-1])
     tour = np.array(order)
-    for _ in range(_ROUNDS):
+    for _ in range(50):
         gained = False
         for i in range(1, len(tour) - 1):
             # Reversing i..j changes the segments into i and out of j; there is none out of the end.
@@ -250,7 +244,7 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
             onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
             gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
             j = int(gain.argmax())
-            if gain[j] > _GAIN_RAD:
+            if gain[j] > 1e-9:
                 tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()
                 gained = True
         if not gained:

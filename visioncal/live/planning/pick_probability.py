@@ -22,11 +22,6 @@ from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.information import World
 from visioncal.vision.targets import corner_positions
 
-# Number of candidates that sample the poses at which objects are observed.
-_LOOKS = 40
-# Stops that together add less to the probability are not worth taking.
-_NEARLY = 0.01
-
 
 @dataclass(frozen=True, eq=False)
 class Picking:
@@ -41,7 +36,7 @@ class Picking:
         """Probability that a pick lands within tolerance, calibrated from (m,) candidates."""
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
-        q = self.q[np.linspace(0, len(self.q) - 1, min(_LOOKS, len(self.q))).astype(np.int64)]
+        q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
         chances = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
             noise = np.repeat(cell.noise.robots[0], 3) ** 2
@@ -54,7 +49,8 @@ class Picking:
 
         That is the required one, or nearly that of all of them.
         """
-        share = min(NeedLimits.probability[0], self.chance(rows) - _NEARLY)
+        # Stops that together add less to the probability are not worth taking.
+        share = min(NeedLimits.probability[0], self.chance(rows) - 0.01)
         # The probability rises with each stop: bisection.
         least, most = 0, len(rows)
         while least < most:

@@ -23,8 +23,6 @@ from visioncal.robot import has_ur_axes
 from visioncal.session.columns import POSE, pose_row
 
 _FILE, _SCHEMA = "plan.json", 1
-# Time for vibrations to decay before an image is taken [s].
-_SETTLING_S = 0.5
 
 
 def stops_table(plan: Plan) -> str:
@@ -125,7 +123,7 @@ def program_of(plan: Plan) -> str:
         "def visioncal_plan():",
         f"  speed = {PLAN_SPEED}          # rad/s",
         f"  acceleration = {PLAN_ACCELERATION}   # rad/s^2",
-        f"  settling = {_SETTLING_S}       # s",
+        "  settling = 0.5       # s",
     ]
     for stop in plan.stops:
         words = ["on the way"] * len(stop.via) + [f"view {stop.view}"]

@@ -8,9 +8,6 @@ from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
 from visioncal.present.recording.preview import MotionPreview, Preview, PreviewStop
 
-# Drawn samples per second: sweeps are long, and slow.
-_EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0
-
 
 def preview_of(plan: Plan, name: str) -> Preview:
     """Builds the preview of a plan under a name."""
@@ -65,9 +62,10 @@ def _plan_note(plan: Plan, name: str) -> str:
 def motion_preview(plan: MotionPlan) -> MotionPreview:
     """Builds the preview of a plan of motions."""
     allowed, excitation = plan.allowed, plan.excitation
-    motions = {"excitation": excitation.series.sampled(_EXCITATION_HZ)}
+    # Sweeps are long, and slow.
+    motions = {"excitation": excitation.series.sampled(20.0)}
     if plan.sweeps is not None:
-        motions["sweeps"] = plan.sweeps.sampled(_SWEEPS_HZ)
+        motions["sweeps"] = plan.sweeps.sampled(5.0)
     boxes = [
         Obstacle(body.name, body.link_from_body, body.size_m)
         for body in allowed.bodies

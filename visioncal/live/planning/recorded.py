@@ -27,14 +27,8 @@ from visioncal.live.planning.information import RecordedStops
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import extent_m, first_corners
 
-# Prior sigma of the mounted camera's or board's offset, per axis [m].
-_MOUNTED_M = 0.1
-# Edges with larger sigmas are too uncertain to plan stops [rad and m].
-_TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
 # Lower bound of a robot's noise; few stops may show less by chance [rad and m].
 _LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
-# Newton steps; the problem is nearly linear.
-_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +100,7 @@ def start_from_session(
             start.problem, start.state, start.noise, run.session.mount
         )
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
-    if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
+    if sigmas[0] > 0.5 or sigmas[1] > 0.5:
         raise _too_vague_error(run)
     # Up to the frame of the reported poses, calibrated where possible.
     arm, joints = robot, start.arm.joints_rad
@@ -232,10 +226,12 @@ def _posterior_edges(
 ) -> tuple[FloatArray, FloatArray]:
     """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
     prior = np.full((2, 2, 3), 1e-6)
-    prior[0 if mount == "eye-in-hand" else 1, 1] = _MOUNTED_M**-2.0
+    # The mounted camera or board is within some 0.1 m of the flange.
+    prior[0 if mount == "eye-in-hand" else 1, 1] = 0.1**-2.0
     weights = np.zeros((problem.size, problem.size))
     weights[:12, :12] = np.diag(prior.ravel())
-    for _ in range(_STEPS):
+    # The problem is nearly linear.
+    for _ in range(20):
         information, gradient = normal_equations(problem, state, noise)
         # Twists from the prior to the edges.
         distance, edges = np.zeros(problem.size), state.edges[:2]

@@ -16,23 +16,13 @@ from visioncal.vision.targets import extent_m, outline
 # Range of distances, relative to that at which the print's half diagonal fills the image's half
 # short side.
 _NEAREST, _FARTHEST = 0.75, 1.6
-# Share of a board's short side that tilt leaves, and the margin around it in standard deviations of
-# its position in the image.
-_FORESHORTENED, _MARGIN_SIGMAS = 0.8, 2.0
 # Factor by which draws extend the range of distances found useful.
 _WIDER = 1.05
-# Largest error of the guesses in standard deviations, and the greatest distance relative to that at
-# which the board fills the image.
-_SURELY, _NEVER_BEYOND = 2.2, 6.0
+# Greatest distance relative to that at which the board fills the image.
+_NEVER_BEYOND = 6.0
 # Draws of the uncertain cell, the numbers of them after which hopeless poses are dropped, and the
 # corners and points per side of the print.
 _GUESSES, _CHECKED, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
-# Rays through each side of the image for the distance at which the board fills it.
-_BORDER_RAYS = 9
-# Least half width of the field of view at unit distance.
-_NARROWEST = 1e-4
-# Rays along each side of the image.
-_RAYS = 33
 # A line of sight may end on a box, such as the table under a board: only this share must be free.
 _FREE_SHARE, _TINY = 0.99, 1e-12
 
@@ -43,7 +33,7 @@ class FieldOfView:
     def __init__(self, camera: Camera, edge_px: float) -> None:
         """Takes a camera, and how far from its image's edge points have to stay [px]."""
         self._camera, self._edge_px = camera, edge_px
-        border = _border_tangents(camera, 0.0, _RAYS)
+        border = _border_tangents(camera, 0.0, 33)
         # Beyond these tangents a lens model may fold back into the image.
         self._largest_tangent = float(np.nanmax(np.linalg.norm(border, axis=-1))) * (1.0 + 1e-6)
 
@@ -83,9 +73,9 @@ class BoardViews:
     """
 
     def __init__(self, cell: PlanCell, seed: int) -> None:
-        border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
+        border = _border_tangents(cell.camera, cell.limits.edge_px, 9)
         tangents = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
-        if not len(tangents) or tangents.min() < _NARROWEST:
+        if not len(tangents) or tangents.min() < 1e-4:
             raise DataError(
                 "camera: no ray of this lens reaches the border of its image, or all are parallel: "
                 f"matrix is {cell.camera.matrix.tolist()}, distortion "
@@ -117,7 +107,7 @@ class BoardViews:
         near, far = _NEAREST * full, _NEVER_BEYOND * full
         for d in np.linspace(full, far, 60):
             turned = cell.sigma_rad * np.hypot(d, radius)
-            if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
+            if half * d > radius + 2.2 * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
                 far = max(_FARTHEST * full, 1.15 * float(d))
                 break
         if cell.observed_distances_m is None:
@@ -141,8 +131,8 @@ class BoardViews:
         middle = 0.5 * (np.array(camera.resolution) - 1.0)
         # Least half size of the board in the image, with a margin for uncertainty. A drawn view
         # need not show the board; this only avoids drawing many that cannot.
-        across = _FORESHORTENED * 0.5 * float((self._high - self._low).min())
-        doubt = _MARGIN_SIGMAS * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance, cell.sigma_rad)
+        across = 0.8 * 0.5 * float((self._high - self._low).min())
+        doubt = 2.0 * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance, cell.sigma_rad)
         occupied_px = camera.matrix[:2].mean() * (across / distance + doubt)
         room = np.maximum(middle - limits.edge_px - occupied_px, 0.0)
         aim = middle + rng.uniform(-1.0, 1.0, (count, 2)) * room

@@ -27,14 +27,6 @@ GUESS_M, GUESS_RAD = 0.02, float(np.deg2rad(5.0))
 _ROBOT = "ur5e"
 # Joint offsets that have changed since the factory calibration.
 _WORN = ArmOptions(offset_sigma_rad=3e-4)
-# Depth of the floor below base and board [m].
-_FLOOR_DEPTH_M = 0.1
-# Seed of the guesses, distinct from those of the cell and the controller.
-_GUESSES = 101
-# An OAK's rate [1/s].
-_RATE_HZ = 30.0
-# Moments of an exposure at which the arm's joints are read, start and end included.
-_MOMENTS = 5
 
 
 class SimulatedCamera:
@@ -96,7 +88,7 @@ class SimulatedCamera:
         self._clock.sleep(max(start + exposure_s - requested_at, 0.0))
         middle_s = start + 0.5 * exposure_s
         try:
-            joints = self._true_joints(np.linspace(start, start + exposure_s, _MOMENTS))
+            joints = self._true_joints(np.linspace(start, start + exposure_s, 5))
         except DriverError:
             if self._last is None:
                 raise
@@ -126,7 +118,7 @@ class Bench:
         cell = simulate(options)
         true_arm = replace(cell.robot, true_arm=self._options.true_arm)
         self.truth = replace(cell, robots={"": true_arm})
-        draws = np.random.default_rng([seed, _GUESSES]).standard_normal((2, 2, 3))
+        draws = np.random.default_rng([seed, 101]).standard_normal((2, 2, 3))
         directions = draws / np.linalg.norm(draws, axis=2, keepdims=True)
         errors = exp((directions * np.array([[GUESS_RAD], [GUESS_M]])).reshape(2, 6))
         x, z = self.truth.transforms.values()
@@ -142,7 +134,7 @@ class Bench:
             GUESS_M / per_axis,
             TYPICAL_NOISE,
             TYPICAL_PX,
-            Limits(floor_m=min(0.0, float(z[2, 3])) - _FLOOR_DEPTH_M),
+            Limits(floor_m=min(0.0, float(z[2, 3])) - 0.1),
         )
         self.views: list[tuple[TakenView, TrueState]] = []
 
@@ -162,7 +154,7 @@ class Bench:
             DriverError: It cannot be opened.
         """
         camera = SimulatedCamera(
-            self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=_RATE_HZ
+            self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=30.0
         )
         with closing(UrArm(self.controller.host)) as arm:
             yield LiveCell(arm, camera)

@@ -46,17 +46,9 @@ Fault: TypeAlias = Literal[
 ]
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT = PORTS = 30004, 29999, 30003, 30011
 # Starting takes a second, but much longer on a busy computer [s].
-_START_S, _END_S = 60.0, 5.0
-# Number of past motions that are kept: pictures are requested within a motion or two.
-_MEMORY = 50
-# Deceleration of a stop by the safety system [rad/s^2].
-_STOP_DECELERATION = 20.0
-# Elbow up, the tool pointing down: clear of every singularity.
-_HOME = (0.0, -1.45, 1.75, -1.9, -1.5708, 0.0)
+_START_S = 60.0
 # The payload that is set, and its centre of mass in the flange frame [kg, m].
 _PAYLOAD_KG, _PAYLOAD_M = 0.6, (0.0, 0.0, 0.04)
-# Current and temperature of the joints [A, C].
-_CURRENT_A, _WARM_C = 1.5, 33.0
 
 # The control script of ur-rtde executes commands from registers. The client writes the number of
 # one at a time into the first, its arguments into others; the script answers with 1 ready, 2 done.
@@ -66,8 +58,6 @@ _COMMAND = "input_int_register_0"
 _STATE, _PROGRESS = "output_int_register_0", "output_int_register_2"
 _READY, _DONE, _REGISTERS = 1, 2, 48
 _MOVE_JOINTS, _STOP_JOINTS, _SET_WATCHDOG, _GET_TOOL_OFFSET, _STOP = 1, 34, 35, 40, 255
-# Time between cycles above which this computer has stalled [s].
-_STALL_S = 0.1
 
 _HEADER = struct.Struct(">HB")
 # Types of frames.
@@ -101,7 +91,14 @@ class ControllerOptions:
             dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4
         )
     )
-    q: tuple[float, ...] = _HOME  # Joint angles at the start [rad].
+    q: tuple[float, ...] = (
+        0.0,
+        -1.45,
+        1.75,
+        -1.9,
+        -1.5708,
+        0.0,
+    )  # Joint angles at the start [rad].
     # Tool offset that is set: x, y, z [m] and a rotation vector [rad].
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
     # Sigma of a joint's error relative to its encoder, drawn anew for each motion [rad].
@@ -209,9 +206,10 @@ class _Machine:
     def start(self, motion: Motion, now_s: float) -> None:
         """Starts a motion, replacing one in progress."""
         error = self.options.repeatability_rad * self._rng.standard_normal(len(motion.goal))
-        self._history = (*self._history[-_MEMORY:], (now_s, motion, error))
+        # Pictures are requested within a motion or two.
+        self._history = (*self._history[-50:], (now_s, motion, error))
 
-    def brake(self, now_s: float, deceleration: float = _STOP_DECELERATION) -> None:
+    def brake(self, now_s: float, deceleration: float = 20.0) -> None:
         """Brakes a motion in progress, with a deceleration in [rad/s^2]."""
         if self.moving(now_s):
             q, dq = self.joints(now_s)
@@ -257,10 +255,10 @@ class _Machine:
             "timestamp": [now_s - self.began_s],
             "actual_q": q.tolist(),
             "actual_qd": dq.tolist(),
-            "actual_current": [_CURRENT_A] * 6,
+            "actual_current": [1.5] * 6,
             "actual_TCP_pose": self.tool_pose(now_s).tolist(),
             "external_force_torque": [0.0] * 6,
-            "joint_temperatures": [_WARM_C] * 6,
+            "joint_temperatures": [33.0] * 6,
             "robot_mode": [_MODES[self.mode]],
             "runtime_state": [1 + self.playing],
             "robot_status_bits": [status],
@@ -279,7 +277,8 @@ class _Machine:
     def tick(self, now_s: float) -> None:
         """Executes what is due, once a cycle."""
         registers = self.registers
-        if now_s - self._last_tick_s > _STALL_S:
+        # This computer has stalled.
+        if now_s - self._last_tick_s > 0.1:
             # After a stall of this computer, commands may have arrived that are not read yet.
             self.heard_s = now_s
         self._last_tick_s = now_s
@@ -547,7 +546,7 @@ class SimulatedController:
     def close(self) -> None:
         """Ends it; may be called twice."""
         self._process.terminate()
-        self._process.join(_END_S)
+        self._process.join(5.0)
         self._process.kill()
         self._pipe.close()
 

@@ -11,17 +11,8 @@ from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import Row, send_rows
 
-# Radii of links at the base and at the flange, as shares of the arm's length; about a UR's.
-_BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
-# Radius of joints, as a share of their link's.
-_JOINT_RADIUS = 1.2
 _LINKS: dict[str, Any] = {"colors": colours.LINK, "fill_mode": "solid"}
 _JOINTS: dict[str, Any] = {"colors": colours.JOINT, "fill_mode": "solid"}
-
-# Half width of the floor that is drawn, as a share of the cell's size.
-_FLOOR = 1.3
-# The floor is drawn a little lower, so that a board on it is visible [m].
-_BELOW_M = 0.004
 
 
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
@@ -61,7 +52,8 @@ def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
     origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
     links = np.diff(origins, axis=1)
     lengths_m = np.linalg.norm(links, axis=2)
-    shares = np.linspace(_BASE_RADIUS, _FLANGE_RADIUS, links.shape[1])
+    # Shares of the arm's length; about a UR's.
+    shares = np.linspace(0.03, 0.02, links.shape[1])
     radii_m = lengths_m.sum(axis=1)[:, None] * shares
     capsules = {
         "lengths": lengths_m.ravel(),
@@ -69,7 +61,7 @@ def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
         "translations": origins[:, :-1].reshape(-1, 3),
         "quaternions": _from_z_to(links.reshape(-1, 3)),
     }
-    half_sizes = np.repeat(_JOINT_RADIUS * radii_m[:, :-1].reshape(-1, 1), 3, axis=1)
+    half_sizes = np.repeat(1.2 * radii_m[:, :-1].reshape(-1, 1), 3, axis=1)
     return capsules, {"centers": origins[:, 1:-1].reshape(-1, 3), "half_sizes": half_sizes}
 
 
@@ -97,9 +89,10 @@ def log_obstacles(
     """Draws the boxes, and the floor of a cell of `size_m` at a height in the base, if any [m]."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
     if floor_m is not None:
-        half = _FLOOR * size_m
+        half = 1.3 * size_m
+        # A little lower, so that a board on the floor is visible.
         floor = rr.Boxes3D(
-            centers=[[0.0, 0.0, floor_m - _BELOW_M]],
+            centers=[[0.0, 0.0, floor_m - 0.004]],
             half_sizes=[[half, half, 0.0]],
             colors=colours.GRID,
         )

@@ -9,11 +9,6 @@ from visioncal.present.recording import colours
 from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import corner_positions, extent_m, outline
 
-# Resolution that shows the markers' bits, and the limit for a large board's pattern.
-_SQUARE_PX, _LARGEST_PX = 48, 2000
-# Radius of a rig's points as a share of its extent.
-_DOT = 0.02
-
 
 def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
     """The pattern as a textured sheet in the target's frame; for a rig, its points."""
@@ -21,7 +16,7 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
         return rr.Points3D(
             corner_positions(target),
             colors=colours.DETECTED,
-            radii=_DOT * target.square_m,
+            radii=0.02 * target.square_m,
             labels=list(map(str, target.point_numbers)),
             show_labels=False,
         )
@@ -37,10 +32,9 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
 def picture(target: Target) -> Image:
     """The printed pattern as a grey image, x to the right and y down."""
     low, high = extent_m(target)
-    side_px = _LARGEST_PX * target.square_m / float(np.max(high - low))
-    side_px = max(
-        int(min(_SQUARE_PX if target.columns * target.rows > 1 else 4 * _SQUARE_PX, side_px)), 1
-    )
+    side_px = 2000 * target.square_m / float(np.max(high - low))
+    # Shows the markers' bits; a large board's pattern is smaller.
+    side_px = max(int(min(48 if target.columns * target.rows > 1 else 192, side_px)), 1)
     scale = side_px / target.square_m
     width, height = np.rint(scale * (high - low)).astype(int).tolist()
     page = np.full((height, width), 255, dtype=np.uint8)

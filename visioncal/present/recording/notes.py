@@ -31,8 +31,6 @@ _MARKS = (
         6.0,
     ),
 )
-# End of a plot's scale, as a multiple of the used views' largest residual.
-_ROOM = 1.25
 
 
 def log_static(stream: rr.RecordingStream, calibration: Calibration) -> None:
@@ -82,7 +80,7 @@ def _log_residuals(
     values = {row: getattr(sight, attribute) for row, sight in sights.items()}
     used = [value for row, value in values.items() if value is not None and sights[row].used]
     # Views that were not used must not compress the scale.
-    end, marks = _ROOM * max(used, default=math.inf), defaultdict[str, dict[int, float]](dict)
+    end, marks = 1.25 * max(used, default=math.inf), defaultdict[str, dict[int, float]](dict)
     for row, value in values.items():
         if sights[row].used:
             if value is not None:

@@ -25,10 +25,6 @@ from visioncal.vision.targets import closed_outline, corner_positions
 
 # Width of the way, as a share of the cell's size.
 _LINE = 0.002
-# Largest joint rotation between drawn postures of the path [rad].
-_STEP_RAD = 0.05
-# Points per side of the board, which the lens bends.
-_SIDE_POINTS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +106,7 @@ def _path(preview: Preview) -> tuple[FloatArray, list[int]]:
     path, reached = [[*first.via, first.q][0]], []
     for stop in preview.stops:
         for begin, end in pairwise([path[-1], *stop.via, stop.q]):
-            count = int(np.ceil(np.abs(end - begin).max() / _STEP_RAD))
+            count = int(np.ceil(np.abs(end - begin).max() / 0.05))
             path += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
         reached.append(len(path) - 1)
     return np.array(path), reached
@@ -128,7 +124,8 @@ def _log_static(stream: rr.RecordingStream, preview: Preview) -> None:
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:
     """Draws the image of each stop, on both timelines; `steps` are its steps on the way."""
     outline = closed_outline(preview.target)
-    shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
+    # The lens bends the board's sides.
+    shares = np.linspace(0.0, 1.0, 9)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
     px, rims = [], []
     for flange in preview.base_from_flange:

@@ -27,8 +27,6 @@ _START_BYTES, _CLOSING_BYTES = 12, 12
 _HEAD = struct.Struct("<QQ")
 _COMPRESSION, _UNPACKED_SIZE, _BODY = 2, 3, 5
 _LZ4 = 2
-# LZ4 expands a block to at most this many times its size.
-_LZ4_RATIO = 255
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,8 @@ def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.Reco
         body = fields[_BODY]
         if numbers.get(_COMPRESSION) == _LZ4:
             size = numbers[_UNPACKED_SIZE]
-            if size > _LZ4_RATIO * len(body):
+            # LZ4 expands a block to at most 255 times its size.
+            if size > 255 * len(body):
                 raise ValueError(f"{len(body)} bytes cannot unpack to {size}")
             body = pa.decompress(body, size, codec="lz4_raw")
         reader = pa.ipc.open_stream(body)

@@ -27,7 +27,6 @@ from visioncal.vision.targets import closed_outline
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
 # Lengths of axes relative to the flange's: of other frames, and of tools.
 _AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
-_OTHER_AXES, _TOOL_AXES = 0.7, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,7 @@ class Scene(CellPoses):
                 pose = placed(self.frames.matrices[frame], parent, frame)
                 stream.log(entity, pose, static=True)
             is_tool = frame in self.tools
-            share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
+            share = 0.5 if is_tool else _AXES.get(frame.partition("_")[0], 0.7)
             axes = rr.TransformAxes3D(share * _AXIS * self.size_m, show_frame=True)
             stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
         for flange, name in self.frames.robots.items():

@@ -28,17 +28,6 @@ from visioncal.present.report.plotting import (
 from visioncal.results.arm import ArmResult, ThermalResult
 from visioncal.results.sections import BoardResult
 
-# Gap between cross-validation views and hold-out views, in views; most labelled views.
-_GAP, _MOST_LABELS = 1.5, 25
-# Percentiles at the ends of the colour scale, as few places at the rim would dominate it.
-_LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
-# Smallest value on a logarithmic scale [mm, deg].
-_LEAST = 1e-6
-# Smaller depths are rounding errors.
-_LEAST_DEPTH_MM = 1e-6
-# Half width of the drift's 95 % band in sigmas.
-_BAND = 1.96
-
 _BEFORE, _AFTER = CHECK, ACCENT
 
 
@@ -49,14 +38,14 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
         return None
     views, count = [*arm.left_out, *arm.holdout], len(arm.left_out)
     positions = np.arange(float(len(views)))
-    positions[count:] += _GAP
+    positions[count:] += 1.5
     kinds = [("position [mm]", "nominal_mm", "mm"), ("orientation [deg]", "nominal_deg", "deg")]
     kinds = kinds if all(view.deg is not None for view in views) else kinds[:1]
     figure, grid = panels(
         WIDE_IN, 1.7 * len(kinds) + 0.4, len(kinds), 1, (0.8, 0.45, 0.75, 0.4), sharex=True
     )
     for axes, (label, *names) in zip(grid[:, 0], kinds, strict=True):
-        pairs = np.maximum([[getattr(view, name) for name in names] for view in views], _LEAST)
+        pairs = np.maximum([[getattr(view, name) for name in names] for view in views], 1e-6)
         logarithmic(axes.yaxis)
         axes.set_ylabel(label)
         axes.grid(visible=False, axis="x")
@@ -68,8 +57,8 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
         for value, colour, rise in zip(rms, (_BEFORE, _AFTER), ("bottom", "top"), strict=True):
             beside(axes, value, f"rms {significant(value)}", colour, rise)
         if arm.holdout:
-            axes.axvline(count - 0.5 + 0.5 * _GAP, color=MUTED, linewidth=0.9)
-    step = max(1, -(-len(views) // _MOST_LABELS))
+            axes.axvline(count + 0.25, color=MUTED, linewidth=0.9)
+    step = max(1, -(-len(views) // 25))
     grid[-1, 0].set_xticks(positions[::step], [str(view.view) for view in views][::step])
     grid[-1, 0].set_xlabel("view")
     sets = [("left out in turn", -0.4), ("held back by the session", positions[-1])]
@@ -101,7 +90,8 @@ def workspace(
         return np.stack([np.hypot(places_m[:, 0], places_m[:, 1]), places_m[:, 2]], axis=1)
 
     order, stops = np.argsort(arm.map_sigmas_mm), seen(stops_m)
-    low, high = np.percentile(arm.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
+    # Few places at the rim would dominate the colour scale.
+    low, high = np.percentile(arm.map_sigmas_mm, [1.0, 98.0])
     figure, ((axes,),) = panels(MIDDLE_IN, 0.8 * MIDDLE_IN, 1, 1, (0.6, 0.45, 0.3, 0.06))
     labels = ("base x [m]", "base y [m]")
     labels = labels if side == "top" else ("distance from the base's axis [m]", "base z [m]")
@@ -120,7 +110,8 @@ def course(thermal: ThermalResult) -> tuple[Figure, str]:
     """Drift over time, with its 95 % band."""
     times_h = [hours(thermal, point.stamp_s) for point in thermal.course]
     drift_mm = np.array([point.drift_mm for point in thermal.course])
-    band_mm = _BAND * np.array([point.sigma_mm for point in thermal.course])
+    # A band of 95 %.
+    band_mm = 1.96 * np.array([point.sigma_mm for point in thermal.course])
     figure, ((axes,),) = panels(WIDE_IN, 2.6)
     axes.set(xlabel="time since the start [h]", ylabel="drift of the flange [mm]")
     axes.fill_between(times_h, drift_mm - band_mm, drift_mm + band_mm, color=ACCENT, alpha=0.2,
@@ -134,7 +125,8 @@ def board_shape(board: BoardResult, target: Target, name: str = "") -> tuple[Fig
     """Depth of a board behind its mean plane; None for a flat one."""
     x_mm, y_mm, depth_mm = 1e3 * board.corners(target).T
     reach = float(np.abs(depth_mm).max())
-    if not board.is_bent or reach < _LEAST_DEPTH_MM:
+    # Smaller depths are rounding errors.
+    if not board.is_bent or reach < 1e-6:
         return None
     figure, ((axes,),) = panels(MIDDLE_IN, 0.7 * MIDDLE_IN, 1, 1, (0.6, 0.45, 0.3, 0.06))
     levels = np.linspace(-reach, reach, 14)

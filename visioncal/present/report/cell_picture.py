@@ -22,14 +22,8 @@ _HEIGHT, _BORDER = 340.0, 36.0
 _ELEVATION_RAD = np.deg2rad(25.0)
 # Sides that it may be seen from.
 _SIDES = 72
-# Length of a drawn camera as a share of the arm's reach.
-_FRUSTUM = 0.1
-# Most views that are drawn.
-_MOST_VIEWS = 60
 _HALO = 'style="paint-order:stroke;stroke:var(--page);stroke-width:4"'
 _ROUND = 'style="stroke-linecap:round;stroke-linejoin:round"'
-# Corners of a camera's image in the order of the lines of its pyramid; 0 is its centre.
-_PYRAMID = (0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +53,10 @@ def cell_picture(
     if not frames.robots:
         return Markup("")
     used = [view for view in calibration.views if view.used]
-    used = used[:: max(1, -(-len(used) // _MOST_VIEWS))]
+    used = used[:: max(1, -(-len(used) // 60))]
     arms = [*_arms(cell, used)]
     reach_m = max((float(np.ptp(arm.points, axis=0).max()) for arm in arms), default=1.0)
-    lines = [*arms, *_seen(cell, used, _FRUSTUM * reach_m)]
+    lines = [*arms, *_seen(cell, used, 0.1 * reach_m)]
     if len(lines) == len(arms):
         return Markup("")
     # The first robot's base is upright, which the cell's frame may not be.
@@ -136,7 +130,8 @@ def _seen(cell: CellPoses, views: Sequence[ViewResult], size_m: float) -> Iterat
                 width, height = camera.resolution
                 px = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
                 rays = size_m * px @ np.linalg.inv(matrix_3x3(camera)).T
-                ends = np.vstack([np.zeros(3), rays])[[*_PYRAMID]]
+                # The pyramid in one line; 0 is the camera's centre.
+                ends = np.vstack([np.zeros(3), rays])[[0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2]]
                 yield _Line(frame, "accent", 1.0, apply(pose, ends))
             elif board is not None:
                 yield _Line(frame, "good", 1.0, apply(pose, closed_outline(board)))

@@ -30,12 +30,6 @@ from visioncal.present.report.plotting import (
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
 
-# Number of fitted motions shown: more look alike.
-_MOST_FITTED = 2
-# Relative widths of torque and error panels.
-_SHARES = (2.2, 1.0)
-# Largest number of points per line, and of marks.
-_MOST_POINTS, _MOST_MARKS = 1500, 600
 _COLUMNS = 3
 _CURVE_POINTS = 401
 
@@ -45,7 +39,8 @@ def render_dynamics(run: Run) -> str:
     identified = run.identified
     source = identified.facts.get("session", {})
     shown = [] if run.predicted is None else [(run.predicted, "not fitted")]
-    shown += [(prediction, "fitted") for prediction in run.fitted[:_MOST_FITTED]]
+    # More look alike.
+    shown += [(prediction, "fitted") for prediction in run.fitted[:2]]
     origin = {"session": source.get("name", ""), "sha256": source.get("sha256", "")}
     created = facts.readable_time(str(identified.facts.get("created", "")))
     judged = judge(identified)
@@ -87,7 +82,7 @@ def _key_figures(identified: Identified) -> Iterator[Fact]:
 @drawn
 def torques(prediction: Prediction) -> tuple[Figure, str]:
     """Measured and predicted torques of each joint over time, and their difference."""
-    subset = slice(None, None, max(len(prediction.times_s) // _MOST_POINTS, 1))
+    subset = slice(None, None, max(len(prediction.times_s) // 1500, 1))
     times = (prediction.times_s - prediction.times_s[0])[subset]
     measured, predicted = prediction.measured_nm[subset], prediction.predicted_nm[subset]
     errors = np.where(prediction.used[subset], measured - predicted, np.nan)
@@ -99,7 +94,7 @@ def torques(prediction: Prediction) -> tuple[Figure, str]:
         2,
         (0.8, 0.45, 0.06, 0.3),
         sharex=True,
-        width_ratios=_SHARES,
+        width_ratios=(2.2, 1.0),
     )
     for joint, (axes, error_axes) in enumerate(grid):
         axes.plot(times, measured[:, joint], color=MUTED, linewidth=2.0)
@@ -146,7 +141,7 @@ def _draw_friction(
         for prediction in predictions
     )
     samples = np.concatenate([*shown])
-    samples = samples[:: max(len(samples) // _MOST_MARKS, 1)]
+    samples = samples[:: max(len(samples) // 600, 1)]
     max_speed = max(float(np.abs(samples[:, 0]).max(initial=0.0)), 1e-3)
     # Small steps near standstill, where dry friction changes sign.
     steps = np.linspace(-1.0, 1.0, _CURVE_POINTS)

@@ -20,10 +20,6 @@ from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
 from visioncal.vision.boards.imaging import decode_image
 
-_MAX_REJECTED_PICTURES = 4
-# Grey level in place of a missing image.
-_PAPER = 235
-
 
 @typed
 def write_report(
@@ -153,7 +149,7 @@ def _pictures(
     )
     return {
         "used_pictures": [*filter(None, used)],
-        "rejected_pictures": [*islice(filter(None, rejected), _MAX_REJECTED_PICTURES)],
+        "rejected_pictures": [*islice(filter(None, rejected), 4)],
         "magnify": magnify,
     }
 
@@ -178,7 +174,7 @@ def _picture(
             return None
     elif row.has_corners and session.resolution is not None:
         # Corners of an external detector are drawn on a blank image if theirs is missing.
-        pixels = np.full((*session.resolution[::-1], 3), _PAPER, dtype=np.uint8)
+        pixels = np.full((*session.resolution[::-1], 3), 235, dtype=np.uint8)
     else:
         return None
     return thumbnail(pixels, evidence, caption, view.view, magnify)

@@ -28,12 +28,6 @@ WIDTH, _LEFT, _RIGHT = 900.0, 70.0, 105.0
 _PANEL, _SCALE = 120.0, 92.0
 # Distance of words above each other [px].
 LINE_HEIGHT = 14.0
-# Most steps of a scale, most labels of views, and most dots of a chart.
-_MOST_STEPS, _MOST_LABELS, _MOST_DOTS = 4, 25, 3000
-# Scales ignore the few largest points, which would compress the others.
-_ROOM, _KEPT_PERCENT = 1.3, 95.0
-# Height of a bar chart over its largest used bar.
-_HEADROOM = 1.5
 # Ends of lines, by which one without length is a dot.
 _ROUND = 'style="stroke-linecap:round"'
 _COLOURS = ("accent", "check", "good")
@@ -95,7 +89,7 @@ class Panel:
 
     def draw_scale(self, label: str) -> None:
         """Draws lines at round values, with their figures."""
-        wanted = (self.high - self.low) / _MOST_STEPS
+        wanted = (self.high - self.low) / 4
         decade = 10.0 ** np.floor(np.log10(wanted))
         step = decade * next(step for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= wanted)
         for value in step * np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1):
@@ -159,7 +153,7 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
         drawing.text(_LEFT, top - 8.0, seer, "start")
         # With several cameras, each panel has other views.
         if is_cell or index == len(shown) - 1:
-            step = max(1, -(-len(views) // _MOST_LABELS))
+            step = max(1, -(-len(views) // 25))
             for x, view in [*zip(_places(len(views)), views, strict=True)][::step]:
                 drawing.text(x, top + _SCALE + 16.0, str(view.view))
     height = pitch * len(shown) + 40.0
@@ -178,9 +172,7 @@ def _scale_of(
     """A scale for the used views, which those that were not used do not compress."""
     used = values[[view.used for view in views]]
     shown = used if len(used) else values
-    return Panel(
-        drawing, top, 0.0, _HEADROOM * float(shown[np.isfinite(shown)].max(initial=0.0)) or 1.0
-    )
+    return Panel(drawing, top, 0.0, 1.5 * float(shown[np.isfinite(shown)].max(initial=0.0)) or 1.0)
 
 
 def _draw_views(
@@ -226,7 +218,7 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
             points = [xy for view, xy in chart.points.items() if (view in used) is is_used]
             if points:
                 places = scale * np.vstack(points) + origin
-                path = dots(*places[:: -(-len(places) // _MOST_DOTS)].T)
+                path = dots(*places[:: -(-len(places) // 3000)].T)
                 drawing.path(colour, 2.2 if chart.name == "image" else 5.0, path, _ROUND)
     return drawing.svg("Coverage: corners, viewing directions, rotation axes", side + 20.0)
 
@@ -260,7 +252,8 @@ def residuals_over_joints(
     for index, (values, label) in enumerate(
         ((1e3 * twists[:, 3:], "position [mm]"), (np.rad2deg(twists[:, :3]), "rotation [deg]"))
     ):
-        reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
+        # A few large points would compress the others.
+        reach = 1.3 * float(np.percentile(np.abs(values), 95.0)) or 1.0
         panel = Panel(drawing, index * _PANEL + 24.0, -reach, reach)
         panel.draw_scale(label)
         for colour, column in zip(_COLOURS, np.clip(values, -reach, reach).T, strict=True):

@@ -32,10 +32,6 @@ _VARIABLES = {
 SMALL = 8.0
 # Widths at which the text of a figure matches the page's [inches].
 WIDE_IN, MIDDLE_IN = 9.2, 5.0
-# Resolution of bitmaps in vectors.
-_RASTER_DPI = 144.0
-# Above this number of marks a bitmap is smaller than vectors.
-_MANY_MARKS = 2500
 _STYLE: Any = {
     "svg.fonttype": "none", "font.family": "sans-serif",
     "font.size": 9.0, "axes.titlesize": 9.0, "axes.labelsize": 9.0, "legend.fontsize": SMALL,
@@ -71,7 +67,7 @@ def drawn(
 
 def _svg(figure: Figure, words: str) -> Markup:
     buffer = io.StringIO()
-    figure.set_dpi(_RASTER_DPI)
+    figure.set_dpi(144.0)
     # Identifiers come from content and salt: the same everywhere, and other ones in each figure.
     mpl.rcParams["svg.hashsalt"] = words
     # `Figure.savefig` would draw twice.
@@ -113,7 +109,8 @@ def scattered(axes: Axes, xy: FloatArray, values: FloatArray, **options: Any) ->
 
     Many of them become a bitmap.
     """
-    many = len(xy) > _MANY_MARKS
+    # Above this number of marks a bitmap is smaller than vectors.
+    many = len(xy) > 2500
     return axes.scatter(xy[:, 0], xy[:, 1], c=values, linewidths=0.0, rasterized=many, **options)
 
 

@@ -9,11 +9,6 @@ import numpy as np
 from visioncal.core.types import FloatArray, Image
 from visioncal.results.evidence import ViewEvidence
 
-_WIDTH_PX = 720
-_JPEG_QUALITY, _JPEG_SIDE_PX = 78, 65_500
-# Size of a crop: factor on the corners' extent, plus a share of the image.
-_ROOM, _LEAST_SHARE = 1.25, 0.05
-
 
 @dataclass(frozen=True)
 class Thumbnail:
@@ -74,7 +69,7 @@ def thumbnail(
 def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
     """Left, top, right, bottom of a crop around the corners, with the image's proportions [px]."""
     low, high = px.min(axis=0), px.max(axis=0)
-    share = min(1.0, _ROOM * float(np.max((high - low) / (width, height))) + _LEAST_SHARE)
+    share = min(1.0, 1.25 * float(np.max((high - low) / (width, height))) + 0.05)
     size = np.maximum(np.round(share * np.array([width, height])), 1.0)
     start = np.clip(np.round(0.5 * (low + high - size)), 0.0, (width, height) - size)
     left, top = (int(value) for value in start)
@@ -82,13 +77,13 @@ def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int
 
 
 def _jpeg_uri(image: Image) -> str:
-    encoded = _jpeg(image, min(1.0, _WIDTH_PX / image.shape[1]))
+    encoded = _jpeg(image, min(1.0, 720 / image.shape[1]))
     return "data:image/jpeg;base64," + base64.b64encode(encoded).decode("ascii")
 
 
 def _jpeg(image: Image, scale: float) -> bytes:
     height, width = image.shape[:2]
     # A line scan of one row keeps a row, and a JPEG has no longer side.
-    size = [min(max(round(scale * side), 1), _JPEG_SIDE_PX) for side in (width, height)]
+    size = [min(max(round(scale * side), 1), 65_500) for side in (width, height)]
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 78])[1])

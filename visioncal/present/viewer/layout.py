@@ -18,8 +18,6 @@ from visioncal.session.table import reported_matrices
 if TYPE_CHECKING:
     from visioncal.present.recording.preview import MotionPreview, Preview
 
-# Distance of the eye from the cell's centre, in extents of the cell's content.
-_EYE_DISTANCE = 0.8
 _THINGS = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
 # The overlays of the image would clutter the frustum.
 _PLAIN_IMAGE = (f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}")
@@ -168,6 +166,4 @@ def _eye_on(places: FloatArray) -> rrb.EyeControls3D:
     forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
     # From the robot's front right, above the table.
     direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
-    return rrb.EyeControls3D(
-        position=centre + _EYE_DISTANCE * size_m * direction, look_target=centre
-    )
+    return rrb.EyeControls3D(position=centre + 0.8 * size_m * direction, look_target=centre)

@@ -24,9 +24,7 @@ from visioncal.present.recording import paths
 
 _HOST = "127.0.0.1"
 # Longest wait for the recording to load, and polling interval [s].
-_PATIENCE_S, _AGAIN_S = 60.0, 0.2
-# Longest wait for the viewer to end [s].
-_END_S = 5.0
+_PATIENCE_S = 60.0
 # Nothing listens at the port of the discard service.
 _NOWHERE = "http://127.0.0.1:9"
 _SERVING = re.compile(rf"connect at (http://{re.escape(_HOST)}:\d+\S*)")
@@ -90,7 +88,7 @@ def _seek(process: Popen[str], port: int, row: int) -> None:
             viewer = ViewerClient(f"rerun+http://{_HOST}:{port}/proxy")
             viewer.set_time(paths.TIMELINE, sequence=row, play_state="paused")
         except (OSError, RuntimeError, ValueError):
-            time.sleep(_AGAIN_S)
+            time.sleep(0.2)
         else:
             return
 
@@ -128,7 +126,7 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, number)
             with suppress(subprocess.TimeoutExpired):
-                process.wait(_END_S)
+                process.wait(5.0)
         if process.stdout is not None:
             process.stdout.close()
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.arguments import typed
 from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.transforms import (
     LAST_ROW,
     RIGID,
@@ -29,8 +30,6 @@ from visioncal.session.selecting import ARM, Choice
 # Transforms, or their (4, 4) or (m, 4, 4) matrices.
 Poses: TypeAlias = FloatArray | RigidTransform
 
-# Plausible limits: an arm's reach [m] and a joint's range [rad].
-FAR_M, WIDE_RAD = 20.0, 4 * np.pi
 # Smallest number of joints that reach any position.
 _LEAST_JOINTS = 3
 

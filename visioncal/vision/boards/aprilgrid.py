@@ -28,25 +28,17 @@ from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, read_ma
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import Print
 
-# One tag's four corners suffice. Kalibr's pages have tags with borders of two modules, and gaps of
-# at most a tag's side, usually this share of it.
-_MIN_TAGS, _MOST_SPACING, _MOST_BORDER, _USUAL_SPACING = 1, 1.0, 2, 0.3
+# Kalibr's pages have tags with borders of two modules, and usually gaps of this share of a side.
+_MOST_BORDER, _USUAL_SPACING = 2, 0.3
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
 # where two dark corners meet: it counts as white if dark has to be darker than its surroundings by
 # this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
 # images of little contrast.
 _DARKER, _LITTLE, _ENLARGED = 25.0, 7.0, 2
-# Share of read tags at which no other copy is searched.
-_MANY = 0.5
-# Minimum number of tags to check a homography.
-_LEAST_TAGS = 2
 # Half-widths of the windows of corner refinement, as a share of the gap between tags, and bounds
 # [px].
 _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
 _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
-# Tolerance of the gap between tags [sides]; minimum number of collinear pairs of sides, and largest
-# interquartile range of their gaps.
-_SPACING, _LEAST_SPACINGS, _SCATTER = 0.02, 4, 0.05
 
 
 class AprilGrid(Board):
@@ -64,11 +56,12 @@ class AprilGrid(Board):
 
     def read(self, table: DocumentTable, name: str) -> Target:
         """Reads columns, rows, size_m, square_sigma_m, spacing, dictionary, id and border."""
-        columns, rows = counts_of(table, _MIN_TAGS)
+        columns, rows = counts_of(table, 1)
         size_m = size_of(table, "size_m")
         sigma_m = sigma_of(table, size_m)
         spacing = table.number("spacing", positive=True)
-        if spacing > _MOST_SPACING:
+        # Kalibr's pages have gaps of at most a tag's side.
+        if spacing > 1.0:
             raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3,")
         dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
         markers = dictionary_size(table, dictionary)
@@ -158,7 +151,8 @@ class AprilGrid(Board):
     ) -> DetectedCorners | NotFound:
         """Corners of the tags in a (h, w) grey image, or why there are none."""
         del quick
-        enough = _MANY * target.columns * target.rows
+        # Share of read tags at which no other copy is searched.
+        enough = 0.5 * target.columns * target.rows
         ids, px = _grid_tags(image, target.dictionary, target.border, enough)
         if not len(ids):
             return NotFound(
@@ -185,7 +179,7 @@ class AprilGrid(Board):
             )
         px = _refined_tags(image, px, target.spacing)
         spacing = _measured_spacing(target, numbers, px)
-        if abs(spacing - target.spacing) > _SPACING:
+        if abs(spacing - target.spacing) > 0.02:
             return NotFound(
                 f"the tags are {spacing:.2f} of their side apart, and the target says spacing = "
                 f"{target.spacing:g}",
@@ -258,7 +252,7 @@ def _ordered_tags(
     """
     # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
     rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
-    if own.sum() < _LEAST_TAGS:
+    if own.sum() < 2:
         return rotated[0], 0.0
     places = _tag_corners(target, numbers[own])
     misfits = [layout_misfit(places, array[own]) for array in rotated]
@@ -319,7 +313,7 @@ def _measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> floa
                 lines += [
                     np.concatenate([px[place][side], px[index[neighbour]][side]]) for side in sides
                 ]
-    if len(lines) < _LEAST_SPACINGS:
+    if len(lines) < 4:
         return target.spacing
     a, b, c, d = np.moveaxis(np.array(lines), 1, 0)
     far, near = (
@@ -328,4 +322,4 @@ def _measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> floa
     )
     quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
     # Scattered corners, as in blurred images, are inconclusive.
-    return target.spacing if last - quarter > _SCATTER else float(middle) - 1.0
+    return target.spacing if last - quarter > 0.05 else float(middle) - 1.0

@@ -13,9 +13,9 @@ from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.template import Print, Refined, refine
 
 # Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
-# fewer than these fit, all corners of the detector are used, with a tenth of the weight: their
-# accuracy relative to the template's in the median.
-_FEWEST_FITTED, _LEAST_FITTED, DETECTED_WEIGHT = 6, 0.5, 0.1
+# too few fit, all corners of the detector are used, with a tenth of the weight: their accuracy
+# relative to the template's in the median.
+DETECTED_WEIGHT = 0.1
 
 
 class Board(BoardKind):
@@ -73,7 +73,8 @@ class Board(BoardKind):
     def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
         refined = self.refine(image, target, seen.ids, seen.px)
         fitted = refined.fitted
-        if fitted.sum() < max(min(_FEWEST_FITTED, len(fitted)), _LEAST_FITTED * len(fitted)):
+        # Otherwise all corners of the detector are used.
+        if fitted.sum() < max(min(6, len(fitted)), 0.5 * len(fitted)):
             return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
         return DetectedCorners(
             seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())

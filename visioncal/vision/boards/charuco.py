@@ -44,21 +44,12 @@ _QUICK_PX = 7
 
 # (4, 2) corners [px] by marker id.
 _Markers: TypeAlias = Mapping[int, FloatArray]
-# Smallest marker side over square side.
-_LEAST_MARKER = 0.1
-# Marker side over square side: at least one module of white on every side; squares from which it is
-# whole millimetres [mm]; usual dictionaries.
-_MARKER_SHARE, _COARSE_MM = 0.75, 10
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
-# Printable boards have fewer columns than the last.
-_LEAST_COLUMNS, _MOST_COLUMNS = 3, 40
 # Steps between markers up to this length, and this close to whole squares, are counted [squares].
 _NEAR, _OFF = 2.5, 0.3
 _SHARES, _SHARE_STEPS = (0.25, 0.98), 3
 # A marker's corners around its centre [sides].
 _AROUND = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-# Number of markers in place that prove a board without its corners; number of layouts listed.
-_SURE_MARKERS, _MOST_TIED = 8, 4
 
 
 class Charuco(Board):
@@ -81,7 +72,7 @@ class Charuco(Board):
         sigma_m = sigma_of(table, square_m)
         marker_m = table.number("marker_m", positive=True)
         # OpenCV compares the sides in single precision.
-        low_m = _LEAST_MARKER * square_m
+        low_m = 0.1 * square_m
         if not low_m < marker_m < square_m or np.float32(marker_m) >= np.float32(square_m):
             allowed = f"less than square_m = {square_m!r}, above {low_m:g}, in the same unit,"
             raise table.refuse("marker_m", marker_m, allowed)
@@ -141,8 +132,9 @@ class Charuco(Board):
         marker_mm = request.marker_mm
         if marker_mm is None:
             # Below ten millimetres whole numbers are too coarse; rounded to a nanometre.
-            marker_mm = round(_MARKER_SHARE * square_mm, 6)
-            marker_mm = float(int(marker_mm)) if square_mm >= _COARSE_MM else marker_mm
+            # At least one module of white on every side; whole millimetres where squares are large.
+            marker_mm = round(0.75 * square_mm, 6)
+            marker_mm = float(int(marker_mm)) if square_mm >= 10 else marker_mm
         needed = (request.columns or 0) * (request.rows or 0) // 2
         large = (name for name in _USUAL if len(aruco_dictionary(name).bytesList) >= needed)
         return document | {
@@ -282,14 +274,15 @@ def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
         whole = np.rint(share * steps)
         near = whole.any(axis=2) & (share * lengths < _NEAR)
         near &= (np.abs(share * steps - whole) < _OFF).all(axis=2)
-        for columns, legacy in product(range(_LEAST_COLUMNS, _MOST_COLUMNS + 1), (False, True)):
+        # Printable boards have fewer columns.
+        for columns, legacy in product(range(3, 40 + 1), (False, True)):
             places = _places(ids, columns, legacy=legacy)
             pairs = near & (places - places[:, None] == whole).all(axis=2)
             agreeing[share, columns, legacy] = pairs
     most = max(int(pairs.sum()) for pairs in agreeing.values())
     tied = [layout for layout, pairs in agreeing.items() if pairs.sum() == most]
     boards = []
-    for share, columns, legacy in tied[:_MOST_TIED]:
+    for share, columns, legacy in tied[:4]:
         fits = agreeing[share, columns, legacy].any(axis=1)
         # At most half of the markers may be false positives.
         if fits.sum() >= max(LEAST_MARKERS, len(ids) / 2):
@@ -357,7 +350,8 @@ def _charuco_of(
     board = Target("board", "charuco", columns, rows, 1.0, sigma, share, names[0], legacy)
     seen = CHARUCO.search(image, board)
     found = len(seen.ids) if isinstance(seen, DetectedCorners) else 0
-    if not found and len(markers) < _SURE_MARKERS:
+    # So many markers in place prove a board without its corners.
+    if not found and len(markers) < 8:
         return None
     if isinstance(seen, NotFound):
         notes.insert(0, f"Its corners are not found in this image: {seen.reason}.")

@@ -24,17 +24,12 @@ from visioncal.vision.boards.template import Print
 
 # OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
-# Fewest inner corners a side that it finds; the squares of a small ChArUco board have two.
-_LEAST_SIDE = 3
 # Its searches: a quick one, and two that are tried one after the other.
 _FLAGS = (
     0,
     cv2.CALIB_CB_ACCURACY,
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
 )
-# Minimum gap between dark and light squares as a share of the local contrast, and minimum share of
-# such corners in each row and column, as glare hides some.
-_APART, _CHECKERED = 0.25, 0.5
 
 
 class Checkerboard(Board):
@@ -102,7 +97,8 @@ class Checkerboard(Board):
         twice the size, which takes four times as long.
         """
         height, width = image.shape
-        if min(target.columns, target.rows) < _LEAST_SIDE:
+        # Fewer it does not find; the squares of a small ChArUco board have two.
+        if min(target.columns, target.rows) < 3:
             return NotFound("no board: so few inner corners are not looked for")
         if min(image.shape) < 2 or height + width > _MOST_SIDES or height * width > _MOST_PIXELS:
             return NotFound(
@@ -175,8 +171,9 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
         antidiagonal.min(axis=0) - diagonal.max(axis=0),
         diagonal.min(axis=0) - antidiagonal.max(axis=0),
     )
-    meet = gap > _APART * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
-    return all(bool(np.all(meet.mean(axis=axis) >= _CHECKERED)) for axis in (0, 1))
+    meet = gap > 0.25 * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
+    # Glare hides some.
+    return all(bool(np.all(meet.mean(axis=axis) >= 0.5)) for axis in (0, 1))
 
 
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:

@@ -28,20 +28,12 @@ from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined
 # Largest diameter over spacing of circles, so that their edges remain separate; that of requested
 # ones, as much dark as white between them.
 _WIDEST, _USUAL_DIAMETER = 0.85, 0.5
-# Circles of a larger radius are fitted at half the image size [px].
-_MOST_RADIUS_PX = 20.0
 # Threshold: window as a share of the image's shorter side, and grey levels below its mean. Blobs
 # have a minimum area [px] and fill the ellipse of their moments: squares fill 0.955, circles of few
 # pixels a little less than all of it; the median separates them.
 _SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
-# Minimum width of a blob's inner edge, relative to its outer edge.
-_INNER = 0.5
-# Largest ratio of widths of neighbouring blobs, in any direction.
-_ALIKE = 1.6
-# Number of seed blobs, and of those from which a lattice must grow before fewer than the most are
-# tried, as many blobs around a small board are larger than its circles; tolerance of predicted
-# neighbours in steps; number of nearest blobs that are candidates for the first steps.
-_SEEDS, _GROWN, _MOST_SEEDS, _OFF, _NEAREST = 16, 4, 400, 0.3, 8
+# Tolerance of predicted neighbours in steps.
+_OFF = 0.3
 # Minimum number of blobs.
 _LEAST = 9
 # Transformations between bases of one lattice.
@@ -155,7 +147,8 @@ class CircleGrid(Board):
             scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(
                 places - places.mean(axis=0)
             )
-            if scale * target.diameter_m > 2 * _MOST_RADIUS_PX:
+            # Larger circles are fitted at half the image size.
+            if scale * target.diameter_m > 2 * 20.0:
                 # Half of the size has edges of enough pixels.
                 half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
                 return Refined(2 * half.px + 0.5, 2 * half.sigma_px, 2 * half.blur_px)
@@ -231,7 +224,7 @@ class Blobs:
     def alike(self, first: int, second: int) -> bool:
         """Whether two blobs could be the same shape in a similar view."""
         ratios = np.linalg.eigvals(np.linalg.solve(self.moments[first], self.moments[second])).real
-        return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(_ALIKE))
+        return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(1.6))
 
 
 def find_blobs(image: Image) -> Blobs:
@@ -268,7 +261,7 @@ def find_blobs(image: Image) -> Blobs:
     blobs = blobs.at(np.argsort(-blobs.diameters, kind="stable"))
     pairs = cKDTree(blobs.px).query_pairs(2.0) if len(blobs.px) else set()
     widths = blobs.diameters
-    inner = [max(pair) for pair in pairs if widths[max(pair)] > _INNER * widths[min(pair)]]
+    inner = [max(pair) for pair in pairs if widths[max(pair)] > 0.5 * widths[min(pair)]]
     return blobs.at(np.setdiff1d(np.arange(len(blobs.px)), inner))
 
 
@@ -278,8 +271,9 @@ def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:
     best: dict[tuple[int, int], int] = {}
     lattices = 0
     # Largest first: letters and scratches are smaller than a board's circles.
-    for seed in range(min(_MOST_SEEDS, len(px))):
-        if seed >= _SEEDS and lattices >= _GROWN:
+    for seed in range(min(400, len(px))):
+        # Many blobs around a small board are larger than its circles.
+        if seed >= 16 and lattices >= 4:
             break
         steps = _first_steps(px, tree, seed)
         grown = _grown(blobs, tree, seed, steps) if steps is not None else {}
@@ -290,7 +284,7 @@ def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:
 
 def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
     """Two steps (2, 2) [px] to neighbours of a point that has opposite neighbours as well."""
-    neighbours = tree.query(px[seed], k=min(_NEAREST + 1, len(px)))[1][1:]
+    neighbours = tree.query(px[seed], k=min(8 + 1, len(px)))[1][1:]
     steps: list[FloatArray] = []
     for neighbour in neighbours.tolist():
         step = px[neighbour] - px[seed]

@@ -26,16 +26,9 @@ _COLUMNS = ("point", "x_m", "y_m", "radius_m")
 _RADIUS, _LARGER, _SHIFT, _CELLS = 0.14, 0.22, 0.2, (14, 9)
 # Number of larger dots, and least radius of these over the median.
 _LARGE, _LEAST_RATIO = 4, 1.3
-# Neighbours that a blob is compared with, tolerance of a larger one's ratio to them as a logarithm,
-# and the largest number of blobs that are tried in their places.
-_NEIGHBOURS, _UNLIKE, _TRIED = 6, 0.25, 9
 # Tolerance of predicted dots, as a share of the distance to the next one; rounds of matching; and
 # matched neighbours that predict how the lens shifts a dot.
 _OFF, _ROUNDS, _NEAR = 0.35, 8, 3
-# The same in the last round, in which a wrong dot is as far from its place as any.
-_SURE = 0.12
-# Least share of the dots in the image that are found, and least number.
-_FOUND, _FEWEST = 0.6, 8
 
 
 @dataclass(frozen=True)
@@ -185,17 +178,17 @@ class Dots(PointsKind, Board):
         """
         del quick
         blobs = find_blobs(image)
-        if len(blobs.px) < _FEWEST:
+        if len(blobs.px) < 8:
             return NotFound("no board: no dots are seen")
         places, tree = self.corners(target)[:, :2], cKDTree(blobs.px)
-        around = tree.query(blobs.px, min(_NEIGHBOURS + 1, len(blobs.px)))[1][:, 1:]
+        around = tree.query(blobs.px, min(6 + 1, len(blobs.px)))[1][:, 1:]
         ratios = blobs.diameters / np.median(blobs.diameters[around], axis=1)
         large, radii = _large(target), _radii_m(target)
         unlike = np.abs(np.log(ratios * np.median(radii) / radii[large].mean()))
-        tried = np.argsort(unlike)[:_TRIED]
+        tried = np.argsort(unlike)[:9]
         large_places = _round_about(places[large])
         best, most, predicted = np.zeros((0, 2), int), 0, np.zeros((0, 2))
-        for chosen in combinations(tried[unlike[tried] < _UNLIKE].tolist(), _LARGE):
+        for chosen in combinations(tried[unlike[tried] < 0.25].tolist(), _LARGE):
             px = _round_about(blobs.px[list(chosen)])
             for turn in range(_LARGE):
                 flat = cv2.getPerspectiveTransform(large_places, np.roll(px, turn, axis=0))
@@ -210,9 +203,10 @@ class Dots(PointsKind, Board):
             shifts = blobs.px[best[:, 1]] - predicted[best[:, 0]]
             near = cKDTree(places[best[:, 0]]).query(places, min(_NEAR, len(best)))[1]
             predicted = predicted + shifts[near].reshape(len(places), -1, 2).mean(axis=1)
-            best = _matched(predicted, tree, _SURE if at == _ROUNDS - 1 else _OFF)
+            # In the last round a wrong dot is as far from its place as any.
+            best = _matched(predicted, tree, 0.12 if at == _ROUNDS - 1 else _OFF)
         shown = ((predicted > 0) & (predicted < image.shape[::-1])).all(axis=1).sum()
-        if len(best) < max(_FEWEST, _FOUND * shown):
+        if len(best) < max(8, 0.6 * shown):
             return NotFound(f"no board: no {self.words(target, '')} with its larger ones is seen")
         return DetectedCorners(best[:, 0], blobs.px[best[:, 1]])
 

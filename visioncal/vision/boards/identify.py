@@ -20,11 +20,6 @@ from visioncal.vision.boards.imaging import check_grey, poor_image_reason
 from visioncal.vision.boards.marker import genuine, single_marker
 from visioncal.vision.targets import board_words, target_document
 
-# Wider edges hide the bits of small markers [px].
-_MAX_BLUR_PX = 6.0
-# Images with at least twice these sides are also searched at this size.
-_USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
-
 # What to type for a board that its picture does not identify.
 DESCRIBE_IT = (
     "Where the board is a checkerboard, write board.toml with its own figures for kind = "
@@ -54,14 +49,16 @@ def identify(image: Image) -> Identity:
     if identity is not None:
         return identity
     # In images much larger than the detectors are made for, details hide the board.
-    scale = (_USUAL_PIXELS / image.size) ** 0.5
-    if scale < _MUCH_LARGER:
+    # Images of twice the usual sides are also searched at that size.
+    scale = (2e6 / image.size) ** 0.5
+    if scale < 0.5:
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         identity = _identity(np.asarray(small, np.uint8))
         if identity is not None:
             note = f"It is found only in the picture reduced to {small.shape[1]} pixels in width."
             return replace(identity, notes=(note, *identity.notes))
-    why = poor_image_reason(image, _MAX_BLUR_PX)
+    # Wider edges hide the bits of small markers.
+    why = poor_image_reason(image, 6.0)
     height, width = image.shape
     raise DataError(
         f"No marker is read in this image of {width} x {height} pixels"

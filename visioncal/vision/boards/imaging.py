@@ -16,13 +16,10 @@ from visioncal.core.types import FloatArray, Image, Image16
 
 # Half-widths of the window around a corner in which the edge width is measured [px].
 _REACH_PX = (4, 12)
-# Number of corners measured in an image; their median is stable to some percent.
-_SAMPLE = 12
 # Number of rows scaled at a time.
 _STRIP = 256
 # Minimum contrast that detectors need [grey levels].
 _LEAST_CONTRAST = 12
-_FAINT_QUALITY = 20
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 _SIGNATURES = (b"\x89PNG", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"BM", b"RIFF")
 # Instruction for an image in colour.
@@ -78,7 +75,7 @@ def faint_jpeg(image: Image) -> bytes:
 
     At full size, so that overlaid corners fit: a twentieth of the bytes.
     """
-    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _FAINT_QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 20])[1])
 
 
 def check_grey(image: Image, label: str) -> None:
@@ -165,7 +162,8 @@ def blur_at_corners(image: Image, px: FloatArray) -> float:
     A step edge blurred by a Gaussian of sigma s has a steepest central difference of 2 Phi(1 / s) -
     1 times half the step; solved for s, this holds down to half a pixel.
     """
-    chosen = px[:: max(1, len(px) // _SAMPLE)]
+    # Their median is stable to some percent.
+    chosen = px[:: max(1, len(px) // 12)]
     spacing = np.linalg.norm(np.diff(px, axis=0), axis=1).min(initial=4 * _REACH_PX[1])
     reach = int(np.clip(0.3 * spacing, *_REACH_PX))
     offsets = np.arange(-reach, reach + 1)

@@ -30,8 +30,6 @@ LARGEST_M, _LARGEST_IN_CM = 1.0, 4.0
 _SMALLEST_MM = 0.1
 # Fewer squares do not determine a pose robustly; more do not fit a printable board.
 FEWEST_SQUARES, MOST_SQUARES = 3, 100
-# Quiet zone that detectors need around squares; markers need one module [m].
-_QUIET_M = 0.0025
 # Counts and lengths [mm] in a description of one word.
 COUNTS = "(?P<columns>[0-9]{1,3})x(?P<rows>[0-9]{1,3})"
 MM = r"[0-9]{1,5}(?:\.[0-9]{1,9})?"
@@ -194,7 +192,8 @@ class BoardKind(ABC):
 
     def quiet_m(self, cells: Sequence[Cells]) -> float:
         """Width of the white that it needs around its cells [m]."""
-        return max(grid.cell_m for grid in cells) if self.has_lone_tags else _QUIET_M
+        # Detectors need 2.5 mm around squares; markers need one module.
+        return max(grid.cell_m for grid in cells) if self.has_lone_tags else 0.0025
 
     def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
         """The description of a requested board with sides of `square_mm`."""

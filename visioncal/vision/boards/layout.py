@@ -9,8 +9,6 @@ from visioncal.vision.boards.kind import aruco_dictionary
 # Largest rms distance of markers from a homography, in marker sides. Lens distortion and noise stay
 # under 0.1; another layout moves every second row by more than a side.
 LAYOUT_MISFIT = 0.35
-# Number of markers in a neighbourhood; enough to include the rows above and below.
-_NEIGHBOURS = 9
 
 
 def read_markers(
@@ -48,7 +46,8 @@ def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:
         return board_misfit
     centres = in_image.mean(axis=1)
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    neighbours = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
+    # Enough to include the rows above and below.
+    neighbours = np.argsort(distances, axis=1)[:, :9]
     squares, limit = 0.0, len(neighbours) * LAYOUT_MISFIT**2
     for index in neighbours:
         squares += _off_plane(on_board[index], in_image[index]) ** 2

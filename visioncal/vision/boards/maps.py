@@ -10,15 +10,10 @@ from scipy.spatial import cKDTree
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 
-# Number of neighbours that determine a corner's map, and distance of half weight [squares].
-_AROUND, _NEAR = 25, 1.5
 # Ridge towards a plain homography, which keeps a map determined with few corners.
 _RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
 # Prior sigmas of radial distortion: two coefficients, and the axis relative to the image's centre.
-# Minimum number of corners, largest number of steps, relative change of the cost at convergence,
-# and smallest divisor of the distortion model.
 _RADIAL_SIGMAS = np.array([0.5, 0.5, 0.1, 0.1])
-_RADIAL_CORNERS, _RADIAL_STEPS, _RADIAL_STEADY, _LEAST_RADIAL = 8, 6, 0.01, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +54,11 @@ def maps_about(
     undistorted = None if axis is None else _undistorted(px[good], board[good], axis)
     flatten = undistorted or _homography(px, board)
     origin = flatten(px[chosen])[:, None]
-    distances, neighbours = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
+    distances, neighbours = cKDTree(board).query(board[chosen], min(25, len(px)))
     offsets = flatten(px)[neighbours] - origin
     terms = _terms(offsets)
-    weighted = terms * (good[neighbours] / (1.0 + (distances / _NEAR) ** 2))[..., None]
+    # Half weight at 1.5 squares.
+    weighted = terms * (good[neighbours] / (1.0 + (distances / 1.5) ** 2))[..., None]
     weighted = weighted.transpose(0, 2, 1)
     smoother = np.linalg.solve(weighted @ terms + _RIDGE, weighted)
     coefficients = smoother @ (board[neighbours] - board[chosen, None] - offsets)
@@ -94,7 +90,7 @@ def _undistorted(
     A point o relative to the axis, at distance r, maps to o / (1 + a r^2 + b r^4) (Fitzgibbon
     2001). Each Gauss-Newton step of a, b and the axis is followed by a least-squares homography.
     """
-    if len(px) < _RADIAL_CORNERS:
+    if len(px) < 8:
         return None
 
     def undistort(
@@ -106,9 +102,9 @@ def _undistorted(
         return offsets / divisor, powers, divisor
 
     lens, cost, least, best = np.zeros(4), np.inf, np.inf, None
-    for _ in range(_RADIAL_STEPS):
+    for _ in range(6):
         flat, powers, divisor = undistort(px, lens)
-        if not np.all(divisor > _LEAST_RADIAL):
+        if not np.all(divisor > 0.1):
             break
         homography = np.asarray(cv2.findHomography(flat, board)[0], float)
         if homography.shape != (3, 3):
@@ -118,7 +114,7 @@ def _undistorted(
         previous, cost = cost, float(np.sum(residuals**2))
         if cost < least:
             least, best = cost, (lens, homography)
-        if abs(previous - cost) < _RADIAL_STEADY * previous:
+        if abs(previous - cost) < 0.01 * previous:
             break
         depth = (flat @ homography[2, :2] + homography[2, 2])[:, None]
         ones = np.column_stack([flat, np.ones(len(flat))]) / depth

@@ -28,18 +28,10 @@ from visioncal.vision.boards.kind import (
 from visioncal.vision.boards.layout import read_markers
 from visioncal.vision.boards.template import refine_tags
 
-# Error of OpenCV's corners, due to rounding by blur; they are used where the template is no better
-# [px].
-_DETECTED_SIGMA_PX = 0.2
 # A marker's corners, clockwise from its upper left, in units of its side.
 CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 # Dictionary of Kalibr's pages, which is the usual one of tags.
 APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
-# Number of markers that a note lists.
-_LISTED = 12
-# Minimum correlation with the ideal marker. Strong lens distortion lowers it to 0.55. Codes of
-# sixteen bits occur by chance in other markers' squares, with up to 0.8; longer codes do not.
-_LIKE, _SHORT_LIKE, _SHORT_MODULES = 0.5, 0.83, 6
 
 
 class MarkerKind(BoardKind):
@@ -121,7 +113,8 @@ class MarkerKind(BoardKind):
         corners = px[ids.index(target.marker_id)]
         count = int(aruco_dictionary(target.dictionary).markerSize) + 2
         refined = refine_tags(image, count, corners[None])
-        fitted = refined.sigma_px < _DETECTED_SIGMA_PX
+        # OpenCV's corners err by so much, due to rounding by blur.
+        fitted = refined.sigma_px < 0.2
         weights = None if fitted.all() else np.where(fitted, 1.0, DETECTED_WEIGHT)
         return DetectedCorners(
             np.arange(4), np.where(fitted[:, None], refined.px, corners), weights
@@ -140,8 +133,10 @@ def genuine(markers: Sequence[Marker]) -> list[Marker]:
             np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
             for other in kept
         )
-        short = modules(marker.family) <= _SHORT_MODULES
-        if marker.likeness > (_SHORT_LIKE if short else _LIKE) and apart:
+        short = modules(marker.family) <= 6
+        # Strong lens distortion lowers it to 0.55. Codes of sixteen bits occur by chance in other
+        # markers' squares, with up to 0.8; longer codes do not.
+        if marker.likeness > (0.83 if short else 0.5) and apart:
             kept.append(marker)
     return kept
 
@@ -162,7 +157,7 @@ def single_marker(markers: Sequence[Marker]) -> Identity | None:
     notes = []
     if others:
         notes.append(
-            f"Also seen: {some_of([*map(str, others)], _LISTED)}. A target is one marker, and the "
+            f"Also seen: {some_of([*map(str, others)], 12)}. A target is one marker, and the "
             "largest is taken; where they are a board's, show more of it, or describe it if it is "
             'an AprilGrid (kind = "aprilgrid"); where they lie freely, describe them by a table of '
             'their corners (kind = "points").'

@@ -11,6 +11,7 @@ from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.documents.tables import read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, is_inside
+from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.kind import (
     LEAST_SIGMA_M,
@@ -29,14 +30,6 @@ from visioncal.vision.boards.template import refine_tags
 # Columns of a rig's table; sigma_m is optional, and so are tag and corner together.
 _RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
 _WHOLE_NUMBERS = ("point", "tag", "corner")
-# Largest rig [m], beyond which numbers are in millimetres; minimum points for a pose.
-_LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
-# Ratio of the second to the first singular value below which points are collinear.
-_ON_ONE_LINE = 1e-6
-# Largest deviation of a tag's measured corners from a square, as a share of its side.
-_SQUARE = 0.02
-# Minimum number of complete tags in one plane for a check of the layout.
-_LEAST_TAGS = 2
 
 
 class PointsKind(BoardKind):
@@ -132,7 +125,7 @@ class Rig(PointsKind):
             x_side, y_side = quad[1] - quad[0], quad[3] - quad[0]
             side_m = float(np.linalg.norm(x_side))
             square = np.array([[-x_side[1], x_side[0]], quad[2] - quad[0] - x_side])
-            if np.abs(square - y_side).max() > _SQUARE * side_m:
+            if np.abs(square - y_side).max() > 0.02 * side_m:
                 raise DataError(
                     f"target {target.name}: the corners of tag {number} are no square, clockwise "
                     "from its upper left.",
@@ -197,7 +190,7 @@ class Rig(PointsKind):
         known = tag_corners(target)
         numbers = np.array([known[quad] for quad in quads])
         places = self.corners(target)
-        if len(quads) < _LEAST_TAGS or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
+        if len(quads) < 2 or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
             return None
         return np.asarray(places[numbers, :2])
 
@@ -271,7 +264,7 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
             "Write a finite number there, or delete the row.",
         )
     numbers, places_m = values[0].tolist(), values[1:4].T
-    if len(numbers) < _FEWEST_POINTS:
+    if len(numbers) < 4:
         yield f"has {len(numbers)} points", "Give four points or more, which a camera needs."
     first: dict[float, int] = {}
     for row, number in enumerate(numbers):
@@ -282,16 +275,16 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
                 "Give each point a whole number of its own.",
             )
     spread_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
-    if spread_m[1] <= _ON_ONE_LINE * spread_m[0]:
+    if spread_m[1] <= 1e-6 * spread_m[0]:
         location = "on one line" if spread_m[0] > 0.0 else "in one place"
         yield (
             f"has all points {location}",
             "Give points beside these: no camera tells how they turn.",
         )
     extent_m = float(np.ptp(places_m, axis=0).max())
-    if extent_m > _LARGEST_RIG_M:
+    if extent_m > FAR_M:
         yield (
-            f"reaches over {extent_m:g} m, and a rig over {_LARGEST_RIG_M:g} m at most",
+            f"reaches over {extent_m:g} m, and a rig over {FAR_M:g} m at most",
             "It looks like millimetres: multiply x_m, y_m, z_m and sigma_m by 0.001.",
         )
     for row, sigma_m in enumerate(values[4].tolist() if "sigma_m" in names else ()):

@@ -56,61 +56,29 @@ _Float32Array: TypeAlias = npt.NDArray[np.float32]
 _SMOOTH_PX, _TAPS = 0.7, 5
 _KERNEL = np.asarray(cv2.getGaussianKernel(_TAPS, _SMOOTH_PX))
 _NOISE_LEFT = float(np.sum(_KERNEL**2)) ** 2
-# Half-width of the patch around a corner in squares, and its bounds [px].
-_HALF, _LEAST_PX, _MOST_PX = 0.42, 3.0, 20.0
+# Least half-width of the patch around a corner [px].
+_LEAST_PX = 3.0
 # Minimum number of corners for a homography.
 MIN_CORNERS = 4
 # Margin around the outermost corners [px].
 _RIM_PX = 32
 _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-# Half-width of the patch of a tag's corner [modules], and of the excluded area at the corner itself
-# [edge widths].
-_TAG_HALF, _SLANT = 1.2, 1.5
-# Widths of white around a tag that are tried [modules]. The one of least variance is used, as
-# anything beyond the white leaves residuals.
-_TAG_WHITE = (1.0, 0.7, 0.4)
-# Distance of pixels from a tag's bits and from the surroundings of its white [edge widths]. 1.5
-# biases all corners inwards by 0.02 px, but small tags have no other pixels.
-_TAG_CLEAR = (2.5, 1.5)
-# Side of a lone tag from which its edges have separate directions at the corners: for shorter sides
-# the noise of these exceeds the bending [px].
-_BENT_PX = 115.0
-# Margin around a circle as a share of its radius, and at least [px]; text may be near.
-_AROUND_CIRCLE, _AROUND_PX = 0.35, 4.0
+# Half-width of the excluded area at a tag's corner itself [edge widths].
+_SLANT = 1.5
 # Nodes per axis of the polynomial that interpolates a map over a window. With cubics, a fisheye's
 # slanted circles would err by up to 0.35 px.
 _NODES = 6
-# Limits memory and time for many corners.
-_MOST_PIXELS = 600_000
 # Up to this number of corners, images are processed one at a time: numpy releases the interpreter
 # lock at each of about a thousand operations, and switching threads takes longer than these.
 _FEW, _ONE_IMAGE = 100, Lock()
-# Number of corners that estimate the blur, its start, and its lower bound [px].
-_BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
-# Largest number of iterations for blur and corners. Convergence: change of the blur as a logarithm,
-# and steps of corners for the maps and for the result [px]; a board's next step is a hundredth of
-# that. Lone corners converge slowly or not at all, and depend on the blur.
-_BLUR_ITERATIONS, _MAX_ITERATIONS = 8, 8
-_BLUR_TOLERANCE, _LONE_BLUR_TOLERANCE = 0.03, 0.01
+# Convergence: change of the blur as a logarithm, and steps for the maps and for the result [px].
+_LONE_BLUR_TOLERANCE = 0.01
 _STEP_TOLERANCES_PX, _LONE_STEP_TOLERANCES_PX = (0.1, 0.02), (0.004, 0.004)
-# Largest number of map updates for lone corners, and the change of corners at convergence [px].
-_LONE_MAP_UPDATES, _MAP_TOLERANCE_PX = 4, 0.03
-# Edge width beyond which the next lines matter [squares].
-_WIDE = 0.16
 # Smaller exponents count as minus infinity: single precision would have denormal numbers there,
 # which are a hundred times slower and negligible.
 _MIN_EXPONENT = np.float32(-80.0)
-# Pixels closer to a ChArUco board's marker are excluded [edge widths].
-_CLEAR = 1.5
-# Longest step [squares].
-_MOST_STEP = 0.25
-# Acceptance limits: last step, for maps and result [px]; shift from the detected corner [squares];
-# share of the patch inside the image; share of the median contrast; residuals relative to the
-# contrast, as a factor of their median plus an offset, and absolute: heavy noise and ink reach half
-# of it, anything but a corner twice as much.
+# Last step of an accepted corner, for maps and result [px].
 _LAST_STEP_PX, _LONE_LAST_STEP_PX = (0.1, 0.02), (0.02, 0.02)
-_MOST_SHIFT, _LEAST_INSIDE, _LEAST_CONTRAST = 0.3, 0.6, 0.1
-_MISFIT_TIMES, _MISFIT_MORE, _MOST_MISFIT = 3.0, 0.05, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +109,7 @@ class Print:
     # Margin of a light square around its marker, or of a tag around its bits [squares]; infinite
     # without them.
     inset: float
-    half: float = _HALF  # Half-width of the patch around a corner [squares].
+    half: float = 0.42  # Half-width of the patch around a corner [squares].
     radii: FloatArray | None = None  # (n,) radii of circles [squares]; None without circles.
     # (n, 2) signs of x and y on the dark square of a lone tag's corner; None where two dark squares
     # meet.
@@ -149,7 +117,7 @@ class Print:
     outside: float = np.inf  # Width of the white around a lone tag [squares].
     # Distance of pixels from a marker, or from the surroundings of a lone tag's white [edge
     # widths].
-    clear: float = _CLEAR
+    clear: float = 1.5
     # (n, 2, 2) from the board to each corner's own axes and units; None if these are the board's.
     axes: FloatArray | None = None
 
@@ -202,13 +170,15 @@ class _Windows:
         side_px = np.sqrt(np.abs(np.linalg.det(jacobian)))
         # A circle needs its whole edge.
         radii = None if pattern.radii is None else pattern.radii[chosen]
-        most = _MOST_PX if radii is None else np.inf
+        most = 20.0 if radii is None else np.inf
         half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
         if radii is not None:
-            around_px = np.maximum(_AROUND_CIRCLE * radii * side_px, _AROUND_PX)
+            # Text may be near.
+            around_px = np.maximum(0.35 * radii * side_px, 4.0)
             half = np.minimum(half, radii + around_px / side_px)
         needed_px = float(np.max(half * np.abs(jacobian).sum(axis=2).max(axis=1)))
-        affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
+        # Limits memory and time for many corners.
+        affordable = max(_LEAST_PX, (np.sqrt(600_000 / len(chosen)) - 1.0) / 2.0)
         reach = int(np.ceil(min(most, affordable, needed_px)))
         steps = np.arange(-reach, reach + 1)
         centre = np.rint(start).astype(int)
@@ -343,14 +313,18 @@ def refine_tags(
         inward.prod(axis=1),
         module,
         # Neighbouring corners determine lens distortion; a single tag does not.
-        module * (_TAG_HALF if len(board) > 1 else 1.0),
+        module * (1.2 if len(board) > 1 else 1.0),
         lone=inward,
         axes=np.repeat(unit * sides / lengths, 4, axis=0),
     )
     positions, start = board.reshape(-1, 2) / unit, px.reshape(-1, 2)
     fits: list[Refined] = []
-    for clear in _TAG_CLEAR:
-        for white in _TAG_WHITE:
+    for clear in (2.5, 1.5):
+        # Widths of white around a tag [modules]. The one of least variance is used, as anything
+        # beyond the white leaves residuals. Pixels keep 2.5 edge widths from the tag's bits and its
+        # surroundings; 1.5 biases all corners inwards by 0.02 px, but small tags have no other
+        # pixels.
+        for white in (1.0, 0.7, 0.4):
             printed = replace(pattern, outside=white * module, clear=clear)
             fits.append(refine(image, printed, positions, start))
         best = min(fits, key=lambda fit: (np.sum(~fit.fitted), np.nansum(fit.sigma_px**2)))
@@ -397,7 +371,7 @@ def _refine_corners(
 ) -> Refined:
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
-    sample = indices[:: -(-len(px) // _BLUR_SAMPLE)]
+    sample = indices[:: -(-len(px) // 30)]
     windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
     blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
     if pattern.radii is not None:
@@ -411,7 +385,7 @@ def _refine_corners(
     )
     no_shift = np.zeros_like(px)
     # The edges of a lone corner are on one side of it, so that it depends on the maps' directions.
-    for _ in range(_LONE_MAP_UPDATES if is_lone else 1):
+    for _ in range(4 if is_lone else 1):
         first = _step(windows, pattern, no_shift, blur_px)
         shift, step = _fit_positions(windows, pattern, blur_px, None, first, tolerances_px[0])
         refined_px = windows.shifted(shift)
@@ -419,7 +393,7 @@ def _refine_corners(
         refined_px = np.where(good[:, None], refined_px, px)
         change_px = np.abs(refined_px - windows.px).max()
         windows = _Windows.cut(smooth, board, refined_px, good, indices, pattern, axis)
-        if change_px < _MAP_TOLERANCE_PX:
+        if change_px < 0.03:
             break
     gradients = windows.gradients(step.levels)
     # Glare and shadows have edges: gradients are only used where they reduce a corner's misfit.
@@ -443,9 +417,10 @@ def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float
     """(2,) median edge widths of the smoothed image [px], and the growth of circles' radii."""
     side_px = 1.0 / np.median(windows.widths)
     # A larger start would exclude all white around a lone corner.
-    blur_px = np.full(2, min(_BLUR_START_PX, 0.2 * min(pattern.outside, 1.0) * side_px))
+    blur_px = np.full(2, min(1.5, 0.2 * min(pattern.outside, 1.0) * side_px))
     shift, total = np.zeros((len(windows.px), 2)), 0.0
-    for _ in range(_BLUR_ITERATIONS):
+    # Lone corners converge slowly or not at all, and depend on the blur.
+    for _ in range(8):
         step = _step(windows, pattern, shift, blur_px, blurs=True)
         shift = shift + _limited(step.shift)
         medians = np.array([_median(column) for column in step.blur.T])
@@ -455,10 +430,8 @@ def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float
             least = float(pattern.radii.min())
             grown = float(np.clip(changes[2], -0.5 * least, 0.5 * least))
             pattern, total = replace(pattern, radii=pattern.radii + grown), total + grown
-        blur_px = np.clip(blur_px * np.exp(change), _BLUR_LEAST_PX, 0.5 * side_px)
-        if np.abs(change).max() < (
-            _BLUR_TOLERANCE if pattern.lone is None else _LONE_BLUR_TOLERANCE
-        ):
+        blur_px = np.clip(blur_px * np.exp(change), 0.5, 0.5 * side_px)
+        if np.abs(change).max() < (0.03 if pattern.lone is None else _LONE_BLUR_TOLERANCE):
             break
     # With too few pixels around a lone corner the blur does not converge.
     converged = pattern.lone is None or np.abs(medians).max() < _LONE_BLUR_TOLERANCE
@@ -477,7 +450,7 @@ def _fit_positions(
     shift = np.zeros((len(windows.px), 2))
     moving = np.arange(len(shift))
     latest = step = first
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(8):
         shift[moving] += _limited(step.shift)
         converged = windows.length_px(latest.shift)[moving] < tolerance_px
         moving = moving[~converged]
@@ -491,7 +464,7 @@ def _fit_positions(
 
 def _limited(shift: FloatArray) -> FloatArray:
     length = np.linalg.norm(shift, axis=1, keepdims=True)
-    bounded = shift * np.minimum(1.0, _MOST_STEP / length)
+    bounded = shift * np.minimum(1.0, 0.25 / length)
     return np.where(np.isfinite(length), bounded, 0.0)
 
 
@@ -546,17 +519,14 @@ def _steps(
         product, *derivatives = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
     else:
         # Next lines matter if any corner is blurred enough.
-        wide = bool(max(sx.max(), sy.max()) > _WIDE)
+        wide = bool(max(sx.max(), sy.max()) > 0.16)
         product, *derivatives = _crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
     columns: list[npt.NDArray[np.floating]] = [product, *derivatives]
     if pattern.lone is not None:
         # Gradients apply to white, where the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * array for array in (x, y)]
-        # The corners of a single tag do not determine how lens distortion bends its sides.
-        if (
-            windows.neighbours.shape[1] == MIN_CORNERS
-            and np.median(windows.widths) * _BENT_PX < 1.0
-        ):
+        # A tag under 115 px a side does not determine how lens distortion bends its sides.
+        if windows.neighbours.shape[1] == MIN_CORNERS and np.median(windows.widths) * 115.0 < 1.0:
             columns += [y * derivatives[0], x * derivatives[1]]
     unknowns = len(columns) + 1
     for slopes in lights:
@@ -684,13 +654,14 @@ def _accepted(
     contrast = step.levels[:, 1] * np.sign(_median(step.levels[:, 1]))
     within = np.sum(windows.within, axis=(1, 2))
     inside = np.sum(windows.within & windows.inside, axis=(1, 2))
-    most_misfit = min(_MISFIT_TIMES * _median(step.misfit) + _MISFIT_MORE, _MOST_MISFIT)
+    # Heavy noise and ink reach half of the upper limit, anything but a corner twice as much.
+    most_misfit = min(3.0 * _median(step.misfit) + 0.05, 0.6)
     # Written so that NaN fails.
     return np.asarray(
-        (inside >= _LEAST_INSIDE * within)
-        & (contrast > _LEAST_CONTRAST * _median(contrast))
+        (inside >= 0.6 * within)
+        & (contrast > 0.1 * _median(contrast))
         & (windows.length_px(step.shift) < last_px)
-        & (shift_squares < _MOST_SHIFT)
+        & (shift_squares < 0.3)
         & (step.misfit < most_misfit)
     )
 

@@ -25,7 +25,6 @@ _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
 _FONT = "DejaVu Sans"
 _GREY = "#444444"
-_LINE_PT = 0.5
 # Distance of the ruler's line from the quiet zone; its ticks, label and arrow [mm].
 _BASE_MM, _TICK_MM, _END_TICK_MM, _LABEL_MM = 0.8, 0.8, 2.4, 1.2
 _HEAD_MM, _HALF_HEAD_MM, _TIP_MM, _LETTER_MM = 2.2, 0.6, 4.0, 5.5
@@ -131,7 +130,7 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
         position[across] += side - away
         return position
 
-    half = _LINE_PT / _PT_PER_MM / 2
+    half = 0.5 / _PT_PER_MM / 2
     tip = length + _TIP_MM
     # Lines are filled rectangles, which every renderer positions exactly.
     bars = [_bar(at(-half, -half), at(tip - _HEAD_MM, half))]

@@ -16,8 +16,6 @@ from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import Sheet
 from visioncal.vision.targets import read_target, stored_target, target_document
 
-# Larger pages take gigabytes of memory to draw.
-_MOST_PIXELS = 2.5e8
 _LEAST_DPI = 50.0
 # Names of this length stay below the 255 bytes of file systems in any script.
 _LONGEST_NAME = 60
@@ -78,7 +76,8 @@ def _check_name(name: str, not_in_font: str) -> None:
 
 def _check_dpi(sheet: Sheet, dpi: float) -> None:
     area_inch2 = sheet.page.width_mm * sheet.page.height_mm / 25.4**2
-    most = (_MOST_PIXELS / area_inch2) ** 0.5
+    # Larger pages take gigabytes of memory to draw.
+    most = (2.5e8 / area_inch2) ** 0.5
     if not _LEAST_DPI <= dpi <= most:
         raise DataError(
             f"--dpi is {dpi:g}; {_LEAST_DPI:g} to {most:.0f} are possible on {sheet.page}.",

@@ -27,9 +27,6 @@ _LEAST_MM, _MOST_MM = 20.0, 3000.0
 
 # Margin that office printers leave white.
 EDGE_MM = 5.0
-# Height of the strip that holds a ruler, its ticks and its label.
-RULER_MM = 4.0
-_FULL_RULER_MM, _STEP_MM = 100.0, 10.0
 # Length of a ruler beyond its last tick, for the arrow and its letter.
 ARROW_MM = 8.0
 
@@ -37,10 +34,6 @@ FONT_PT = 7.0
 LINE_MM = 3.1
 # Gap of the text to the quiet zone.
 _GAP_MM = 0.5
-# Width per letter of a line, rounded up.
-_LETTER_MM = 1.3
-# Width of text below a narrow board.
-_TEXT_MM = 170.0
 
 
 @dataclass(frozen=True)
@@ -174,7 +167,8 @@ def _room(target: Target, pattern: Pattern, page: Page) -> _Room:
     left, top, right, bottom = (1e3 * side for side in pattern.box)
     quiet_mm = 1e3 * pattern.quiet_m
     lines = _lines(target, _text_width_mm(right - left, page))
-    above = EDGE_MM + RULER_MM + quiet_mm
+    # 4 mm for a ruler, its ticks and its label.
+    above = EDGE_MM + 4.0 + quiet_mm
     beside = max(EDGE_MM, quiet_mm)
     below = quiet_mm + _GAP_MM + LINE_MM * len(lines) + EDGE_MM
     width, height = above + right - left + beside, above + bottom - top + below
@@ -210,16 +204,16 @@ def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet
 
 def _ruler_mm(room_mm: float) -> float:
     """Length of a ruler that starts at this distance from the paper's edge."""
-    whole = _STEP_MM * ((room_mm - EDGE_MM - ARROW_MM) // _STEP_MM)
-    return min(max(whole, 0.0), _FULL_RULER_MM)
+    whole = 10.0 * ((room_mm - EDGE_MM - ARROW_MM) // 10.0)
+    return min(max(whole, 0.0), 100.0)
 
 
 def _text_width_mm(width_mm: float, page: Page) -> float:
-    return min(max(width_mm, _TEXT_MM), page.width_mm - 2 * EDGE_MM)
+    return min(max(width_mm, 170.0), page.width_mm - 2 * EDGE_MM)
 
 
 def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
-    letters = max(int(width_mm / _LETTER_MM), 10)
+    letters = max(int(width_mm / 1.3), 10)
     return tuple(
         line for text in _sentences(target) for line in textwrap.wrap(text, letters) or [""]
     )
