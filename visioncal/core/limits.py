@@ -114,8 +114,8 @@ class DynamicsLimits:
 
 # No arm reaches this far [m], and no joint turns this far [rad]: the numbers are in other units.
 FAR_M, WIDE_RAD = 20.0, 4 * math.pi
-# Tolerance of rotations: with three written digits a quaternion is within 9e-4 of unit length, and a
-# matrix within 8e-4 of a rotation; larger errors mean a wrong form or order.
+# Tolerance of rotations: with three written digits a quaternion is within 9e-4 of unit length, and
+# a matrix within 8e-4 of a rotation; larger errors mean a wrong form or order.
 NORM_TOLERANCE = 1e-3
 # Fewest views, or stops, that determine a frame: turns about two axes take three of them.
 FEWEST_VIEWS = 3
