@@ -1,16 +1,12 @@
 """The comparison of two checkouts finds a loss of a tenth, and no loss where there is none."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from support.paired import Outcome, Pair, beyond_chance, report
+from support.paired import Outcome, Pair, report
 
 WORLDS, SEEDS = 12, 20
-ROOT = Path(__file__).parents[1]
 
 
 def pairs(rng, spread=0.2, **planted):
@@ -95,22 +91,3 @@ def test_a_cause_that_is_no_longer_named_is_found_where_the_verdict_is_not_asked
     worlds = {item.what for item in report(found)[1] if item.world != "all worlds"}
     assert "good" not in worlds
     assert any(item.what == "cause named" and item.is_worse for item in report(found)[1])
-
-
-def test_nothing_is_beyond_chance_of_nothing():
-    assert beyond_chance([]) == []
-
-
-@pytest.mark.slow
-def test_a_checkout_is_within_chance_of_itself():
-    done = subprocess.run(
-        [sys.executable, "tests/benchmarks/compare.py", ".", ".", "--worlds", "need", "verify",
-         "tcp: touches", "--seeds", "2", "--lanes", "1"],
-        cwd=ROOT, env={"PYTHONPATH": f"{ROOT}:tests", "PATH": ""}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("within chance\n")
-    assert "| need | 2 |" in done.stdout
-    assert "refused" not in done.stdout
-    assert "bug" not in done.stdout

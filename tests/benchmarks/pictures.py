@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from rerun.experimental import ViewerClient
 from results import QUICK
-from support.browser import CHROMIUM, Page, chromium
+from support.browser import CHROMIUM, picture
 from support.commands import visioncal
 from support.fuzz.broken_sessions import BROKEN, broken_session
 
@@ -37,6 +37,8 @@ _FOLDER = Path(__file__).parents[2] / "recordings"
 _PATIENCE_S = 60.0
 # Height of the viewer's own bar, whose notes are about the machine [px].
 _TITLE_PX = 37
+# Of a report, its first figure of the arm and what follows.
+_ARM = "body :not(.arm, .arm *, :has(.arm)), .arm > :has(~ figure):not(figure) { display: none }"
 
 
 def main() -> None:
@@ -57,34 +59,21 @@ def main() -> None:
         visioncal("show", "out", "--certificate", *signed, "-o", "certificate.html")
         card = package.Calibration.load("out")._repr_html_()
         Path("card.html").write_text(f"<meta charset=utf-8>{card}", "utf-8")
-        with chromium(Path("profile")) as page:
-            for name, file, width, height in (
-                ("report", "out/report.html", 1100, 1300),
-                ("report_phone", "out/report.html", 390, 1300),
-                ("certificate", "certificate.html", 800, 1130),
-                ("notebook_card", "card.html", 800, 330),
-                ("arm", "calibrated/report.html", 900, 880),
-            ):
-                _sized(page, width, height, is_phone=width < 500)
-                page.visit(Path(file).absolute().as_uri())
-                if name == "arm":
-                    begin = "document.querySelector('.arm figure').scrollIntoView()"
-                    page.call("Runtime.evaluate", expression=begin)
-                _keep(name, page.picture())
-            for name, folder, row in (
-                () if QUICK else (("demo", "out", 5), ("viewer", "doubted", 6))
-            ):
-                _keep(name, _viewed(Path(folder, "recording.rrd"), row))
-
-
-def _sized(page: Page, width: int, height: int, *, is_phone: bool) -> None:
-    page.call(
-        "Emulation.setDeviceMetricsOverride",
-        width=width,
-        height=height,
-        deviceScaleFactor=1,
-        mobile=is_phone,
-    )
+        arm = Path("calibrated/report.html").read_text("utf-8")
+        Path("arm.html").write_text(
+            arm.replace("</head>", f"<style>{_ARM}</style></head>"), "utf-8"
+        )
+        for name, file, width, height in (
+            ("report", "out/report.html", 1100, 1300),
+            ("report_phone", "out/report.html", 390, 1300),
+            ("certificate", "certificate.html", 800, 1130),
+            ("notebook_card", "card.html", 800, 330),
+            ("arm", "arm.html", 900, 880),
+        ):
+            picture(Path(file), width, height, Path("page.png").absolute())
+            _keep(name, cv2.imread("page.png"))
+        for name, folder, row in () if QUICK else (("demo", "out", 5), ("viewer", "doubted", 6)):
+            _keep(name, _viewed(Path(folder, "recording.rrd"), row))
 
 
 def _viewed(recording: Path, row: int) -> np.ndarray:
@@ -107,13 +96,12 @@ def _viewed(recording: Path, row: int) -> np.ndarray:
     return picture[_TITLE_PX:]
 
 
-def _keep(name: str, picture: np.ndarray) -> None:
+def _keep(name: str, image: np.ndarray) -> None:
     """Writes a picture where the pages have it; a quick run, beside what it was taken of."""
     file = (Path(os.curdir) if QUICK else _FOLDER) / f"{name}.png"
-    cv2.imwrite(str(file), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    print(
-        f"{file.name}: {picture.shape[1]} x {picture.shape[0]}, {file.stat().st_size / 1e3:.0f} kB"
-    )
+    cv2.imwrite(str(file), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    height, width = image.shape[:2]
+    print(f"{file.name}: {width} x {height}, {file.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Transforms, quantiles, and figures as messages and pages state them."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -95,13 +93,6 @@ def test_limits_are_the_distributions_upper_quantiles(chance):
 @pytest.mark.parametrize("value", [-3.0, 0.0, 0.7, 20.0])
 def test_chance_counts_both_sides(value):
     assert t_chance(value, 4) == pytest.approx(2 * t.sf(abs(value), 4), rel=1e-9)
-
-
-def test_nothing_loads_the_slow_way_to_them():
-    code = "import sys, visioncal.calibration.pipeline, visioncal.frames;"
-    code += "print('scipy.stats' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert done.stdout.strip() == "False"
 
 
 PAGE = Path(visioncal.__file__).parent / "calibration" / "README.md"

@@ -236,9 +236,8 @@ def test_it_prints_on_one_page(tmp_path):
         sample.session,
         {"operator": "A. Smith", "serial number, camera": "1"},
     )
-    with browser.chromium(tmp_path / "profile") as chromium:
-        chromium.visit(page.as_uri())
-        (printed,) = pypdfium2.PdfDocument(chromium.printed())
+    browser.printed(page, tmp_path / "page.pdf")
+    (printed,) = pypdfium2.PdfDocument((tmp_path / "page.pdf").read_bytes())
     # A4, in points of 1/72 inch; a browser rounds to a pixel of 3/4 point.
     assert printed.get_size() == pytest.approx((595.3, 841.9), abs=1.0)
     words = printed.get_textpage().get_text_range()
