@@ -1,6 +1,5 @@
 """The whole way: a folder goes in, a result with its verdict comes out, or one clear message."""
 
-import csv
 import json
 import shutil
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from support.cells import exact
+from support.edited import rewritten
 from support.refusals import raised
 
 import visioncal
@@ -23,16 +23,6 @@ from visioncal.simulation import CellOptions, read_truth, simulate, write_sessio
 @pytest.fixture(scope="module")
 def result(done) -> Calibration:
     return done[0].calibration
-
-
-def with_rows(folder, change):
-    """Rewrites views.csv through a function of its rows, each a dictionary of texts."""
-    path = folder / "views.csv"
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    rows = [change(at, dict(row)) for at, row in enumerate(rows)]
-    lines = [list(rows[0]), *(list(row.values()) for row in rows)]
-    path.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
 
 
 def away_mm(one: Calibration, other: Calibration) -> float:
@@ -104,13 +94,13 @@ def test_a_pose_whose_forms_contradict_each_other_is_refused_and_a_rounded_one_i
 
 
 def test_joints_stand_in_for_poses(session_copy, result):
-    with_rows(session_copy, lambda _, row: {k: v for k, v in row.items() if k not in POSE})
+    rewritten(session_copy, lambda _, row: {k: v for k, v in row.items() if k not in POSE})
     # The model's poses and the reported ones agree to rounding.
     assert away_mm(visioncal.calibrate(session_copy), result) < 1e-6
 
 
 def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):
-    with_rows(session_copy, lambda at, row: row | {"role": "holdout" if at == 3 else ""})
+    rewritten(session_copy, lambda at, row: row | {"role": "holdout" if at == 3 else ""})
     whole = visioncal.calibrate(session_copy)
     assert not whole.views[3].used
     assert "holdout" in whole.views[3].reason
@@ -119,7 +109,7 @@ def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):
     def spoil(at, row):
         return row | {"x_m": repr(float(row["x_m"]) + 0.05 * (at == 3))}
 
-    with_rows(session_copy, spoil)
+    rewritten(session_copy, spoil)
     spoilt = visioncal.calibrate(session_copy)
     assert same(spoilt, whole)
     # The spoilt pose is off by 50 mm, and shows as such.
@@ -135,7 +125,7 @@ def test_images_and_measured_poses_in_one_session(session_copy, done, result):
         cells = {f"cft_{name}": repr(value) if at < 3 else "" for name, value in told.items()}
         return row | cells | {"image": "" if at < 3 else row["image"]}
 
-    with_rows(session_copy, measured)
+    rewritten(session_copy, measured)
     mixed = visioncal.calibrate(session_copy)
     assert all(view.used for view in mixed.views)
     assert away_mm(mixed, result) < 4 * result.edges["flange_from_cam"].sigma_mm

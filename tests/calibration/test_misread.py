@@ -1,13 +1,11 @@
 """Poses, joints and rows that are misread: named, and sound ones left alone; `convert --guess`."""
 
-import csv
 import json
 import shlex
 import tracemalloc
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial, reduce
+from functools import lru_cache, partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -18,30 +16,25 @@ from scipy.spatial.transform import Rotation
 from support.advice import printed_commands
 from support.cells import known_of, pairs_session, session_of
 from support.commands import visioncal as typed
-from support.foreign_samples import easy_handeye_file
+from support.edited import rewritten
 from support.fuzz.mistakes import (
     HALF_TURNS,
     MISTAKES,
-    OTHER,
     Poses,
     numbers,
     sound,
 )
-from support.marks import slow
 from support.refusals import raised
-from typer.testing import CliRunner
 
 import visioncal
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.guess.readings import changes
-from visioncal.calibration.pipeline.guess_inputs import chain_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.reported_poses import reported_poses
-from visioncal.cli.app import app
 from visioncal.core.conventions import Reading
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.transforms import compose, exp, invert
@@ -56,23 +49,19 @@ from visioncal.interchange.formats import (
 )
 from visioncal.results import Calibration
 from visioncal.robot import (
-    Robot,
     load_robot,
     read_robot_document,
     with_base,
 )
 from visioncal.session import Session, View
-from visioncal.session.columns import POSE
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     CellOptions,
     SimulatedCell,
     fine_camera,
-    project,
     simulate,
-    wide_camera,
     write_session,
 )
-from visioncal.vision.targets import corner_positions, load_target
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The generation before each arm.
@@ -102,36 +91,24 @@ class Identifiability:
         views = []
         for at, row in enumerate(self.joints):
             numbers = {f"q{joint + 1}_rad": float(value) for joint, value in enumerate(row)}
-            if self.poses is not None:
-                turn = Rotation.from_matrix(self.poses[at, :3, :3]).as_quat()
-                numbers |= dict(zip(POSE, [*self.poses[at, :3, 3], *turn], strict=True))
+            numbers |= {} if self.poses is None else pose_row(self.poses[at])
             views.append(View(at, image=f"{at}.png", numbers=numbers))
         return replace(session_of(self.cell), views=tuple(views), robot_document=self.robot)
 
-    def known(self, **changes) -> Iterator[RunState]:
-        """What is known after each stage; detection is given."""
+    def known(self, last: str = "", **changes) -> RunState:
+        """What is known after a stage, or at the end; detection is given."""
         known = RunState(self.session, **changes)
+        corners = {view_corners.view: view_corners for view_corners in self.cell.corners}
         for stage in STAGES:
-            if stage.name == "detect":
-                known = detect_targets(
-                    known, {view_corners.view: view_corners for view_corners in self.cell.corners}
-                )
-            else:
-                known = stage.run(known)
-            yield known
-
-    def seen(self) -> RunState:
-        """What is known once the joints were looked at."""
-        return next(
-            run_state
-            for run_state, stage in zip(self.known(), STAGES, strict=False)
-            if stage.name == "joints"
-        )
+            known = detect_targets(known, corners) if stage.name == "detect" else stage.run(known)
+            if stage.name == last:
+                break
+        return known
 
     def said(self) -> str:
         """All that is said up to the stage that looks at the joints, errors included."""
         try:
-            known = self.seen()
+            known = self.known("joints")
         except VisioncalError as error:
             return f"error: {error}"
         return " ".join(
@@ -209,26 +186,10 @@ SLIPS: Mapping[str, Plant] = {
 }
 
 
-def slip_is_named(told: Identifiability) -> bool:
-    """Whether what was planted is named."""
-    return told.words in told.said()
-
-
-def with_tool(told: Identifiability, rng: np.random.Generator) -> Identifiability:
-    """Poses of a tool's tip."""
-    tool = compose(Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)).as_matrix(), rng.normal(0, 0.1, 3))
-    return replace(told, poses=told.poses @ tool)
-
-
 def in_the_world(told: Identifiability, rng: np.random.Generator) -> Identifiability:
     """Poses in a frame of the world, in which the arm stands somewhere."""
     turn = Rotation.from_euler("z", rng.uniform(0.3, 2.6)).as_matrix()
     return replace(told, poses=compose(turn, rng.uniform(-1.0, 1.0, 3)) @ told.poses)
-
-
-def as_built(told: Identifiability, _: np.random.Generator) -> Identifiability:
-    """Poses of a controller that knows how its own arm was built."""
-    return replace(told, poses=told.cell.robot.true_base_from_flange)
 
 
 def as_identified(told: Identifiability, rng: np.random.Generator) -> Identifiability:
@@ -259,24 +220,12 @@ ALARMS = (
 )
 
 
-def alarms(told: Identifiability) -> tuple[str, ...]:
-    """What is said that accuses somebody's input."""
-    said = told.said()
-    return tuple(alarm for alarm in ALARMS if alarm in said)
-
-
-def measured(cell: SimulatedCell) -> RunState:
-    """What is known of a cell once the target's poses are."""
+def seen_in(cell: SimulatedCell) -> Poses:
+    """The poses of a simulated cell: the camera's are measured from corners, lens included."""
     known = known_of(cell)
     for stage in STAGES:
         if stage.name in ("intrinsics", "pnp"):
             known = stage.run(known)
-    return known
-
-
-def seen_in(cell: SimulatedCell) -> Poses:
-    """The poses of a simulated cell: the camera's are measured from corners, lens included."""
-    known = measured(cell)
     views = sorted(known.poses)
     camera = np.array([known.poses[view].cam_from_target[0] for view in views])
     return sound(cell.robot.base_from_flange[views], camera, cell.options.mount)
@@ -350,58 +299,6 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     assert guess.best.hypothesis.mount == "eye-in-hand"
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_a_wrong_mount_is_named_though_poses_are_poor(mount):
-    # As of a hobby arm: 5 degrees and 10 mm.
-    poses, rng = cell_poses(mount), np.random.default_rng(2)
-    noise = exp(rng.normal(0.0, [0.05] * 3 + [6e-3] * 3, (len(poses.robot), 6)))
-    poor = numbers(poses.camera.poses() @ noise)
-    guess = guess_reading(poses.robot, poor, OTHER[mount], is_measured=True)
-    assert guess.best.words == f"the camera mounted {mount}", guess.sentence
-    assert guess_reading(poses.robot, poor, mount, is_measured=True).stands_out is False
-
-
-TAG = replace(load_target("apriltag_36h11_id0_120mm"), square_m=0.04)
-
-
-def hobby_arm(seed):
-    """24 flange poses of an arm of five axes, off by 2 deg a joint, and what it sees of a tag."""
-    rng = np.random.default_rng(seed)
-    twists = np.zeros((5, 6))
-    # The axes of base, shoulder, elbow, wrist and hand at rest, and a point on each [m].
-    twists[:, :3] = [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0]]
-    places = [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.22], [0.13, 0, 0.22], [0.23, 0, 0.22]]
-    twists[:, 3:] = np.cross(places, twists[:, :3])
-
-    def poses(joints):
-        return reduce(
-            np.matmul, [exp(q[:, None] * twist) for q, twist in zip(joints.T, twists, strict=True)]
-        )
-
-    joints = rng.uniform([-0.6, -0.5, -0.4, -0.2, -1.0], [0.6, 0.5, 0.6, 1.2, 1.0], (4000, 5))
-    on_flange = exp(np.array([0.2, 1.4, 0.1, 0.03, 0.0, 0.06]))
-    at_base = exp(np.array([0.1, 2.9, 0.3, 0.35, 0.05, 0.0]))
-    cam_from_tag = invert(poses(joints) @ on_flange) @ at_base
-    corners = cam_from_tag[:, None, :3, :3] @ corner_positions(TAG)[..., None]
-    corners = corners[..., 0] + cam_from_tag[:, None, :3, 3]
-    lens = wide_camera()
-    px = project(lens, corners.reshape(-1, 3)).reshape(-1, 4, 2)
-    seen = (corners[..., 2] > 0.05).all(axis=1)
-    seen &= ((px > 5.0) & (px < np.subtract(lens.resolution, 5.0))).all(axis=(1, 2))
-    at = np.flatnonzero(seen)[:24]
-    told = poses(joints[at] + rng.normal(0.0, np.deg2rad(2.0), (len(at), 5)))
-    return told, px[at] + rng.normal(0.0, 0.3, (len(at), 4, 2))
-
-
-def of_tag(told, px):
-    """The session of flange poses and of a tag's corners."""
-    lens = wide_camera()
-    found = [(np.arange(4), corners) for corners in px]
-    return Session.from_corners(
-        found, told, TAG, lens.resolution, mount="eye-in-hand", camera=lens
-    ).needing(20.0, None)
-
-
 def test_a_long_recording_takes_no_more_memory_than_what_is_looked_at():
     rng, edge = np.random.default_rng(1), np.eye(4)
     edge[:3, 3] = [0.0, 0.1, 0.2]
@@ -429,34 +326,6 @@ def test_rotations_that_are_none_are_called_so(side, rows):
     assert not guess.stands_out
     assert not guess.declared.fit.is_readable
     assert "are none" in guess.sentence
-
-
-def test_only_the_joints_tell_the_inverse_where_the_camera_is_far_from_the_flange():
-    poses = cell_poses()
-    # A tool of two metres, and a board beside the base.
-    tool, base = np.eye(4), np.eye(4)
-    tool[2, 3], base[:3, 3] = 2.0, [-0.6, 0.2, 0.4]
-    robot = base @ poses.true_robot @ invert(tool)
-    told = numbers(invert(robot))
-    alone = guess_reading(told, poses.camera, poses.mount, is_measured=True)
-    assert alone.best.hypothesis.mount == OTHER[poses.mount]
-    with_joints = guess_reading(
-        told, poses.camera, poses.mount, chain=poses.true_robot, is_measured=True
-    )
-    assert with_joints.best.hypothesis.mount == poses.mount
-    assert with_joints.best.hypothesis.robot.reading.inverse
-
-
-def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
-    session = Session.load(rendered)
-    chain = chain_poses(session)
-    assert np.isfinite(chain).all()
-    told = numbers(chain, unit="mm").read_as(Reading())
-    guess = DoubtfulSession(session, told).guess()
-    assert guess.stands_out
-    # The simulated robot reports the model's poses: what is given back is the chain.
-    np.testing.assert_allclose(guess.best.hypothesis.robot_numbers(told).poses(), chain, atol=1e-6)
-    assert not DoubtfulSession(session).guess().stands_out
 
 
 @lru_cache(maxsize=3)
@@ -526,18 +395,6 @@ def test_a_planted_mistake_is_named(make, mount, views):
         assert not any("sorted as text" in change.words for change in tried)
 
 
-@pytest.mark.parametrize(("written", "read"), [("ZYX", "xyz"), ("xyz", "ZYX")])
-def test_readings_with_the_same_poses_leave_nothing_open(written, read):
-    # Angles of a KUKA read as those of a FANUC: several orders of turns undo that.
-    poses = cell_poses()
-    angles = Rotation.from_matrix(poses.true_robot[:, :3, :3]).as_euler(written)
-    wrong = compose(Rotation.from_euler(read, angles).as_matrix(), poses.true_robot[:, :3, 3])
-    guess = guess_reading(numbers(wrong), poses.camera, "eye-in-hand", is_measured=True)
-    assert guess.stands_out, guess.sentence
-    found = guess.best.hypothesis.robot_numbers(numbers(wrong))
-    np.testing.assert_allclose(found.poses(), poses.true_robot, atol=1e-9)
-
-
 def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_right():
     poses = cell_poses()
     camera, told = (
@@ -556,29 +413,6 @@ def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_righ
         assert any(words in name for name in (guess.best.words, *guess.notes))
     with pytest.raises(DegenerateError, match="3 rows have"):
         guess_reading(numbers(poses.true_robot[:3]), numbers(poses.camera.poses()[:3]), "")
-
-
-@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 4))])
-def test_inverse_poses_of_a_hobby_arm_are_the_first_cause_and_undone(seed, tmp_path):
-    told, px = hobby_arm(seed)
-    inverse = of_tag(invert(told), px)
-    verdict = visioncal.calibrate(inverse).verdict
-    first = verdict.causes[0]
-    assert first is verdict.findings[0]
-    assert first.kind == "misread_poses"
-    assert "the robot's poses inverse" in first.words
-    sound = visioncal.calibrate(of_tag(told, px)).verdict
-    assert "misread_poses" not in {cause.kind for cause in sound.causes}
-    for finding in (*verdict.findings, *sound.findings):
-        assert "within 0 " not in f"{finding.reason} {finding.without_it}"
-    if seed == 0:
-        inverse.save(tmp_path / "cell")
-        argv = ("convert", tmp_path / "cell", tmp_path / "fixed", "--guess", "--yes")
-        done = typed(*argv)
-        assert done.status == 0, done.err
-        fixed = Session.load(tmp_path / "fixed").views
-        poses = [view.base_from_flange().as_matrix() for view in fixed]
-        np.testing.assert_allclose(poses, told, atol=1e-9)
 
 
 SOUND = {
@@ -607,10 +441,9 @@ def test_sound_poses_are_not_accused(world, mount):
         assert "cannot distinguish readings" in guess.sentence
 
 
-@pytest.mark.parametrize("name", [slow("board's size in mm"), "the other mount"])
-def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monkeypatch):
+def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    planted = plant(name, cell_poses())
+    planted = plant("the other mount", cell_poses())
     told, seen = planted.robot.poses(), planted.camera.poses()
     pairs_session(planted.mount, told, seen).save(Path("my cell"))
     done = typed("calibrate", "my cell", "-o", "out")
@@ -626,17 +459,9 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(name, tmp_path, monk
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 
-@pytest.mark.parametrize(
-    ("lost", "mount"),
-    [
-        ("rotations", "eye-in-hand"),
-        ("poses", "eye-in-hand"),
-        ("positions", "eye-in-hand"),
-        slow("positions", "eye-to-hand"),
-    ],
-)
-def test_what_was_never_recorded_is_named(lost, mount):
-    poses = cell_poses(mount)
+@pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
+def test_what_was_never_recorded_is_named(lost):
+    poses = cell_poses()
     told = poses.robot.poses()
     if lost == "positions":
         told[:, :3, 3] = 0.0
@@ -644,7 +469,7 @@ def test_what_was_never_recorded_is_named(lost, mount):
         told[:, :3, :3] = np.eye(3)
     if lost == "poses":
         told[:] = told[0]
-    session = pairs_session(mount, told, poses.camera.poses())
+    session = pairs_session(poses.mount, told, poses.camera.poses())
     one_place = "all rows have one position of the robot"
     if lost == "positions":
         verdict = visioncal.calibrate(session).verdict
@@ -670,11 +495,6 @@ CELLS = {name: simulate(replace(OPTIONS, mount=name)) for name in ("eye-in-hand"
 IN_HAND = CELLS["eye-in-hand"]
 
 
-def finished(told, **changes):
-    """What is known at the end of the way."""
-    return deque(told.known(**changes), maxlen=1).pop()
-
-
 def planted(name, *, with_poses, seed=0):
     told = Identifiability.of(IN_HAND, with_poses=with_poses)
     return SLIPS[name](told, np.random.default_rng(seed))
@@ -693,20 +513,18 @@ def test_slips_are_named(name, with_poses):
     mount = "eye-to-hand" if with_poses else "eye-in-hand"
     told = Identifiability.of(CELLS[mount], with_poses=with_poses)
     told = SLIPS[name](told, np.random.default_rng(int(with_poses)))
-    assert slip_is_named(told), told.said()
+    assert told.words in told.said()
 
 
-@pytest.mark.parametrize(
-    "change", [as_built, as_identified, in_the_world, with_stray_offset, with_tool]
-)
+@pytest.mark.parametrize("change", [as_identified, in_the_world, with_stray_offset])
 def test_sound_sessions_raise_no_alarm(change):
-    told = change(Identifiability.of(IN_HAND, with_poses=True), np.random.default_rng(0))
-    assert not alarms(told), told.said()
+    said = change(Identifiability.of(IN_HAND, with_poses=True), np.random.default_rng(0)).said()
+    assert not any(alarm in said for alarm in ALARMS), said
 
 
 def test_joints_alone_that_are_misread_are_refused_with_the_fix():
     with pytest.raises(DataError, match="opposite sign, they fit") as caught:
-        finished(planted("a joint's sign", with_poses=False))
+        planted("a joint's sign", with_poses=False).known()
     error = caught.value
     assert "not those of ur5e" in error.message
     (column,) = error.culprits
@@ -716,15 +534,15 @@ def test_joints_alone_that_are_misread_are_refused_with_the_fix():
 
 def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     told = planted("joints in degrees", with_poses=True)
-    known = finished(told)
+    known = told.known()
     assert known.reported.joints_rad is None
     assert known.robot_arm.kinematics is None
     assert known.verdict.status != "good"
     assert any("pi / 180" in reason for reason in known.verdict.reasons)
-    alone = finished(replace(told, robot=None))
+    alone = replace(told, robot=None).known()
     # What is done with the poses is what would be done if there were no joints.
     assert np.array_equal(known.assessment.state.edges[0], alone.assessment.state.edges[0])
-    caught = raised(DataError, "needs the joint angles", finished, told, level="kinematics")
+    caught = raised(DataError, "needs the joint angles", told.known, level="kinematics")
     assert "multiply q1_rad to q6_rad by pi / 180" in caught.next_step
 
 
@@ -743,7 +561,7 @@ def test_a_lost_encoder_is_named_and_estimated_with_the_arm():
     told = Identifiability.of(IN_HAND, with_poses=True)
     joints = told.joints - np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
     poses = load_robot("ur5e").base_from_flange(joints)
-    known = finished(replace(told, joints=joints, poses=poses))
+    known = replace(told, joints=joints, poses=poses).known()
     nominal, found = known.robot_arm.kinematics.result.levels
     assert nominal.held_out_mm > 10.0
     assert found.held_out_mm < 0.5
@@ -772,7 +590,7 @@ def test_one_row_of_wrong_joints_costs_its_view_alone():
     told = Identifiability.of(IN_HAND, with_poses=True)
     joints = told.joints.copy()
     joints[5, 1] += 0.3
-    known = finished(replace(told, joints=joints))
+    known = replace(told, joints=joints).known()
     assert known.reported.joints_rad.keys() == set(range(16)) - {5}
     assert known.robot_arm.kinematics.level == "geometry"
     assert known.reasons[5].endswith("with which the camera agrees")
@@ -818,53 +636,16 @@ def cell(tmp_path: Path) -> Path:
     return write_session(simulate(CellOptions(views=12, seed=4)), tmp_path / "cell", images=False)
 
 
-def rewritten(folder, change):
-    """Changes the rows of views.csv, each a dictionary, in place."""
-    file = folder / "views.csv"
-    with file.open(newline="", encoding="utf-8") as stream:
-        reader = csv.DictReader(stream)
-        rows, names = list(reader), reader.fieldnames
-    change(rows)
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, names)
-        writer.writeheader()
-        writer.writerows(rows)
+def converted(source, dest, *more):
+    return typed("convert", source, dest, "--guess", *more)
 
 
-def shifted(columns):
-    def change(rows):
-        before = [dict(row) for row in rows]
-        for at, row in enumerate(rows):
-            row.update({name: before[(at + 1) % len(rows)][name] for name in columns})
-
-    return change
-
-
-def converted(source, dest, *more, strict=False):
-    words = ["convert", str(source), str(dest), "--guess", *more]
-    return CliRunner().invoke(app, words, catch_exceptions=not strict)
-
-
-def by_view(session, names):
-    return {
-        view.number: [view.numbers[name] for name in names]
-        for view in session.views
-        if names[0] in view.numbers
-    }
-
-
-@pytest.mark.parametrize("corners", [slow(False), True], ids=["poses", "corners"])
-def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path, corners):
+def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     cell = simulate(CellOptions(views=18, seed=3))
-    flange, width = cell.robot.base_from_flange, cell.stated[""].resolution[0]
-    mirror = np.eye(4) if corners else np.diag([1.0, -1.0, 1.0, 1.0])
-    seen = [
-        view_corners.px * [-1, 1] + [width - 1, 0] if corners else view_corners.px
-        for view_corners in cell.corners
-    ]
+    width = cell.stated[""].resolution[0]
     Session.from_corners(
-        [(view_corners.ids, px) for view_corners, px in zip(cell.corners, seen, strict=True)],
-        mirror @ flange @ mirror,
+        [(seen.ids, seen.px * [-1, 1] + [width - 1, 0]) for seen in cell.corners],
+        cell.robot.base_from_flange,
         replace(cell.options.target, square_sigma_m=1e-7),
         cell.stated[""].resolution,
         mount="eye-in-hand",
@@ -874,76 +655,14 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path, corners):
     assert "Look at an image first: where it is mirrored" in done.said
     assert "--mirror-poses" in done.said
     assert not any("--guess" in command for command in printed_commands(done.said))
-    with pytest.raises(DataError, match="mirrored images are the usual cause"):
-        converted(tmp_path / "cell", tmp_path / "fixed", "--yes", strict=True)
+    told = converted(tmp_path / "cell", tmp_path / "fixed", "--yes")
+    told.refused("mirrored images are the usual cause")
     assert not (tmp_path / "fixed").exists()
-    done = converted(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses")
-    assert done.exit_code == 0
+    converted(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses").good()
     fixed = Session.load(tmp_path / "fixed")
     assert "left-handed frame" in fixed.declaration.corrected[0]
     # Of mirrored corners the board is still seen from behind.
-    assert visioncal.calibrate(fixed).verdict.status == ("check" if corners else "good")
-
-
-# A cell: what the camera is from the flange, and the target from the base; or the other way round.
-NEAR, FAR = (
-    exp(np.array([0.1, 0.2, 1.5, 0.03, 0.02, 0.08])),
-    exp(np.array([0.1, 2, 0.5, 1, 0.2, 0])),
-)
-
-
-def joints_and_poses(count, seed):
-    """(n, 6) joint angles of a ur5e, and its (n, 4, 4) poses."""
-    rng = np.random.default_rng(seed)
-    joints = 0.5 * rng.normal(size=(count, 6)) + [0, -1.5, 1.5, -1.5, -1.5, 0]
-    return joints, Robot.from_document(read_robot_document("ur5e", tip=None)).base_from_flange(
-        joints
-    )
-
-
-def one_late(rows):
-    return np.concatenate([rows[:1], rows[:-1]])
-
-
-@pytest.fixture
-def late(tmp_path):
-    """Writes a log in which the robot's rows are one late."""
-
-    def write(*, with_poses):
-        joints, poses = joints_and_poses(12, seed=1)
-        camera = invert(poses @ NEAR) @ FAR
-        keyed = {"joints": one_late(joints), "camera_pose": camera}
-        keyed |= {"robot_pose": one_late(poses)} if with_poses else {}
-        rows = [
-            {name: value[at].tolist() for name, value in keyed.items()} for at in range(len(joints))
-        ]
-        (tmp_path / "log.json").write_text(json.dumps(rows))
-        foreign = read_foreign(
-            tmp_path / "log.json", ImportOptions(mount="eye-in-hand", robot_model="ur5e")
-        )
-        return foreign, joints
-
-    return write
-
-
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_the_mount_of_samples_that_do_not_say_it(tmp_path, mount):
-    options = CellOptions(mount=mount, views=12)
-    sound = Session.load(write_session(simulate(options), tmp_path / "cell", images=False))
-    robot, camera = (
-        np.array([getattr(view, name)().as_matrix() for view in sound.views])
-        for name in ("base_from_flange", "cam_from_target")
-    )
-    # With the camera on the base easy_handeye2 stores the inverse.
-    stored = robot if mount == "eye-in-hand" else invert(robot)
-    source = easy_handeye_file(tmp_path / "cell.samples", stored, camera)
-    done = converted(source, tmp_path / "read", "--yes")
-    assert done.exit_code == 0, done.stderr
-    session = Session.load(tmp_path / "read")
-    assert session.mount == mount
-    found = np.array([view.base_from_flange().as_matrix() for view in session.views])
-    # A quaternion and back, and two inversions, in double precision.
-    np.testing.assert_allclose(found, robot, atol=1e-13)
+    assert visioncal.calibrate(fixed).verdict.status == "check"
 
 
 def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
@@ -954,7 +673,7 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
     assert "There is no robot named 'ur10ee'. Did you mean ur10e" in found.words
     assert found.do.words.startswith("Correct the robot's model in session.toml")
     # Without poses there is no result, and that is why.
-    rewritten(cell, lambda rows: [row.update(dict.fromkeys(POSE, "")) for row in rows])
+    rewritten(cell, lambda _, row: row | dict.fromkeys(POSE, ""))
     with pytest.raises(DataError) as caught:
         visioncal.calibrate(cell)
     assert caught.value.message.startswith("session.toml: robot.model: There is no robot named")
@@ -963,50 +682,51 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
 
 @pytest.mark.parametrize("moved", [(*POSE, *JOINTS), POSE], ids=["both", "poses alone"])
 def test_what_is_of_one_log_changes_rows_together(cell, tmp_path, moved):
-    sound = Session.load(cell)
-    rewritten(cell, shifted(moved))
-    done = converted(cell, tmp_path / "fixed", "--yes")
-    assert done.exit_code == 0, done.stderr
-    fixed = Session.load(tmp_path / "fixed")
+    views = Session.load(cell).views
+    later = [*views[1:], views[0]]
+    rewritten(cell, lambda at, row: row | {name: later[at].cell(name) for name in moved})
+    converted(cell, tmp_path / "fixed", "--yes").good()
+    fixed = Session.load(tmp_path / "fixed").views
     for names in (POSE, JOINTS):
-        found, wanted = by_view(fixed, names), by_view(sound, names)
+        found = {view.number: view for view in fixed if names[0] in view.numbers}
         # One row at the end has lost its partner; the rest are the numbers that were written.
-        assert len(found) == len(wanted) - (names[0] in moved)
-        rows = [wanted[index] for index in found]
-        np.testing.assert_allclose(list(found.values()), rows, atol=1e-15)
+        assert len(found) == len(views) - (names[0] in moved)
+        for number, view in found.items():
+            wanted = [views[number].numbers[name] for name in names]
+            assert [view.numbers[name] for name in names] == pytest.approx(wanted, abs=1e-15)
 
 
 def test_nothing_is_written_without_a_word_or_a_reading(cell, tmp_path):
-    done = converted(cell, tmp_path / "same", "--yes")
-    assert done.exit_code == 0, done.stderr
-    assert "fit as declared" in done.stderr
+    done = converted(cell, tmp_path / "same", "--yes").good()
+    assert "fit as declared" in done.err
     assert Session.load(tmp_path / "same").digest() == Session.load(cell).digest()
-
-    def in_millimetres(rows):
-        for row in rows:
-            row.update({name: repr(1e3 * float(row[name])) for name in POSE[:3]})
-
-    rewritten(cell, in_millimetres)
+    rewritten(cell, lambda _, row: row | {at: repr(1e3 * float(row[at])) for at in POSE[:3]})
     done = converted(cell, tmp_path / "fixed")
-    assert done.exit_code != 0
-    assert "the robot's positions in mm" in done.stderr
-
-    def scrambled(rows):
-        turns = np.random.default_rng(0).normal(size=(len(rows), 4))
-        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
-        for row, turn in zip(rows, turns.tolist(), strict=True):
-            row.update(zip(POSE[3:], map(repr, turn), strict=True))
-
-    rewritten(cell, scrambled)
-    done = converted(cell, tmp_path / "fixed", "--yes")
-    assert isinstance(done.exception, DataError)
-    assert "no other reading stands out" in str(done.exception)
+    assert done.status != 0
+    assert "the robot's positions in mm" in done.err
+    turns = np.random.default_rng(0).normal(size=(12, 4))
+    turns = (turns / np.linalg.norm(turns, axis=1, keepdims=True)).tolist()
+    rewritten(cell, lambda at, row: row | dict(zip(POSE[3:], map(repr, turns[at]), strict=True)))
+    converted(cell, tmp_path / "fixed", "--yes").refused("no other reading stands out")
     assert not (tmp_path / "fixed").exists()
 
 
 @pytest.mark.parametrize("with_poses", [False, True], ids=["joints alone", "both"])
-def test_a_shift_moves_the_joints(late, with_poses):
-    foreign, joints = late(with_poses=with_poses)
+def test_a_shift_moves_the_joints(tmp_path, with_poses):
+    """In a log in which the robot's rows are one late."""
+    joints = 0.5 * np.random.default_rng(1).normal(size=(12, 6)) + [0, -1.5, 1.5, -1.5, -1.5, 0]
+    poses = load_robot("ur5e", None).base_from_flange(joints)
+    x = exp(np.array([0.1, 0.2, 1.5, 0.03, 0.02, 0.08]))
+    late = np.array([0, *range(11)])
+    keyed = {
+        "joints": joints[late],
+        "camera_pose": invert(poses @ x) @ exp(np.array([0.1, 2, 0.5, 1, 0.2, 0])),
+        **({"robot_pose": poses[late]} if with_poses else {}),
+    }
+    rows = [{name: value[at].tolist() for name, value in keyed.items()} for at in range(12)]
+    (tmp_path / "log.json").write_text(json.dumps(rows))
+    asked = ImportOptions(mount="eye-in-hand", robot_model="ur5e")
+    foreign = read_foreign(tmp_path / "log.json", asked)
     session = assemble(foreign)
     for recorded in (DoubtfulSession.of(foreign), DoubtfulSession(session)):
         guess = recorded.guess()

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 from support.cells import calibrated, pairs_session, reporting, showing
-from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, views
 
 from visioncal.calibration.pipeline.judging import findings_of
@@ -23,7 +22,6 @@ from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD
 from visioncal.core.codec import read, write
-from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import compose, exp, invert, pose_difference
 from visioncal.core.types import MOUNTS, Need, Rejection
@@ -252,19 +250,16 @@ def session_of(cell: SimulatedCell, base_from_flange: np.ndarray) -> Session:
     )
 
 
-@pytest.mark.parametrize(
-    ("since", "which", "mount"), [(12, "tool", "eye-in-hand"), slow(6, "base", "eye-to-hand")]
-)
-def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named(mount, which, since):
-    cell = simulate(CellOptions(mount=mount, views=18, seed=3))
+def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
+    cell = simulate(CellOptions(views=18, seed=3))
     switched = exp(np.array([0.0, 0.5, 0.7, 0.02, -0.01, 0.18]))
     flange = cell.robot.base_from_flange.copy()
-    flange[since:] = flange[since:] @ switched if which == "tool" else switched @ flange[since:]
+    flange[12:] = flange[12:] @ switched
     cause = calibrate(session_of(cell, flange)).verdict.causes[0]
     assert cause.kind == "something_moved"
     # Of the two parts the larger one is kept.
-    assert ("from view 12 on" if since == 12 else "before view 6") in cause.words
-    said = re.search(rf"another {which} frame, (\d+) mm and (\d+) deg from", cause.words)
+    assert "from view 12 on" in cause.words
+    said = re.search(r"another tool frame, (\d+) mm and (\d+) deg from", cause.words)
     # Seen from 1.5 m away, whose direction is known to 0.5 mrad; and figures are rounded.
     away = np.abs(np.array(said.groups(), float) - pose_difference(np.eye(4), switched))
     assert (away < [1.3, 0.55]).all()
@@ -308,9 +303,7 @@ def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
         assert verdict.status == "check"
 
 
-@pytest.mark.parametrize("freedom", [np.inf, 15.0])
-@pytest.mark.parametrize("places", [1, 7])
-@pytest.mark.parametrize("flat", [1.0, 0.03])
+@pytest.mark.parametrize(("freedom", "places", "flat"), [(np.inf, 1, 1.0), (15.0, 7, 0.03)])
 def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: float) -> None:
     rng, count = np.random.default_rng(places), 200_000
     sizes = 1e-3 * np.geomspace(flat, 1.0, 6)[rng.permutation(6)]
@@ -401,21 +394,15 @@ def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks
         ({"held_out": Rms(3.0, 0.011), "rms": Rms(2.9, 0.01)}, "check", "by 3 mm (doubt begins"),
         ({"held_out": Rms(30.0, 0.011), "rms": Rms(29.0, 0.01)}, "bad", "by 30 mm"),
         ({"held_out": Rms(0.11, 0.5), "rms": Rms(0.1, 0.45)}, "check", "by 0.5 deg"),
-        ({"held_out": Rms(0.11, 3.0), "rms": Rms(0.1, 2.9)}, "bad", "by 3 deg"),
         ({"holdout": Rms(2.0, 0.01)}, "check", "holds back are missed by 2 mm"),
-        ({"holdout": Rms(0.1, 0.4)}, "check", "0.4 deg, 36 times worse"),
         ({"worst": directions(2e-3, 0, 0, 0)}, "check", "the direction 0 (2 mm)"),
         ({"worst": directions(4e-3, 0, 0, 0)}, "bad", "the direction 0 (4 mm)"),
-        ({"worst": directions(0, 3e-3, 0, 0)}, "check", "the direction 1 (0.17 deg)"),
         ({"noise_mm": 1.0}, "check", "take a flange that is off by 1 mm and 0.0057 deg"),
         ({"noise_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
-        ({"stops": 1, "views": views(1)}, "bad", "Only 1 view is used"),
         ({"lost": LOST}, "check", "10 of 30 views are not used. The first but for outliers: view "),
-        ({"lost": LOST * 4}, "bad", "40 of 60 views"),
         ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),
-        ({"pixel_px": 4.0}, "bad", "Corners deviate by 4 px"),
         ({"warnings": remarks(("It is upside down.",))}, "check", "It is upside down."),
         # Coarse poses leave noise open: doubt is about what it is at the least.
         ({"noise_mm": 0.1, "noise_deg": 0.025, "lower_bounds": (0.05, 0.012)}, "good", ""),
@@ -423,9 +410,7 @@ def of_size(sigma_mm: float, camera: str = "cam", robot: str = "robot") -> Picks
         # A small board far away scatters by as much as its pixels do; half more is beyond chance.
         ({"held_out": Rms(0.1, 0.36), "rms": Rms(0.1, 0.35), "noise": Rms(0.1, 0.33)}, "good", ""),
         ({"held_out": Rms(0.1, 0.36), "rms": Rms(0.1, 0.35), "noise": Rms(0.1, 0.2)}, "check", ""),
-        ({"holdout": Rms(0.2, 0.02)}, "good", ""),
         ({"lost": LOST[:3]}, "good", ""),
-        ({"pixel_px": None}, "good", ""),
         ({"noise_mm": None}, "good", ""),
         # A scatter that settles it is not blamed on the motion.
         (
@@ -458,16 +443,13 @@ def test_each_doubt_has_its_sentence(changes, status, words):
     [
         ({"worst": directions(2e-3)}, ["weak_motion"]),
         ({"warnings": (MISSPELT,)}, ["remark"]),
-        ({"stops": 8, "warnings": (MISSPELT,)}, ["few_stops", "remark"]),
         ({"stops": 8, "worst": directions(2e-3)}, ["weak_motion", "few_stops"]),
         # They are none where something else is likely.
         ({"stops": 8, "warnings": (DRIFT,)}, ["moved_slowly"]),
-        ({"noise_mm": 1.0}, ["unexplained"]),
         # What happened comes before what nothing explains.
         ({"noise_mm": 1.0, "warnings": (MOVED,)}, ["something_moved", "unexplained"]),
         # What moves with the time passes for a focus, and not the other way round.
         ({"warnings": (FOCUS, DRIFT)}, ["moved_slowly"]),
-        ({"warnings": (FOCUS,)}, ["focus"]),
         # A held lens that is wrong is no arm that errs.
         ({"warnings": (POSTURE, HELD_LENS), "noise_mm": 2.0}, ["lens"]),
         # Joints that are there but misread come before the errors they would explain.
@@ -500,14 +482,12 @@ def test_poses_that_are_misread_explain_the_rest_but_exchanged_rows() -> None:
 @pytest.mark.parametrize(
     ("changes", "sigma_mm", "need", "status", "kinds"),
     [
-        ({}, 0.1, NEED, "good", []),
         ({}, 0.17, NEED, "good", []),
         ({}, 0.2, NEED, "check", ["calibration"]),
         ({}, 0.4, NEED, "bad", ["calibration"]),
         # Both have to hold.
         ({}, 0.1, Need(0.5, 0.05), "good", []),
         ({}, 0.1, Need(0.5, 0.005), "bad", ["calibration"]),
-        ({}, 0.1, Need(None, 0.05), "good", []),
         ({}, 0.2, None, "good", []),
         ({}, 0.7, None, "check", ["calibration"]),
         # What moves picks by 0.08 mm is no doubt where they err by three times that anyway.
@@ -571,14 +551,32 @@ def test_rows_that_were_shuffled_are_named(options, order, status, words):
     assert ("poses are not those of the images" in verdict.top[0]) == (status == "bad")
 
 
+def drawn_misses_m(known: RunState, mount: str, count: int = 20_000) -> np.ndarray:
+    """(n, 3) by how much picks miss, drawn one by one and seen through the chain [m]."""
+    answer, rng = known.assessment, np.random.default_rng(0)
+    problem, (camera, target) = answer.problem, answer.state.edges[:2]
+    views = rng.integers(len(known.used), size=count)
+    (poses,) = problem.poses.values()
+    flange, middle = poses[problem.observations.stops][views], np.array([0.135, 0.09, 0.0, 1.0])
+    sigmas = np.repeat(answer.noise.robots[0], 3)
+    look, pick = (sigmas * rng.standard_normal((count, 6)) for _ in range(2))
+    edges = rng.standard_normal((count, 12)) @ np.linalg.cholesky(answer.covariance[:12, :12]).T
+    first, second = exp(edges[:, :6]), exp(edges[:, 6:])
+    if mount == "eye-in-hand":
+        seen = problem.measured(answer.state)[views] @ middle[:, None]
+        away = flange @ (exp(look) @ camera @ first - camera) @ seen
+        return away[:, :3, 0] + pick[:, 3:]
+    went = flange @ exp(pick) @ target @ second
+    return ((went - camera @ first @ invert(camera) @ flange @ target) @ middle)[:, :3]
+
+
 def test_picks_err_as_the_chain_does() -> None:
     """Against errors that are drawn and put through the chain, by no slope of ours."""
     for mount, seed in (("eye-in-hand", 0), ("eye-to-hand", 4)):
         # Of these cells the images and the motion raise no doubt about the lens that is given.
         cell = simulate(CellOptions(mount=mount, views=12, seed=seed))
         known = without_arm_errors(calibrated(cell, joints=False))
-        (picks,), drawn = findings_of(known).picks, Drawn(known, mount)
-        away = drawn.errors(drawn.noise, *drawn.edges(np.linalg.cholesky(drawn.covariance)))
+        (picks,), away = findings_of(known).picks, drawn_misses_m(known, mount)
         parts = {name: value for name, value in picks.budget_mm.items() if name != "left out"}
         total = np.sqrt(sum(part**2 for name, part in parts.items() if name != "total"))
         assert total == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(away**2, axis=1))), rel=0.05)
@@ -588,88 +586,25 @@ def test_picks_err_as_the_chain_does() -> None:
         assert set(parts) == {"board", "calibration", "pick", "total"} | looks
 
 
-def erring(known: RunState, errors: ArmErrors) -> tuple[RunState, np.ndarray]:
-    """The same with an arm whose errors count, and how these move its edges."""
-    answer, solved = known.assessment, known.cell_fit
-    ((robot, arm),) = solved.arms.items()
-    off = errors.sigma * misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
-    covariance = answer.covariance + off @ off.T
-    return replace(
-        known,
-        assessment_or_none=replace(answer, covariance=covariance),
-        cell_fit_or_none=replace(solved, arms={robot: replace(arm, errors=errors)}),
-    ), off
-
-
 def test_what_an_arm_does_again_moves_no_pick() -> None:
     """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
     known = without_arm_errors(calibrated(simulate(CellOptions()), joints=False))
-    (poses,) = known.assessment.problem.poses.values()
-    errors = ArmErrors(pose_basis(poses)[:, :, :12], 4e-3, gain=0.0, of_links=False)
-    (before,), (after,) = (findings_of(it).picks for it in (known, erring(known, errors)[0]))
+    answer, solved = known.assessment, known.cell_fit
+    ((robot, arm),) = solved.arms.items()
+    errors = ArmErrors(
+        pose_basis(answer.problem.poses[robot])[:, :, :12], 4e-3, 0.0, of_links=False
+    )
+    off = errors.sigma * misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
+    erring = replace(
+        known,
+        assessment_or_none=replace(answer, covariance=answer.covariance + off @ off.T),
+        cell_fit_or_none=replace(solved, arms={robot: replace(arm, errors=errors)}),
+    )
+    (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))
     # Both are the same to rounding, of spreads that would be a hundred times as large.
     np.testing.assert_allclose(
         after.covariances, before.covariances, atol=1e-3 * before.covariances.max()
     )
-
-
-class Drawn:
-    """Picks of a calibrated cell, drawn one by one, seen through the chain."""
-
-    def __init__(self, known, mount, count=20_000):
-        answer = known.assessment
-        self.rng, self.count, self.mount = np.random.default_rng(0), count, mount
-        self.covariance, self.sigmas = answer.covariance[:12, :12], answer.noise.robots[0]
-        self.views = self.rng.integers(len(known.used), size=count)
-        problem, self.frames = answer.problem, answer.state.edges[:2]
-        (poses,) = problem.poses.values()
-        self.flange = poses[problem.observations.stops][self.views]
-        self.middle = np.array([0.135, 0.09, 0.0, 1.0])
-        self.seen = problem.measured(answer.state)[self.views] @ self.middle[:, None]
-
-    def noise(self):
-        """(n, 6) of the flange."""
-        return np.repeat(self.sigmas, 3) * self.rng.standard_normal((self.count, 6))
-
-    def edges(self, root):
-        """(n, 4, 4) twice, by which the frames are off, drawn from a root (12, p)."""
-        drawn = self.rng.standard_normal((self.count, root.shape[1]))
-        return exp(drawn @ root[:6].T), exp(drawn @ root[6:12].T)
-
-    def errors(self, anew, first, second):
-        """(n, 3) by how much picks miss, with errors of the flange at the look and at the pick."""
-        camera, target = self.frames
-        if self.mount == "eye-in-hand":
-            away = self.flange @ (exp(anew()) @ camera @ first - camera) @ self.seen
-            return away[:, :3, 0] + anew()[:, 3:]
-        there = self.flange @ target
-        went = self.flange @ exp(anew()) @ target @ second
-        return ((went - camera @ first @ invert(camera) @ there) @ self.middle)[:, :3]
-
-
-@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
-def test_errors_that_last_are_others_at_a_pick(mount: str) -> None:
-    """Against drawn ones: those of the session move the fit, and a pick has its own."""
-    known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))
-    (poses,) = known.assessment.problem.poses.values()
-    # An Ornstein-Uhlenbeck process of a memory of five stops, of 0.4 mrad and 0.2 mm.
-    order = np.arange(len(poses))
-    memory = np.linalg.cholesky(np.exp(-np.abs(order[:, None] - order) / 5.0))
-    sizes = np.diag(np.repeat([4e-4, 2e-4], 3))
-    basis = (memory[:, None, :, None] * sizes[None, :, None]).reshape(len(poses), 6, -1)
-    lasting = ArmErrors(basis, 1.0, gain=0.0, of_links=False, time_correlated_count=basis.shape[2])
-    worse, off = erring(known, lasting)
-    (before,), (after,) = (findings_of(run_state).picks for run_state in (known, worse))
-    drawn, changing = Drawn(known, mount), basis - basis.mean(axis=0)
-
-    def anew():
-        values = drawn.rng.standard_normal((drawn.count, basis.shape[2]))
-        return np.einsum("nip,np->ni", changing[drawn.views], values)
-
-    away = drawn.errors(anew, *drawn.edges(off))
-    grown = after.budget_mm["total"] ** 2 - before.budget_mm["total"] ** 2
-    # Twenty thousand draws know it to a hundredth; slopes at one place of a fit count for more.
-    assert grown == pytest.approx(1e6 * np.mean(np.sum(away**2, axis=1)), rel=0.05)
 
 
 def test_what_happens_now_and_then_or_from_image_to_image_happens_at_picks() -> None:
@@ -706,10 +641,8 @@ def test_what_happens_now_and_then_or_from_image_to_image_happens_at_picks() -> 
         ({"worst": directions(4e-3, 0, 0, 0)}, 0.0),
         ({"stops": 8}, 0.0),
         ({"noise_mm": 1.0}, 10.0),
-        ({"noise_deg": 0.1}, 10.0),
         ({"held_out": Rms(3.0, 0.1), "noise_mm": 1.0}, 10.0),
         ({"warnings": remarks(["It is upside down."])}, np.inf),
-        ({"pixel_px": 4.0}, np.inf),
     ],
 )
 def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, good_from_mm):
@@ -726,7 +659,7 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
 
 
-@pytest.mark.parametrize("sigma_mm", [0.1, 0.101, 0.102, 0.104])
+@pytest.mark.parametrize("sigma_mm", [0.1, 0.102])
 def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
     found = replace(SOUND, picks=(of_size(sigma_mm),))
     plain = judge(found)
@@ -759,12 +692,3 @@ def test_a_result_tells_what_it_is_good_for() -> None:
     assert asked.need.probability == pytest.approx(0.95, abs=1e-3)
     again = Calibration.from_json(json.dumps(to_document(asked)), "again")
     assert (again.need, again.verdict) == (asked.need, asked.verdict)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [(0.0, "0"), (2.1e-13, "under 0.001"), (-1e-9, "under 0.001"), (0.0214, "0.021"),
-     (0.0996, "0.1"), (2.96, "3"), (1234.6, "1235"), (-273.4, "-273"), (np.inf, "inf")],
-)  # fmt: skip
-def test_figures_have_no_exponents(value, words):
-    assert figure(value) == words
