@@ -68,7 +68,17 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     with closing(bench):
         host = bench.controller.host
         say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
-        _drive(bench, planned, session)
+
+        def watch(step: CaptureEvent) -> None:
+            say_line(step)
+            bench.note(step)
+
+        with ExitStack() as opened, signals_as_interrupts():
+            cell = opened.enter_context(bench.connected())
+            facts = CaptureFacts.of(cell, session.name, planned.cell, planned)
+            journal = Journal.begin(session, facts, cell.clock.unix_offset_s(), len(planned.stops))
+            steps = record_driven(cell, planned, journal, _TAKING, Consent(None), watch)
+            check_all(journal, steps)
     flange = np.array([state.base_from_flange[0] for _, state in bench.views])
     x, z = bench.truth.transforms.values()
     poses = {"base_from_flange": flange, "cam_from_target": invert(flange @ x) @ z}
@@ -89,19 +99,6 @@ def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> PlanFile:
     report_written(written, quiet=True)
     say(f"plan: {summary_of(plan)}")
     return read_plan(folder)
-
-
-def _drive(bench: Bench, plan: PlanFile, session: Path) -> None:
-    def watch(step: CaptureEvent) -> None:
-        say_line(step)
-        bench.note(step)
-
-    with ExitStack() as opened, signals_as_interrupts():
-        cell = opened.enter_context(bench.connected())
-        facts = CaptureFacts.of(cell, session.name, plan.cell, plan)
-        journal = Journal.begin(session, facts, cell.clock.unix_offset_s(), len(plan.stops))
-        steps = record_driven(cell, plan, journal, _TAKING, Consent(None), watch)
-        check_all(journal, steps)
 
 
 def demo_command(options: DemoOptions) -> None:

@@ -51,7 +51,15 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     if cell is not None:
         _print_noise(cell)
     else:
-        _print_residuals(calibration)
+        used = sum(view.used for view in calibration.views)
+        held = calibration.validation.held_out
+        # Larger ones are meaningless.
+        answer(
+            f"{used} of {len(calibration.views)} views used. "
+            f"Checked with views that were not used in the fit: {figure(held.mm)} mm"
+            + ("" if held.deg is None else f", {figure(held.deg)} deg")
+            + (f", {figure(held.px)} px" if held.px and held.px < 1e4 else "")
+        )
     for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
         answer(f"  {suspects.words}")
     if cell is not None:
@@ -59,19 +67,6 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     solvers = solver_table(calibration)
     if verbose and solvers is not None:
         print_table(solvers.titles, [row.cells for row in solvers.rows])
-
-
-def _print_residuals(calibration: Calibration) -> None:
-    """Prints the number of used views, and the errors of held-out predictions."""
-    used = sum(view.used for view in calibration.views)
-    held = calibration.validation.held_out
-    # Larger ones are meaningless.
-    answer(
-        f"{used} of {len(calibration.views)} views used. "
-        f"Checked with views that were not used in the fit: {figure(held.mm)} mm"
-        + ("" if held.deg is None else f", {figure(held.deg)} deg")
-        + (f", {figure(held.px)} px" if held.px and held.px < 1e4 else "")
-    )
 
 
 def _print_noise(cell: CellResult) -> None:

@@ -314,7 +314,18 @@ def condition(
         DataError: No part without gaps is as long as the filters.
     """
     notes: list[str] = []
-    invalid = _saturated(recorded, limits_nm, notes)
+    flat = np.stack([_flat_tops(column) for column in recorded.torques_nm.T], axis=1)
+    if limits_nm is not None:
+        beyond = np.abs(recorded.torques_nm) >= 0.999 * limits_nm
+        # Torques that are beyond the limits often are not saturated, but in another unit.
+        flat |= beyond & (beyond.mean(axis=0) < 0.2)
+    if flat.any():
+        joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(flat.sum(axis=0)) if n]
+        notes.append(
+            f"{recorded.label}: torques are at rest on an extreme value (saturated): "
+            f"{some_of(joints)}; what rests on them is left out."
+        )
+    invalid = np.asarray(flat)
     clock = StampClock.of(recorded.times_s)
     # For the slowest motion, until the bandwidth is known.
     slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
@@ -373,22 +384,6 @@ def _longest_gap(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
     """Longest gap over which polynomials of that cut-off may interpolate angles [s]."""
     # Over so short gaps the other samples of a polynomial's window determine the angles.
     return 0.25 * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
-
-
-def _saturated(recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]) -> Mask:
-    """(m, n) mask of saturated torques."""
-    flat = np.stack([_flat_tops(column) for column in recorded.torques_nm.T], axis=1)
-    if limits_nm is not None:
-        beyond = np.abs(recorded.torques_nm) >= 0.999 * limits_nm
-        # Torques that are beyond the limits often are not saturated, but in another unit.
-        flat |= beyond & (beyond.mean(axis=0) < 0.2)
-    if flat.any():
-        joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(flat.sum(axis=0)) if n]
-        notes.append(
-            f"{recorded.label}: torques are at rest on an extreme value (saturated): "
-            f"{some_of(joints)}; what rests on them is left out."
-        )
-    return np.asarray(flat)
 
 
 def _flat_tops(values: FloatArray) -> Mask:

@@ -41,20 +41,15 @@ def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         DataError: Torques or angles are of another joint, of the other sign, or in other units.
     """
     for stream in streams:
-        measured = _sampled(stream)
+        piece = max(stream.pieces, key=lambda value: len(value.measured))
+        good = np.flatnonzero(piece.present & ~piece.invalid.any(axis=1))
+        measured = piece.measured.chosen(good[:: max(len(good) // 250, 1)])
         if len(measured) >= _LEAST:
             if base.model.robot.inertias is not None:
                 _check_conventions(base, stream.label, measured, known=True)
                 _check_units(base.model.robot, stream.label, measured)
             # The prediction hardly shows exchanged joints whose torques are mostly friction.
             _check_conventions(base, stream.label, measured, known=False)
-
-
-def _sampled(stream: Conditioned) -> Measured:
-    """Unfiltered samples, spread over a stream, at which all torques are valid."""
-    piece = max(stream.pieces, key=lambda value: len(value.measured))
-    good = np.flatnonzero(piece.present & ~piece.invalid.any(axis=1))
-    return piece.measured.chosen(good[:: max(len(good) // 250, 1)])
 
 
 def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known: bool) -> None:

@@ -318,7 +318,14 @@ class _ExcitationSearch:
     def run(self) -> Excitation:
         request, starts = self._request, 0
         while starts < request.starts and not self._is_over:
-            self._keep(self._descend(self._start(), starts))
+            motion = self._modest(self._posture())
+            # A descent that begins inside a body may never come out of it.
+            for _ in range(8):
+                q = motion.sampled(_CLEAR_HZ).q
+                if (self._allowed.collisions.first_contact(q) < 0).all():
+                    break
+                motion = motion.shrunk(0.5)
+            self._keep(self._descend(motion.free.ravel(), starts))
             starts += 1
         if self._best is None:
             raise DegenerateError(
@@ -368,7 +375,17 @@ class _ExcitationSearch:
 
     def _keep(self, free: FloatArray) -> None:
         """Keeps a motion if it is the best yet and within the limits, shrunk where needed."""
-        series = _shrunk_to_limits(self._allowed, self._objective.series(free))
+        series = self._objective.series(free)
+        motion, middle = series.sampled(CHECK_HZ), series.coefficients[0]
+        above, below = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)
+        with np.errstate(divide="ignore"):
+            shares = [
+                (self._allowed.upper - middle) / above,
+                (middle - self._allowed.lower) / below,
+                self._allowed.speed / np.abs(motion.dq).max(axis=0),
+                self._allowed.acceleration / np.abs(motion.ddq).max(axis=0),
+            ]
+        series = series.shrunk(float(np.clip(np.min(shares), 0.0, 1.0)))
         for _ in range(5):
             condition = self._figures(series)
             if self._best is not None and condition >= self._best[0]:
@@ -382,17 +399,6 @@ class _ExcitationSearch:
 
     def _figures(self, series: Series) -> float:
         return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
-
-    def _start(self) -> FloatArray:
-        """Coefficients (k,) of a random motion without collisions, or nearly at rest."""
-        motion = self._modest(self._posture())
-        # A descent that begins inside a body may never come out of it.
-        for _ in range(8):
-            q = motion.sampled(_CLEAR_HZ).q
-            if (self._allowed.collisions.first_contact(q) < 0).all():
-                break
-            motion = motion.shrunk(0.5)
-        return motion.free.ravel()
 
     def _posture(self) -> FloatArray:
         """A random posture without collisions, (n,) [rad]."""
@@ -437,17 +443,3 @@ class _ExcitationSearch:
         """Median condition of random motions, for comparison."""
         drawn = [self._figures(self._modest(self._posture())) for _ in range(20)]
         return float(np.median(drawn))
-
-
-def _shrunk_to_limits(allowed: MotionLimits, series: Series) -> Series:
-    """Shrinks a motion to the limits of the joints' ranges, speeds and accelerations."""
-    motion, middle = series.sampled(CHECK_HZ), series.coefficients[0]
-    above, below = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)
-    with np.errstate(divide="ignore"):
-        shares = [
-            (allowed.upper - middle) / above,
-            (middle - allowed.lower) / below,
-            allowed.speed / np.abs(motion.dq).max(axis=0),
-            allowed.acceleration / np.abs(motion.ddq).max(axis=0),
-        ]
-    return series.shrunk(float(np.clip(np.min(shares), 0.0, 1.0)))

@@ -289,7 +289,19 @@ def to_document(identified: Identified) -> dict[str, Any]:
         "streams": [write(StreamStatistics, stream) for stream in identified.streams],
     }
     if identified.consistent is not None:
-        document["standard"] = _standard_document(identified, identified.consistent)
+        document["standard"] = {
+            "parameters": [
+                {"name": name, "value": value, "sigma": sigma}
+                for name, value, sigma in zip(
+                    identified.base.model.names,
+                    identified.consistent.values.tolist(),
+                    np.sqrt(np.diag(identified.consistent.covariance)).tolist(),
+                    strict=True,
+                )
+            ],
+            "covariance": identified.consistent.covariance.tolist(),
+            "misfit": identified.consistent.misfit,
+        }
     if identified.lag is not None:
         document["lag"] = write(Lag, identified.lag)
     if identified.validation is not None:
@@ -330,22 +342,6 @@ def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
     return rows
 
 
-def _standard_document(identified: Identified, consistent: Consistent) -> dict[str, Any]:
-    return {
-        "parameters": [
-            {"name": name, "value": value, "sigma": sigma}
-            for name, value, sigma in zip(
-                identified.base.model.names,
-                consistent.values.tolist(),
-                np.sqrt(np.diag(consistent.covariance)).tolist(),
-                strict=True,
-            )
-        ],
-        "covariance": consistent.covariance.tolist(),
-        "misfit": consistent.misfit,
-    }
-
-
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "robot", "friction", "base", "covariance", "stribeck", "streams"}
     | {"standard", "lag", "validation", "verdict"}
@@ -374,6 +370,11 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     base = BaseModel.keeping(model, np.array(kept, dtype=np.int64))
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
+    figures = read(_Figures, document, "")
+    for stream in (*figures.streams, figures.validation):
+        for name, value in vars(stream).items() if stream else ():
+            if isinstance(value, np.ndarray) and len(value) != robot.joint_count:
+                raise ValueError(f"{name} has {len(value)} numbers for {robot.joint_count} joints")
     return {
         "robot": robot,
         "base": base,
@@ -381,7 +382,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "covariance": _array(document["covariance"], (size, size)),
         "stribeck": _stribeck(document["stribeck"], terms),
         "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
-        **_checked_fields(read(_Figures, document, ""), robot.joint_count),
+        **vars(figures),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
 
@@ -393,15 +394,6 @@ class _Figures:
     streams: tuple[StreamStatistics, ...]
     validation: TorqueValidation | None = None
     lag: Lag | None = None
-
-
-def _checked_fields(figures: _Figures, joints: int) -> dict[str, Any]:
-    """Fields by name, after checking that all arrays are of that number of joints."""
-    for stream in (*figures.streams, figures.validation):
-        for name, value in vars(stream).items() if stream else ():
-            if isinstance(value, np.ndarray) and len(value) != joints:
-                raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
-    return vars(figures)
 
 
 def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:

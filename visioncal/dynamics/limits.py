@@ -146,7 +146,17 @@ def motion_limits(
         (*arm_bodies(robot), *bodies),
         share,
     )
-    _check_left(allowed)
+    for place, name in enumerate(allowed.robot.joint_names):
+        left = float(allowed.upper[place] - allowed.lower[place])
+        if left <= 0.0:
+            margin_deg = np.rad2deg(allowed.share.margin_rad)
+            raise DataError(
+                f"robot {allowed.robot.name}: of the range of {name} "
+                f"{np.rad2deg(left) + 2.0 * margin_deg:.1f} deg are left, and a margin of "
+                f"{margin_deg:.1f} deg is wished on both sides.",
+                culprits=[name],
+                next_step="Make the margin smaller (--margin-deg), or mend the limits.",
+            )
     if payload is None or allowed.inertias is None:
         return allowed
     values = allowed.inertias.values.copy()
@@ -174,20 +184,6 @@ def _check_stated(
                 culprits=unlimited,
                 next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
                 f"{option}.",
-            )
-
-
-def _check_left(allowed: MotionLimits) -> None:
-    for place, name in enumerate(allowed.robot.joint_names):
-        left = float(allowed.upper[place] - allowed.lower[place])
-        if left <= 0.0:
-            margin_deg = np.rad2deg(allowed.share.margin_rad)
-            raise DataError(
-                f"robot {allowed.robot.name}: of the range of {name} "
-                f"{np.rad2deg(left) + 2.0 * margin_deg:.1f} deg are left, and a margin of "
-                f"{margin_deg:.1f} deg is wished on both sides.",
-                culprits=[name],
-                next_step="Make the margin smaller (--margin-deg), or mend the limits.",
             )
 
 

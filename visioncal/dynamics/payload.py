@@ -21,7 +21,7 @@ from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms, JointMotion
-from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
+from visioncal.dynamics.regression import NoiseBlock, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, symmetric_entries
 
 # Correlation of the gain errors of an arm's drives: of the 12 % of GAIN_SIGMA about 11 % are common
@@ -132,11 +132,44 @@ def estimate_payload(
         raise DegenerateError(
             "payload: the motion does not determine all of its inertia.", next_step=_HOW
         ) from error
-    gains_covariance = _gains_covariance(loaded, fit, gain_sigma)
+    # A joint's torques with and without the payload are currents times one gain: its contribution
+    # to the payload has the gain's relative error.
+    count = len(fit.values)
+    information, parts = np.zeros((count, count)), np.zeros((count, fit.blocks[0].y.shape[1]))
+    for stream, block, noise in zip(loaded, fit.blocks, fit.sigmas, strict=True):
+        weights = block.used / noise
+        rows = block.x * weights[:, :, None]
+        information += np.einsum("kjp,kjq->pq", rows, rows)
+        parts += stream.of_currents * np.einsum("kjp,kj->pj", rows, block.y * weights)
+    by_joint = gain_sigma * np.linalg.solve(information, parts)
+    common = by_joint.sum(axis=1, keepdims=True)
+    gains_covariance = np.asarray(
+        (1.0 - _GAIN_CORRELATION) * by_joint @ by_joint.T + _GAIN_CORRELATION * common @ common.T
+    )
+    # Errors of the arm's predicted torques pass into the payload through the least-squares fit.
+    base = identified.base
+    information = np.zeros((len(fit.values), len(fit.values)))
+    cross = np.zeros((len(fit.values), base.rank))
+    for stream, block, sigma in zip(loaded, fit.blocks, fit.sigmas, strict=True):
+        weights = (block.used / sigma)[:, :, None]
+        own = stream.filtered(base.regressor) * weights
+        rows = (block.x * weights).reshape(-1, len(fit.values))
+        information += rows.T @ rows
+        cross += rows.T @ own.reshape(-1, base.rank)
+    sensitivity = np.linalg.solve(information, cross)
+    kept = slice(base.rank)
+    sigmas = np.zeros(10)
+    if "gravity_m_s2" not in identified.robot.document:
+        # Gravity's relative standard deviation over inhabited places.
+        sigmas[:4] = 5e-4 * fit.values[:4]
     payload = Payload(
         fit.values[:10],
-        (fit.covariance + _arm_covariance(identified, loaded, fit) + gains_covariance)[:10, :10]
-        + _gravity_covariance(identified, fit),
+        (
+            fit.covariance
+            + np.asarray(sensitivity @ identified.covariance[kept, kept] @ sensitivity.T)
+            + gains_covariance
+        )[:10, :10]
+        + np.outer(sigmas, sigmas),
         rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
         float(np.sqrt(gains_covariance[0, 0])),
     )
@@ -160,52 +193,6 @@ def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) ->
 
     excess = stream.torques_nm - stream.filtered(identified.torques)
     return NoiseBlock(stream.filtered(columns), excess, stream.used, stream.correlation)
-
-
-def _arm_covariance(
-    identified: Identified, loaded: Sequence[Conditioned], fit: Regression
-) -> FloatArray:
-    """Covariance that the arm's own uncertainty adds to the payload's."""
-    # Errors of the arm's predicted torques pass into the payload through the least-squares fit.
-    base = identified.base
-    information = np.zeros((len(fit.values), len(fit.values)))
-    cross = np.zeros((len(fit.values), base.rank))
-    for stream, block, sigma in zip(loaded, fit.blocks, fit.sigmas, strict=True):
-        weights = (block.used / sigma)[:, :, None]
-        own = stream.filtered(base.regressor) * weights
-        rows = (block.x * weights).reshape(-1, len(fit.values))
-        information += rows.T @ rows
-        cross += rows.T @ own.reshape(-1, base.rank)
-    sensitivity = np.linalg.solve(information, cross)
-    kept = slice(base.rank)
-    return np.asarray(sensitivity @ identified.covariance[kept, kept] @ sensitivity.T)
-
-
-def _gravity_covariance(identified: Identified, fit: Regression) -> FloatArray:
-    """(10, 10) covariance that unstated gravity adds to the mass and the first moments."""
-    sigmas = np.zeros(10)
-    if "gravity_m_s2" not in identified.robot.document:
-        # Gravity's relative standard deviation over inhabited places.
-        sigmas[:4] = 5e-4 * fit.values[:4]
-    return np.outer(sigmas, sigmas)
-
-
-def _gains_covariance(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> FloatArray:
-    """Covariance that errors of the drive gains add."""
-    # A joint's torques with and without the payload are currents times one gain: its contribution
-    # to the payload has the gain's relative error.
-    count = len(fit.values)
-    information, parts = np.zeros((count, count)), np.zeros((count, fit.blocks[0].y.shape[1]))
-    for stream, block, noise in zip(loaded, fit.blocks, fit.sigmas, strict=True):
-        weights = block.used / noise
-        rows = block.x * weights[:, :, None]
-        information += np.einsum("kjp,kjq->pq", rows, rows)
-        parts += stream.of_currents * np.einsum("kjp,kj->pj", rows, block.y * weights)
-    by_joint = sigma * np.linalg.solve(information, parts)
-    common = by_joint.sum(axis=1, keepdims=True)
-    return np.asarray(
-        (1.0 - _GAIN_CORRELATION) * by_joint @ by_joint.T + _GAIN_CORRELATION * common @ common.T
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,37 +53,33 @@ def _motion_table(motion: JointMotion) -> str:
 
 def motion_document(plan: MotionPlan) -> dict[str, Any]:
     """Builds the content of plan.json; fields that do not apply are absent."""
+    mean, sines, cosines = plan.excitation.series.coefficients
+    request = plan.excitation.request
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "kind": "dynamics",
         "visioncal": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "joints": list(plan.allowed.robot.joint_names),
-        "excitation": _excitation(plan.excitation),
+        "excitation": {
+            "period_s": request.period_s,
+            "harmonics": request.harmonics,
+            "start_rad": plan.excitation.series.start.tolist(),
+            "mean_rad": mean.tolist(),
+            "sine_rad": sines.tolist(),
+            "cosine_rad": cosines.tolist(),
+            "condition": plan.excitation.condition,
+            "condition_random": plan.excitation.random,
+            "base_parameters": list(plan.excitation.base.names),
+            "kept": _kept(plan.excitation.extremes),
+            "seed": request.seed,
+        },
     }
     if plan.sweeps is not None:
         document["sweeps"] = _sweeps(plan.sweeps)
     if unchecked := plan.allowed.unchecked:
         document["not_checked"] = list(unchecked)
     return document | {"robot": dict(plan.allowed.robot.document)}
-
-
-def _excitation(excitation: Excitation) -> dict[str, Any]:
-    mean, sines, cosines = excitation.series.coefficients
-    request = excitation.request
-    return {
-        "period_s": request.period_s,
-        "harmonics": request.harmonics,
-        "start_rad": excitation.series.start.tolist(),
-        "mean_rad": mean.tolist(),
-        "sine_rad": sines.tolist(),
-        "cosine_rad": cosines.tolist(),
-        "condition": excitation.condition,
-        "condition_random": excitation.random,
-        "base_parameters": list(excitation.base.names),
-        "kept": _kept(excitation.extremes),
-        "seed": request.seed,
-    }
 
 
 def _sweeps(sweeps: Sweeps) -> dict[str, Any]:

@@ -72,7 +72,17 @@ def read_recorded(
     """
     names = {name: _names(name, count) for name in ("q", "tau", "current", "dq")}
     present = {word: [name in stream for name in names[word]] for word in names}
-    _check_joints(stream, label, count)
+    known = {name for kind in ("q", "dq", "tau", "current") for name in _names(kind, count)}
+    beyond = [
+        column for column in stream.columns if _NUMBERED.fullmatch(column) and column not in known
+    ]
+    if beyond:
+        raise DataError(
+            f"{label} has {', '.join(beyond)}, but the robot has {count} joints.",
+            culprits=[f"{label}, {name}" for name in beyond],
+            next_step="Name the robot that was recorded under [robot] in session.toml, or leave "
+            "the columns of other axes out.",
+        )
     of_currents = not any(present["tau"]) and any(present["current"])
     drive = "current" if of_currents else "tau"
     missing = [
@@ -108,21 +118,6 @@ def read_recorded(
 def _names(kind: str, count: int) -> list[str]:
     unit = {"q": "rad", "dq": "rad_s", "tau": "nm", "current": "a"}[kind]
     return [f"{kind}{joint}_{unit}" for joint in range(1, count + 1)]
-
-
-def _check_joints(stream: Stream, label: str, count: int) -> None:
-    """Refuses columns of joints that the robot does not have."""
-    known = {name for kind in ("q", "dq", "tau", "current") for name in _names(kind, count)}
-    beyond = [
-        column for column in stream.columns if _NUMBERED.fullmatch(column) and column not in known
-    ]
-    if beyond:
-        raise DataError(
-            f"{label} has {', '.join(beyond)}, but the robot has {count} joints.",
-            culprits=[f"{label}, {name}" for name in beyond],
-            next_step="Name the robot that was recorded under [robot] in session.toml, or leave "
-            "the columns of other axes out.",
-        )
 
 
 def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:

@@ -315,7 +315,14 @@ def fit_stribeck(
                 break
         fit = regress(_with_humps(streams, blocks, humps))
         humps = replace(humps, hump_nm=fit.values[-2 * len(joints) : -len(joints)])
-        significant = _significant(humps, fit, fit.values[coulomb_indices[joints]])
+        coulomb_nm = fit.values[coulomb_indices[joints]]
+        # Fs below 0 would drive the joint at low speeds: something else is fitted then.
+        count = len(humps.joints)
+        sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
+        limit = float(np.sqrt(chi2_limit(FALSE_REJECTION, 2.0)))
+        inside = (humps.speed_rad_s > 1.01 * _SLOWEST) & (humps.speed_rad_s < 0.99 * _FASTEST)
+        resists = coulomb_nm + humps.hump_nm > 0.0
+        significant = np.asarray((np.abs(humps.hump_nm) > limit * sigma) & inside & resists)
         if significant.all():
             return humps, fit
         joints = joints[significant]
@@ -326,17 +333,6 @@ def _cost(fit: Regression) -> float:
     """Negative log-likelihood of a fit."""
     pairs = zip(fit.blocks, fit.sigmas, strict=True)
     return float(sum(block.used.sum(axis=0) @ np.log(sigma) for block, sigma in pairs))
-
-
-def _significant(humps: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
-    """(a,) humps that are significant, within the bounds of speed, and resist the motion."""
-    # Fs below 0 would drive the joint at low speeds: something else is fitted then.
-    count = len(humps.joints)
-    sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
-    limit = float(np.sqrt(chi2_limit(FALSE_REJECTION, 2.0)))
-    inside = (humps.speed_rad_s > 1.01 * _SLOWEST) & (humps.speed_rad_s < 0.99 * _FASTEST)
-    resists = coulomb_nm + humps.hump_nm > 0.0
-    return np.asarray((np.abs(humps.hump_nm) > limit * sigma) & inside & resists)
 
 
 def _with_humps(

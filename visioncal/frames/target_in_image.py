@@ -61,7 +61,20 @@ def target_pose_candidates(
             not fit any pose of it.
     """
     corners = seen if isinstance(seen, Corners) else _detected(eye, seen, target, label)
-    _check_corners(corners, target, label)
+    positions = corner_positions(target)
+    ids = corners.ids
+    if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
+        raise DataError(
+            f"{label}: corners {ids.min()} to {ids.max()}, and target {target.name} has "
+            f"{len(positions)}.",
+            culprits=[label],
+        )
+    if not determines_pose(positions[ids]):
+        raise DataError(
+            f"{label}: {len(ids)} corners of target {target.name} do not determine its pose: it "
+            "takes four, of which two lie off every line.",
+            culprits=[label],
+        )
     noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
     with one_blas_thread():
         in_model = replace(corners, px=eye.lens.in_model(corners.px))
@@ -140,23 +153,6 @@ def _detected(eye: CalibratedCamera, image: Image, target: Target, label: str) -
             culprits=[label],
         )
     return seen
-
-
-def _check_corners(corners: Corners, target: Target, label: str) -> None:
-    positions = corner_positions(target)
-    ids = corners.ids
-    if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
-        raise DataError(
-            f"{label}: corners {ids.min()} to {ids.max()}, and target {target.name} has "
-            f"{len(positions)}.",
-            culprits=[label],
-        )
-    if not determines_pose(positions[ids]):
-        raise DataError(
-            f"{label}: {len(ids)} corners of target {target.name} do not determine its pose: it "
-            "takes four, of which two lie off every line.",
-            culprits=[label],
-        )
 
 
 def _fit_poses(

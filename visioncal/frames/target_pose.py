@@ -177,7 +177,19 @@ def _find_inliers(candidates: _CandidateViews) -> _ImageInliers:
 
     Where no more than half are inliers, the correct ones are unknown, and all are kept.
     """
-    picks, agrees = _start(candidates)
+    best: tuple[float, IntArray, FloatArray] | None = None
+    half = len(candidates.views) // 2 + 1
+    for seed in (place for view in candidates.views for place in view):
+        nearest, picks = _nearest(candidates, seed)
+        score = float(np.sort(nearest)[:half].sum())
+        # Poses of a symmetric board fit equally, apart from rounding of their fits.
+        if best is None or score < (1.0 - 1e-6) * best[0] - 1e-9:
+            best = (score, picks, nearest)
+    if best is None:
+        raise RuntimeError("there are no images to agree")
+    _, picks, nearest = best
+    agrees = np.zeros(len(picks), dtype=bool)
+    agrees[np.argsort(nearest)[:half]] = True
     search = _ImageSearch(candidates, picks)
     agrees, fit = settled(search, agrees, _fit(candidates, picks, agrees), fewest=2, suspect=0.0)
     if 2 * int(agrees.sum()) <= len(picks):
@@ -198,24 +210,6 @@ class _ImageSearch:
     def distances(self, _: Mask, fit: _ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
         return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
-
-
-def _start(candidates: _CandidateViews) -> tuple[IntArray, Mask]:
-    """Selected candidates, and the half of the images nearest to one pose (least median)."""
-    best: tuple[float, IntArray, FloatArray] | None = None
-    half = len(candidates.views) // 2 + 1
-    for seed in (place for view in candidates.views for place in view):
-        nearest, picks = _nearest(candidates, seed)
-        score = float(np.sort(nearest)[:half].sum())
-        # Poses of a symmetric board fit equally, apart from rounding of their fits.
-        if best is None or score < (1.0 - 1e-6) * best[0] - 1e-9:
-            best = (score, picks, nearest)
-    if best is None:
-        raise RuntimeError("there are no images to agree")
-    _, picks, nearest = best
-    agrees = np.zeros(len(picks), dtype=bool)
-    agrees[np.argsort(nearest)[:half]] = True
-    return picks, agrees
 
 
 def _nearest(candidates: _CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:

@@ -10,7 +10,6 @@ from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results.arm import (
     NOMINAL,
     ArmErrorsResult,
-    ArmParameter,
     ArmResult,
     ElasticResult,
     ThermalResult,
@@ -59,14 +58,10 @@ def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
     )
     off_by = Fact(
         f"{'the flange' if errors.of else 'a link'} is typically off by",
-        _size(errors.sigma_mm, errors.sigma_deg),
+        f"{significant(errors.sigma_mm)} mm, {significant(errors.sigma_deg)} deg",
     )
     ratio = Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15")
     return (off_by, ratio, Fact("its errors were", *treatment))
-
-
-def _size(mm: float | None, deg: float | None) -> str:
-    return f"{significant(mm)} mm, {significant(deg)} deg"
 
 
 def level_table(arm: ArmResult) -> Table | None:
@@ -93,33 +88,28 @@ def parameter_tables(arm: ArmResult, count: int = 1) -> list[Table]:
     """The parameters of the arm's model, joint by joint, in `count` tables."""
     joints: dict[str, list[TableRow]] = {}
     for parameter in arm.parameters:
+        suffix = next((end for end in _UNITS if parameter.name.endswith(end)), "")
+        unit, scale = _UNITS.get(suffix, ("", 1.0))
+        stem = parameter.name.removesuffix(suffix)
+        sigma = None if parameter.sigma is None else scale * parameter.sigma
+        decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
+        cells = (
+            _SYMBOLS.get(stem, stem.replace("_", " ")),
+            # All digits of the nominal value, whatever the sigma.
+            f"{scale * parameter.nominal + 0.0:.7g}",
+            fixed(scale * parameter.identified, decimals),
+            signed(scale * parameter.change, decimals),
+            f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
+            unit,
+        )
         joints.setdefault(parameter.joint, [TableRow((joint_words(parameter.joint),))]).append(
-            _parameter_row(parameter)
+            TableRow(cells, "sure" if parameter.is_sure else "")
         )
     titles, rows = ("parameter", "nominal", "identified", "change", "sigma", "unit"), [*joints]
     size = max(-(-len(rows) // count), 1)
     groups = [rows[start : start + size] for start in range(0, len(rows), size)]
     return [Table(titles, tuple(joint for name in names for joint in joints[name]), (0, 4, 5))
             for names in groups]  # fmt: skip
-
-
-def _parameter_row(parameter: ArmParameter) -> TableRow:
-    """One parameter's row, rounded by the sigma of its change."""
-    suffix = next((end for end in _UNITS if parameter.name.endswith(end)), "")
-    unit, scale = _UNITS.get(suffix, ("", 1.0))
-    stem = parameter.name.removesuffix(suffix)
-    sigma = None if parameter.sigma is None else scale * parameter.sigma
-    decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
-    cells = (
-        _SYMBOLS.get(stem, stem.replace("_", " ")),
-        # All digits of the nominal value, whatever the sigma.
-        f"{scale * parameter.nominal + 0.0:.7g}",
-        fixed(scale * parameter.identified, decimals),
-        signed(scale * parameter.change, decimals),
-        f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
-        unit,
-    )
-    return TableRow(cells, "sure" if parameter.is_sure else "")
 
 
 def identifiability_facts(arm: ArmResult) -> Iterator[Fact]:

@@ -44,7 +44,20 @@ def robot_states(
 ) -> Mapping[str, Mapping[int, RobotState]]:
     """State of each robot, where known, by flange and view number."""
     if calibration is not None and calibration.cell is not None:
-        return _cell_states(session, calibration)
+        rows = session.robot_rows
+        models = result_parts.calibrated_robots(calibration)
+        by_flange: dict[str, Mapping[int, RobotState]] = {}
+        for flange, name in result_parts.frames(calibration).robots.items():
+            by_view = {view: by_robot[name] for view, by_robot in rows.items() if name in by_robot}
+            known = {view: _state(row, models.get(name)) for view, row in by_view.items()}
+            current = next((state for state in known.values() if state is not None), None)
+            filled: dict[int, RobotState] = {}
+            for view in session.views:
+                current = known.get(view.number) or (current and replace(current, is_past=True))
+                if current is not None:
+                    filled[view.number] = current
+            by_flange[flange] = filled
+        return by_flange
     # Without a result, the bases of several robots have no known poses.
     views = () if session.is_network else session.views
     poses = reported_matrices(views)
@@ -59,29 +72,6 @@ def robot_states(
         for view in views
     }
     return {flange: {view: state for view, state in states.items() if state is not None}}
-
-
-def _cell_states(
-    session: Session, calibration: Calibration
-) -> Mapping[str, Mapping[int, RobotState]]:
-    """States in a cell: at the view's stop, or else at the last stop with a pose.
-
-    A robot without a pose so far has its first one.
-    """
-    rows = session.robot_rows
-    models = result_parts.calibrated_robots(calibration)
-    states: dict[str, Mapping[int, RobotState]] = {}
-    for flange, name in result_parts.frames(calibration).robots.items():
-        by_view = {view: by_robot[name] for view, by_robot in rows.items() if name in by_robot}
-        known = {view: _state(row, models.get(name)) for view, row in by_view.items()}
-        current = next((state for state in known.values() if state is not None), None)
-        filled: dict[int, RobotState] = {}
-        for view in session.views:
-            current = known.get(view.number) or (current and replace(current, is_past=True))
-            if current is not None:
-                filled[view.number] = current
-        states[flange] = filled
-    return states
 
 
 def _state(row: View, robot: Robot | None) -> RobotState | None:
@@ -115,7 +105,10 @@ class CellPoses:
         """The cell of a result, with flange poses from the evidence, or else as recorded."""
         frames = result_parts.frames(calibration)
         states = robot_states(session, calibration, evidence)
-        size_m = _size_m(frames, states)
+        poses = [state.pose for by_view in states.values() for state in by_view.values()]
+        distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
+        extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *frames.fixed_m], axis=0)))
+        size_m = max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)
         if calibration is None:
             return cls(frames, states, {}, {}, {}, size_m)
         cameras = result_parts.cameras(calibration).items()
@@ -153,11 +146,3 @@ class CellPoses:
         """Robots of a cell without a pose at the stop of a view."""
         states = {robot: self.states[name].get(view) for name, robot in self.frames.robots.items()}
         return [robot for robot, state in states.items() if robot and (not state or state.is_past)]
-
-
-def _size_m(frames: FrameHierarchy, states: Mapping[str, Mapping[int, RobotState]]) -> float:
-    """Distance of flanges from their bases, or half the cell's extent if that is larger."""
-    poses = [state.pose for by_view in states.values() for state in by_view.values()]
-    distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-    extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *frames.fixed_m], axis=0)))
-    return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)

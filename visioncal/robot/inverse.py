@@ -240,7 +240,13 @@ def _moved(
 ) -> FloatArray:
     """One damped step within the bounds; joints that would leave them from a limit are held."""
     for _ in range(len(positions)):
-        wanted = positions - _step(jacobian, error, damping)
+        # LAPACK directly: numpy's overhead would double the time of a step.
+        rows, columns = jacobian.shape
+        long = columns > rows
+        gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian
+        gram.flat[:: len(gram) + 1] += damping
+        solved = dposv(gram, error if long else error @ jacobian)[1]
+        wanted = positions - np.asarray(solved @ jacobian if long else solved)
         moved = np.minimum(np.maximum(wanted, bounds.lower), bounds.upper)
         limited = moved != wanted
         if not limited.any():
@@ -250,14 +256,3 @@ def _moved(
             break
         jacobian = np.where(held, 0.0, jacobian)
     return np.asarray(moved)
-
-
-def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
-    """The damped step, by the smaller of the two equivalent systems."""
-    # LAPACK directly: numpy's overhead would double the time of a step.
-    rows, columns = jacobian.shape
-    long = columns > rows
-    gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian
-    gram.flat[:: len(gram) + 1] += damping
-    solved = dposv(gram, error if long else error @ jacobian)[1]
-    return np.asarray(solved @ jacobian if long else solved)

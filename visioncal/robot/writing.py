@@ -271,7 +271,15 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
         if joint is None:
             root.extend(_corrected_tip_link(nominal.tip, joints, step))
         else:
-            _set_origin(joint, _placement(joint) @ step)
+            origin = joint.find("origin")
+            attributes = {} if origin is None else origin.attrib
+            xyz, rpy = (
+                np.array(attributes.get(key, "0 0 0").split(), dtype=float)
+                for key in ("xyz", "rpy")
+            )
+            _set_origin(
+                joint, compose(ROTATION_FORMS["euler-xyz-rad"].read(rpy[None])[0], xyz) @ step
+            )
     return _with_comments(root, comment_texts(corrected, notes))
 
 
@@ -300,16 +308,6 @@ def _with_comments(root: Element, comments: Sequence[str]) -> str:
     root[:0] = [Comment(f" {comment} ") for comment in comments]
     indent(root)
     return f'<?xml version="1.0"?>\n{tostring(root, encoding="unicode")}\n'
-
-
-def _placement(joint: Element) -> FloatArray:
-    """A joint's origin (4, 4) [m]."""
-    origin = joint.find("origin")
-    attributes = {} if origin is None else origin.attrib
-    xyz, rpy = (
-        np.array(attributes.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy")
-    )
-    return compose(ROTATION_FORMS["euler-xyz-rad"].read(rpy[None])[0], xyz)
 
 
 def _of_tip(joints: Mapping[str, Element], robot: Robot) -> Element | None:
@@ -350,19 +348,14 @@ def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
     else:
         document = robot.weighted(chain_document(robot.name, robot.tip, robot.chain))
         joint_from_row = np.broadcast_to(np.eye(4), (robot.joint_count, 4, 4))
-    rows = zip(document["joint"], _in_row_frames(inertias, joint_from_row).rows(), strict=True)
-    joints: list[dict[str, Any]] = [{**row, **own} for row, own in rows]
-    return Robot.from_document(document | {"joint": joints})
-
-
-def _in_row_frames(inertias: Inertias, joint_from_row: FloatArray) -> Inertias:
-    """The inertias in the frames in which rows end."""
     row_from_joint = invert(joint_from_row)
     rotation, position = row_from_joint[:, :3, :3], row_from_joint[:, :3, 3]
     masses = inertias.masses
     centres = (rotation @ masses.centres_m[:, :, None])[:, :, 0] + position
     about = rotation @ inertias.about_centres @ np.swapaxes(rotation, 1, 2)
-    return Inertias.of_bodies(masses.kg, centres, about)
+    rows = zip(document["joint"], Inertias.of_bodies(masses.kg, centres, about).rows(), strict=True)
+    joints: list[dict[str, Any]] = [{**row, **own} for row, own in rows]
+    return Robot.from_document(document | {"joint": joints})
 
 
 def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) -> str:

@@ -440,7 +440,24 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         DataError: A component is unknown, or the robot does not move target and camera relative to
             each other.
     """
-    _check(cell, swept)
+    layout = cell.layout
+    for kind, name, things in (
+        ("robot", swept.robot, layout.robots),
+        ("camera", swept.camera, layout.cameras),
+        ("target", swept.target, layout.boards),
+    ):
+        known = [thing.name for thing in things]
+        if name not in known:
+            raise DataError(
+                f"simulation: a sweep is of {kind} {name!r}; there are {', '.join(known)}."
+            )
+    ends = frame_name("camera", swept.camera), frame_name("target", swept.target)
+    carriers = [cell.parents[end] for end in ends]
+    if sorted(carriers) != sorted((CELL, frame_name("flange", swept.robot))):
+        raise DataError(
+            f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "
+            f"to be on robot {swept.robot} and the other in the cell."
+        )
     options, robot = cell.options, cell.robots[swept.robot]
     index = list(cell.robots).index(swept.robot)
     rng, stamp_noise = (
@@ -474,28 +491,6 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         )
     streams = {**cell.streams, swept.robot: recorded}
     return replace(cell, sights=(*cell.sights, *sights), streams=streams)
-
-
-def _check(cell: SimulatedCell, swept: Swept) -> None:
-    """Checks that the components of a sweep exist and move relative to each other."""
-    layout = cell.layout
-    for kind, name, things in (
-        ("robot", swept.robot, layout.robots),
-        ("camera", swept.camera, layout.cameras),
-        ("target", swept.target, layout.boards),
-    ):
-        known = [thing.name for thing in things]
-        if name not in known:
-            raise DataError(
-                f"simulation: a sweep is of {kind} {name!r}; there are {', '.join(known)}."
-            )
-    ends = frame_name("camera", swept.camera), frame_name("target", swept.target)
-    carriers = [cell.parents[end] for end in ends]
-    if sorted(carriers) != sorted((CELL, frame_name("flange", swept.robot))):
-        raise DataError(
-            f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "
-            f"to be on robot {swept.robot} and the other in the cell."
-        )
 
 
 def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCell:

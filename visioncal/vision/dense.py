@@ -239,7 +239,13 @@ class _Fit:
         terms = np.concatenate([np.ones_like(gain)[None], gain * images])
         grey = self.image - self.light @ values[12:15]
         places = corner_positions(self.target)[:, :2] / self.target.square_m
-        px = self._in_image(values, places)
+        flat = np.linalg.inv(np.append(values[:8], 1.0).reshape(3, 3))
+        straight = cv2.perspectiveTransform(places[None], flat)[0]
+        bent = straight
+        # A fixed point: distortion in the image is slight.
+        for _ in range(50):
+            bent = straight * (1 + values[8] * np.sum(bent**2, axis=1, keepdims=True))
+        px = np.asarray(self.unit_px[:2] + self.unit_px[2] * bent)
         rows: list[tuple[int, FloatArray, float, float]] = []
         for number, (place, at) in enumerate(zip(places, px, strict=True)):
             patch = (np.abs(board - place) < 0.5).all(axis=-1)
@@ -273,16 +279,6 @@ class _Fit:
             self.factor * values[10:12],
             float(np.sqrt(typical)),
         )
-
-    def _in_image(self, values: FloatArray, places: FloatArray) -> FloatArray:
-        """(n, 2) pixels of the reduced image where (n, 2) places on the board are seen."""
-        flat = np.linalg.inv(np.append(values[:8], 1.0).reshape(3, 3))
-        straight = cv2.perspectiveTransform(places[None], flat)[0]
-        bent = straight
-        # A fixed point: distortion in the image is slight.
-        for _ in range(50):
-            bent = straight * (1 + values[8] * np.sum(bent**2, axis=1, keepdims=True))
-        return np.asarray(self.unit_px[:2] + self.unit_px[2] * bent)
 
 
 def _texture(target: Target, blur: float) -> npt.NDArray[np.float32]:

@@ -113,7 +113,21 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     joints, notes = _joints(np.array(rows[state], dtype=float), features, state, requested)
     episodes, stamps_s = (np.array(rows[name], dtype=float) for name in columns[3:0:-2])
     fps = float(info.get("fps", 30.0))
-    chosen, how = _chosen(joints, episodes, fps)
+    reach, count = max(round(_STILL_S * fps), 1), len(joints)
+    at = np.arange(count)
+    sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
+    is_still = np.all(
+        [
+            (np.abs(joints[side] - joints).max(axis=1) < _STILL_RAD)
+            & (episodes[side] == episodes)
+            & (np.abs(side - at) == reach)
+            for side in sides
+        ],
+        axis=0,
+    )
+    still = np.flatnonzero(is_still)
+    moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
+    chosen, how = frames_to_take(at, still, moved, 60)
     paths = tuple(Path(f"images/{at:06d}.png") for at in chosen.tolist())
     places: dict[str, tuple[Path, int] | bytes] = {}
     if is_video:
@@ -180,25 +194,6 @@ def _joints(
             "record it anew."
         )
     return np.deg2rad(state) if is_deg else state, notes
-
-
-def _chosen(joints: FloatArray, episodes: FloatArray, fps: float) -> tuple[IntArray, str]:
-    """The rows to take, as `frames_to_take` has them."""
-    reach, count = max(round(_STILL_S * fps), 1), len(joints)
-    at = np.arange(count)
-    sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
-    is_still = np.all(
-        [
-            (np.abs(joints[side] - joints).max(axis=1) < _STILL_RAD)
-            & (episodes[side] == episodes)
-            & (np.abs(side - at) == reach)
-            for side in sides
-        ],
-        axis=0,
-    )
-    still = np.flatnonzero(is_still)
-    moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
-    return frames_to_take(at, still, moved, 60)
 
 
 def _starts(

@@ -60,7 +60,7 @@ def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tupl
     positions: dict[tuple[str, ...], str] = {}
     rotations: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, size in sizes.items():
-        words = _words(name)
+        words = [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
         is_whole = size == 16 or (size in (6, 7, 12) and (_POSE_WORDS | _CHILD_FIRST) & {*words})
         # A single matrix without frame words is the robot's.
         is_plain = [*sizes.values()] == [16] and whose == "robot" and not _sides(words)
@@ -77,10 +77,6 @@ def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tupl
             # Of several rotations the least ambiguous: a matrix, then a quaternion.
             found[position, max(rotations[rest], key=lambda index: sizes[index])] = None
     return next(iter(found)) if len(found) == 1 else ()
-
-
-def _words(name: str) -> list[str]:
-    return [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
 
 
 def _is_of(words: Sequence[str], whose: str) -> bool:

@@ -172,7 +172,15 @@ def reread(
     camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
     robot = doubtful.robot or numbers_in(session, POSE)
     reading = candidate.hypothesis
-    _check_applies(candidate, session, robot)
+    streamed = any(name in stream for stream in session.streams.values() for name in POSE)
+    recorded = streamed or robot.present.any()
+    if not recorded and candidate.hypothesis.robot != candidate.recording.declared.robot:
+        raise DataError(
+            f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
+            "alone, of which that cannot be said.",
+            culprits=[candidate.words],
+            next_step="Check the robot's model, its tip, and the camera's poses.",
+        )
     if _is_one_log(chain_poses(session), robot):
         names = joint_columns(session.columns)
         order = reading.rows(len(cells))
@@ -234,19 +242,6 @@ def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
     values[:, columns] = [[float(row.get(name, "nan")) for name in POSE] for row in rows]
     values.setflags(write=False)
     return replace(stream, values=values)
-
-
-def _check_applies(candidate: Candidate, session: Session, robot: PoseNumbers) -> None:
-    """Refuses another reading of poses where only joint angles are recorded."""
-    streamed = any(name in stream for stream in session.streams.values() for name in POSE)
-    recorded = streamed or robot.present.any()
-    if not recorded and candidate.hypothesis.robot != candidate.recording.declared.robot:
-        raise DataError(
-            f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
-            "alone, of which that cannot be said.",
-            culprits=[candidate.words],
-            next_step="Check the robot's model, its tip, and the camera's poses.",
-        )
 
 
 def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:

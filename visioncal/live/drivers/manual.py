@@ -52,7 +52,21 @@ class ManualArm:
                 shift all that follow.
         """
         if not self.answers:
-            return self._next_of_file()
+            while not (line := self._ask("").strip()):
+                pass
+            if line.lower() == "q":
+                raise EOFError
+            forms = possible_forms(line)
+            if self._form is None and len(forms) > 1:
+                raise DriverError(
+                    f"{line!r} may be a pose of {', '.join(forms)}.",
+                    culprits=["stdin"],
+                    next_step=f"Say which: --pose-form {forms[0]}.",
+                )
+            pose = self._read(line)
+            if isinstance(pose, str):
+                raise DriverError(pose, culprits=["stdin"], next_step="Correct it: a pose a line.")
+            return ArmState(time.monotonic(), pose.pose)
         line = self._answer("Pose of the flange: ")
         while True:
             pose = self._read(line)
@@ -65,24 +79,6 @@ class ManualArm:
             )
             if not line.strip():
                 return ArmState(time.monotonic(), pose.pose)
-
-    def _next_of_file(self) -> ArmState:
-        """State from the next line of a file that is not empty."""
-        while not (line := self._ask("").strip()):
-            pass
-        if line.lower() == "q":
-            raise EOFError
-        forms = possible_forms(line)
-        if self._form is None and len(forms) > 1:
-            raise DriverError(
-                f"{line!r} may be a pose of {', '.join(forms)}.",
-                culprits=["stdin"],
-                next_step=f"Say which: --pose-form {forms[0]}.",
-            )
-        pose = self._read(line)
-        if isinstance(pose, str):
-            raise DriverError(pose, culprits=["stdin"], next_step="Correct it: a pose a line.")
-        return ArmState(time.monotonic(), pose.pose)
 
     def close(self) -> None:
         """Holds no resources."""

@@ -256,7 +256,16 @@ class UrArm:
             self._flange_from_tool = _matrix(read_tool_offset(self._host))
             return
         try:
-            self._take_control(control)
+            try:
+                self._control = control.RTDEControlInterface(self._host, _RATE_HZ)
+            except RuntimeError as error:
+                raise self._explained_error(f"does not take the control script: {error}") from error
+            self._line = CallThread(self._name, self._kick_watchdog, _KICK_S)
+            offset = self._line.call(
+                self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
+            )
+            self._flange_from_tool = _matrix(offset)
+            self._enable_watchdog(self._line)
         except DriverError:
             self.close()
             raise
@@ -335,7 +344,14 @@ class UrArm:
         self._states.check()
         self._check_safety()
         if not self._control.isProgramRunning():
-            self._restart_program(line)
+            read_condition(self._host).check_moves()
+            line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
+            timer = Stopwatch()
+            while not self._control.isProgramRunning():
+                if timer.read() > _CALL_S:
+                    raise self._explained_error("does not run the control script")
+                time.sleep(0.01)
+            self._enable_watchdog(line)
         before = self._control.getAsyncOperationProgressEx().changeCount()
         accepted = line.call(
             lambda: self._control.moveJ(goal.tolist(), speed, acceleration, True),
@@ -409,19 +425,6 @@ class UrArm:
             self._line.end()
         disconnecting_states.join(max(0.0, ends_s - time.monotonic()))
 
-    def _take_control(self, library: Any) -> None:  # noqa: ANN401
-        """Sends the control script, and reads the tool offset."""
-        try:
-            self._control = library.RTDEControlInterface(self._host, _RATE_HZ)
-        except RuntimeError as error:
-            raise self._explained_error(f"does not take the control script: {error}") from error
-        self._line = CallThread(self._name, self._kick_watchdog, _KICK_S)
-        offset = self._line.call(
-            self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
-        )
-        self._flange_from_tool = _matrix(offset)
-        self._enable_watchdog(self._line)
-
     def _enable_watchdog(self, line: CallThread) -> None:
         """Makes the controller stop the arm if this computer falls silent."""
         line.call(
@@ -435,17 +438,6 @@ class UrArm:
         with suppress(RuntimeError):
             if self._states.alive and self._control.isProgramRunning():
                 self._control.kickWatchdog()
-
-    def _restart_program(self, line: CallThread) -> None:
-        """Sends the control script again after it was ended at the pendant, or in a pause."""
-        read_condition(self._host).check_moves()
-        line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
-        timer = Stopwatch()
-        while not self._control.isProgramRunning():
-            if timer.read() > _CALL_S:
-                raise self._explained_error("does not run the control script")
-            time.sleep(0.01)
-        self._enable_watchdog(line)
 
     def _disconnect_control(self) -> None:
         if self._states.alive and self._control.isProgramRunning():

@@ -205,14 +205,9 @@ def without_password(url: str) -> str:
     return f"{scheme}{separator}{authority.rpartition('@')[2]}{slash}{path}" if separator else url
 
 
-def _is_url(source: int | str) -> bool:
-    """Whether a source is a URL, and no GStreamer pipeline that contains one."""
-    scheme, separator, _ = str(source).partition("://")
-    return bool(separator) and "!" not in scheme
-
-
 def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.VideoCapture:
-    is_url = _is_url(source)
+    scheme, separator, _ = str(source).partition("://")
+    is_url = bool(separator) and "!" not in scheme
     if is_url and (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
         raise DriverError(
             f"The {name} cannot be set from here: a URL gives nothing but pictures.",

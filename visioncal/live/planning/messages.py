@@ -3,7 +3,6 @@
 from visioncal.core.number_format import counted, figure, percent, some_of
 from visioncal.dynamics.limits import MotionExtremes
 from visioncal.dynamics.plan_files import MotionPlan
-from visioncal.dynamics.sweeps import Sweeps
 from visioncal.live.planning.pick_probability import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
 
@@ -36,7 +35,14 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
         f"it uses {_used(motion.extremes)}",
     ]
     if plan.sweeps is not None:
-        words += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.extremes)}"]
+        speeds = [stroke.speed for stroke in plan.sweeps.strokes if stroke.sweeps]
+        joints = len({stroke.joint for stroke in plan.sweeps.strokes})
+        words += [
+            f"sweeps of {joints} joints, one at a time, there and back at "
+            f"{len(speeds) // (2 * joints)} speeds from {figure(min(speeds))} to "
+            f"{figure(max(speeds))} rad/s: {plan.sweeps.begins_s[-1]:.0f} s",
+            f"they use {_used(plan.sweeps.extremes)}",
+        ]
     return tuple(words)
 
 
@@ -55,13 +61,3 @@ def _used(kept: MotionExtremes) -> str:
     if kept.nearest:
         near = f"; {' and '.join(kept.nearest)} come to {1e3 * kept.clearance_m:.0f} mm"
     return f"at most {', '.join(parts)} allowed{near}"
-
-
-def _sweeps(sweeps: Sweeps) -> str:
-    speeds = [stroke.speed for stroke in sweeps.strokes if stroke.sweeps]
-    joints = len({stroke.joint for stroke in sweeps.strokes})
-    return (
-        f"sweeps of {joints} joints, one at a time, there and back at "
-        f"{len(speeds) // (2 * joints)} speeds from {figure(min(speeds))} to "
-        f"{figure(max(speeds))} rad/s: {sweeps.begins_s[-1]:.0f} s"
-    )

@@ -12,6 +12,20 @@ from visioncal.present.recording.preview import MotionPreview, Preview, PreviewS
 def preview_of(plan: Plan, name: str) -> Preview:
     """Builds the preview of a plan under a name."""
     cell = plan.cell
+    lines = [f"# {len(plan.stops)} stops for {plan.request.purpose.name}", name, ""]
+    lines.append(f"{summary_of(plan)}.")
+    if plan.need is not None and plan.need.limits:
+        lines += ["", f"**{plan.need.limits}**"]
+    if plan.start is not None and plan.start.refusal:
+        lines += ["", f"So far: {plan.start.refusal}"]
+    lines += [
+        "",
+        "The most informative first, each with what is predicted of it and all above it. Views are "
+        "numbered as the arm drives to them.",
+        "",
+    ]
+    ranked = sorted(plan.stops, key=lambda stop: stop.rank)
+    lines += [f"- **view {stop.view}** ({stop.after.words}): {stop.words}" for stop in ranked]
     return Preview(
         cell.mount,
         cell.target,
@@ -23,7 +37,7 @@ def preview_of(plan: Plan, name: str) -> Preview:
         tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
         tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),
         cell.limits.floor_m,
-        _plan_note(plan, name),
+        "\n".join(lines),
     )
 
 
@@ -39,24 +53,6 @@ def _note(stop: PlannedStop) -> str:
             f"{100 * stop.seen:.0f} % of what the cell may be.",
         ]
     )
-
-
-def _plan_note(plan: Plan, name: str) -> str:
-    lines = [f"# {len(plan.stops)} stops for {plan.request.purpose.name}", name, ""]
-    lines.append(f"{summary_of(plan)}.")
-    if plan.need is not None and plan.need.limits:
-        lines += ["", f"**{plan.need.limits}**"]
-    if plan.start is not None and plan.start.refusal:
-        lines += ["", f"So far: {plan.start.refusal}"]
-    lines += [
-        "",
-        "The most informative first, each with what is predicted of it and all above it. Views are "
-        "numbered as the arm drives to them.",
-        "",
-    ]
-    ranked = sorted(plan.stops, key=lambda stop: stop.rank)
-    lines += [f"- **view {stop.view}** ({stop.after.words}): {stop.words}" for stop in ranked]
-    return "\n".join(lines)
 
 
 def motion_preview(plan: MotionPlan) -> MotionPreview:

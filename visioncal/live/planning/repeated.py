@@ -2,7 +2,6 @@
 
 import csv
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,11 +63,9 @@ def stops_to_repeat(
     first = np.unique(stops.poses, axis=0, return_index=True)[1]
     rows = first[spread_postures(poses[first], count)].tolist()
     views = tuple(stops.views[row] for row in rows)
-    return CalibratedStops(views, poses[rows], _joints(session, views))
-
-
-def _joints(session: Session | None, views: Sequence[int]) -> FloatArray | None:
     recorded = {} if session is None else {view.number: view for view in session.views}
     angles = [recorded[view].joints_rad for view in views if view in recorded]
     known = [q for q in angles if q is not None]
-    return np.array(known) if len(known) == len(views) else None
+    return CalibratedStops(
+        views, poses[rows], np.array(known) if len(known) == len(views) else None
+    )

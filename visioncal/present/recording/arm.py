@@ -55,23 +55,22 @@ def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
     # Shares of the arm's length; about a UR's.
     shares = np.linspace(0.03, 0.02, links.shape[1])
     radii_m = lengths_m.sum(axis=1)[:, None] * shares
-    capsules = {
-        "lengths": lengths_m.ravel(),
-        "radii": radii_m.ravel(),
-        "translations": origins[:, :-1].reshape(-1, 3),
-        "quaternions": _from_z_to(links.reshape(-1, 3)),
-    }
-    half_sizes = np.repeat(1.2 * radii_m[:, :-1].reshape(-1, 1), 3, axis=1)
-    return capsules, {"centers": origins[:, 1:-1].reshape(-1, 3), "half_sizes": half_sizes}
-
-
-def _from_z_to(directions: FloatArray) -> FloatArray:
-    """(n, 4) quaternions x, y, z, w that rotate the z axis onto (n, 3) directions."""
+    # Rotations that turn z to the links.
+    directions = links.reshape(-1, 3)
     x, y, z = directions.T
     quaternions = np.stack([-y, x, np.zeros(len(x)), np.linalg.norm(directions, axis=1) + z], 1)
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
     # For -z any horizontal axis will do; links without length have no direction.
-    return np.where(norms > 1e-9, quaternions / np.maximum(norms, 1e-9), [1.0, 0.0, 0.0, 0.0])
+    capsules = {
+        "lengths": lengths_m.ravel(),
+        "radii": radii_m.ravel(),
+        "translations": origins[:, :-1].reshape(-1, 3),
+        "quaternions": np.where(
+            norms > 1e-9, quaternions / np.maximum(norms, 1e-9), [1.0, 0.0, 0.0, 0.0]
+        ),
+    }
+    half_sizes = np.repeat(1.2 * radii_m[:, :-1].reshape(-1, 1), 3, axis=1)
+    return capsules, {"centers": origins[:, 1:-1].reshape(-1, 3), "half_sizes": half_sizes}
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,12 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
         recorder.lay_out(blueprint)
         scene.log_static(stream)
         scene.log_stops(stream, labelled=True)
-        _log_static(stream, preview)
+        width, height = preview.camera.resolution
+        border = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=[[width, height]], colors=colours.GRID)
+        in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
+        stream.log(f"{paths.IMAGE}/border", in_image, border, static=True)
+        log_obstacles(stream, preview.obstacles, preview.floor_m, preview.size_m)
+        stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
         flange_m = np.array([state.pose[:3, 3] for state in states.values()])
         line = rr.LineStrips3D([flange_m], colors=colours.WAY, radii=0.7 * _LINE * preview.size_m)
         stream.log(paths.WAY, rr.CoordinateFrame(paths.BASE_FRAME), line, static=True)
@@ -110,15 +115,6 @@ def _path(preview: Preview) -> tuple[FloatArray, list[int]]:
             path += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
         reached.append(len(path) - 1)
     return np.array(path), reached
-
-
-def _log_static(stream: rr.RecordingStream, preview: Preview) -> None:
-    width, height = preview.camera.resolution
-    border = rr.Boxes2D(mins=[[0.0, 0.0]], sizes=[[width, height]], colors=colours.GRID)
-    in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
-    stream.log(f"{paths.IMAGE}/border", in_image, border, static=True)
-    log_obstacles(stream, preview.obstacles, preview.floor_m, preview.size_m)
-    stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
 
 
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:

@@ -89,7 +89,7 @@ class Scene(CellPoses):
             for part in ("links", "joints", "reach"):
                 stream.log(f"{paths.named(paths.ROBOT, name)}/{part}", base, static=True)
             # Lines from the flange to what it carries.
-            for child in self._carried_by(flange):
+            for child in [name for name, parent in self.frames.parents.items() if parent == flange]:
                 line = rr.LineStrips3D(
                     [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
                     colors=colours.JOINT,
@@ -199,9 +199,6 @@ class Scene(CellPoses):
 
     def _radius(self, share: float) -> float:
         return share * self.size_m
-
-    def _carried_by(self, flange: str) -> list[str]:
-        return [name for name, parent in self.frames.parents.items() if parent == flange]
 
     def _log_image_plane(self, stream: rr.RecordingStream, camera: Camera, frame: str) -> None:
         """Places the image in a camera's frame."""

@@ -25,6 +25,15 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
     undone = "" if change is None or change.cause.kind == NOISE else change_words(check, change)
     stops = [str(view) for view in check.predicted.views]
     before, after = _lengths(check.residuals), _lengths(check.remaining)
+    rows = []
+    for change in [] if check.passed else listed_changes(check):
+        share, is_found = 100.0 * change.probability, change in check.named
+        cells = (
+            f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
+            "found" if is_found else "ruled out",
+            change_words(check, change),
+        )
+        rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return template("check.html.j2").render(
         check=check,
         kind="Check of a calibration",
@@ -34,7 +43,7 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
         judged=verdict,
         provenance={},
         undone=undone,
-        changes=_change_table(check),
+        changes=_reasons(rows, ("share", "", "change")),
         triggers=_reasons(
             TableRow(
                 (_STATES[state], "", trigger.words), "look" if state == "fired" else "rejected"
@@ -65,20 +74,6 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
     return Table.of(
         ("stop (views)", *columns), [(name, *map(significant, row)) for name, *row in rows]
     )
-
-
-def _change_table(check: Check) -> Table:
-    """Changes that were compared: their probability, and whether the check found them."""
-    rows = []
-    for change in [] if check.passed else listed_changes(check):
-        share, is_found = 100.0 * change.probability, change in check.named
-        cells = (
-            f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
-            "found" if is_found else "ruled out",
-            change_words(check, change),
-        )
-        rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
-    return _reasons(rows, ("share", "", "change"))
 
 
 def _reasons(rows: Iterable[TableRow], titles: tuple[str, str, str] = ("", "", "")) -> Table:

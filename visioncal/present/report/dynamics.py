@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from visioncal.core.number_format import matched, significant
@@ -124,30 +123,24 @@ def friction(
     for axes in grid.flat[joints:]:
         axes.set_visible(False)
     for joint, axes in enumerate(grid.flat[:joints]):
-        _draw_friction(axes, identified, predictions, joint)
+        shown = (
+            np.column_stack(
+                [prediction.dq[:, joint], measured_friction(identified, prediction)[:, joint]]
+            )[prediction.used[:, joint]]
+            for prediction in predictions
+        )
+        samples = np.concatenate([*shown])
+        samples = samples[:: max(len(samples) // 600, 1)]
+        max_speed = max(float(np.abs(samples[:, 0]).max(initial=0.0)), 1e-3)
+        # Small steps near standstill, where dry friction changes sign.
+        steps = np.linspace(-1.0, 1.0, _CURVE_POINTS)
+        curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
+        curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
+        modelled = friction_at(identified, curve)[:, joint]
+        axes.plot(*samples.T, ".", color=MUTED, alpha=0.5, markersize=3.0)
+        axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
+        few_ticks(axes, 5, 5)
         axes.set_title(identified.robot.joint_names[joint])
         axes.set_xlabel("speed [rad/s]" if joint >= joints - _COLUMNS else "")
         axes.set_ylabel("" if joint % _COLUMNS else "friction [N m]")
     return figure, "Friction of each joint over its speed"
-
-
-def _draw_friction(
-    axes: Axes, identified: Identified, predictions: Sequence[Prediction], joint: int
-) -> None:
-    shown = (
-        np.column_stack(
-            [prediction.dq[:, joint], measured_friction(identified, prediction)[:, joint]]
-        )[prediction.used[:, joint]]
-        for prediction in predictions
-    )
-    samples = np.concatenate([*shown])
-    samples = samples[:: max(len(samples) // 600, 1)]
-    max_speed = max(float(np.abs(samples[:, 0]).max(initial=0.0)), 1e-3)
-    # Small steps near standstill, where dry friction changes sign.
-    steps = np.linspace(-1.0, 1.0, _CURVE_POINTS)
-    curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
-    curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
-    modelled = friction_at(identified, curve)[:, joint]
-    axes.plot(*samples.T, ".", color=MUTED, alpha=0.5, markersize=3.0)
-    axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
-    few_ticks(axes, 5, 5)

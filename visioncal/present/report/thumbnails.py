@@ -77,13 +77,10 @@ def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int
 
 
 def _jpeg_uri(image: Image) -> str:
-    encoded = _jpeg(image, min(1.0, 720 / image.shape[1]))
-    return "data:image/jpeg;base64," + base64.b64encode(encoded).decode("ascii")
-
-
-def _jpeg(image: Image, scale: float) -> bytes:
+    scale = min(1.0, 720 / image.shape[1])
     height, width = image.shape[:2]
     # A line scan of one row keeps a row, and a JPEG has no longer side.
     size = [min(max(round(scale * side), 1), 65_500) for side in (width, height)]
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 78])[1])
+    encoded = bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 78])[1])
+    return "data:image/jpeg;base64," + base64.b64encode(encoded).decode("ascii")

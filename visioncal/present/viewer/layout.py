@@ -56,8 +56,12 @@ def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.B
     things = [*_THINGS, *(f"{thing}s" for thing in _THINGS), paths.STOPS]
     things += [paths.FRAMES, paths.SEEN_TARGET, paths.CELL]
     frame = paths.BASE_FRAME if cell is None else paths.CELL_FRAME
+    fixed = result_parts.frames(calibration).fixed_m
+    # With several robots, the poses have different bases.
+    poses = {} if session.is_network else reported_matrices(session.views)
+    places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
     left: rrb.Container | rrb.View = _space_view(
-        "Cell", things, _eye(session, calibration), frame, has_image=has_images
+        "Cell", things, _eye_on(places) if len(places) > 2 else None, frame, has_image=has_images
     )
     if cell is None:
         # The residuals of one camera fit below the cell, those of several have a tab.
@@ -148,15 +152,6 @@ def _image_view(name: str, bounds: rrb.VisualBounds2D | None = None) -> rrb.Spat
     return rrb.Spatial2DView(
         name=name, origin=paths.IMAGE, contents=["$origin/**"], visual_bounds=bounds
     )
-
-
-def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
-    """Views the cell from the side so that it fills the view; None without known positions."""
-    fixed = result_parts.frames(calibration).fixed_m
-    # With several robots, the poses have different bases.
-    poses = {} if session.is_network else reported_matrices(session.views)
-    places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
-    return _eye_on(places) if len(places) > 2 else None
 
 
 def _eye_on(places: FloatArray) -> rrb.EyeControls3D:

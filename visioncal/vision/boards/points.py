@@ -52,7 +52,11 @@ class PointsKind(BoardKind):
     ) -> tuple[Mapping[str, Any], dict[str, str]]:
         """The content of its `.toml`, and its table `STEM.points.csv`."""
         table = f"{stem}.points.csv"
-        return {**document, "points": table}, {table: _points_csv(document["points"])}
+        points = document["points"]
+        rows = zip(*points.values(), strict=True)
+        return {**document, "points": table}, {
+            table: "\n".join([",".join(points), *(",".join(map(repr, row)) for row in rows), ""])
+        }
 
 
 class Rig(PointsKind):
@@ -225,12 +229,6 @@ def _read_points(
     }
     reader.check()
     return read
-
-
-def _points_csv(points: Mapping[str, Sequence[float]]) -> str:
-    """Text of a table of points, from its columns."""
-    rows = zip(*points.values(), strict=True)
-    return "\n".join([",".join(points), *(",".join(map(repr, row)) for row in rows), ""])
 
 
 def points_of(

@@ -201,6 +201,7 @@ class _Windows:
         rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
         distances = np.hypot(x, y) if radii is not None else np.maximum(np.abs(x), np.abs(y))
         within = distances < half[:, None, None]
+        slopes = np.linalg.inv(np.swapaxes(axes, -1, -2)) @ smoother[:, 1:3]
         return cls(
             start,
             jacobian,
@@ -213,7 +214,7 @@ class _Windows:
             inside,
             neighbours,
             # Gradients are along a corner's own axes.
-            _along_axes(smoother, axes),
+            np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1),
         )
 
     def at(self, chosen: IntArray) -> Self:
@@ -596,12 +597,6 @@ def _circle(
     inward = -slope / distance
     by_width = width_derivative / (part_x + part_y)
     return edge, inward * x, inward * y, by_width * part_x, by_width * part_y, slope
-
-
-def _along_axes(smoother: FloatArray, axes: FloatArray) -> FloatArray:
-    """Polynomial operators (m, 10, k) with gradients along other axes (m, 2, 2)."""
-    slopes = np.linalg.inv(np.swapaxes(axes, -1, -2)) @ smoother[:, 1:3]
-    return np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1)
 
 
 def _edges(

@@ -44,7 +44,15 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
 
     name = sheet.target.name
     _check_name(name, not_in_font(name))
-    _check_dpi(sheet, dpi)
+    area_inch2 = sheet.page.width_mm * sheet.page.height_mm / 25.4**2
+    # Larger pages take gigabytes of memory to draw.
+    most = (2.5e8 / area_inch2) ** 0.5
+    if not _LEAST_DPI <= dpi <= most:
+        raise DataError(
+            f"--dpi is {dpi:g}; {_LEAST_DPI:g} to {most:.0f} are possible on {sheet.page}.",
+            culprits=["--dpi"],
+            next_step="The PDF and the SVG are exact at any magnification.",
+        )
     names = [f"{name}.{ending}" for ending in ("pdf", "svg", "png")]
     # The folder's name may be invalid for the file system.
     with named_errors(folder):
@@ -71,18 +79,6 @@ def _check_name(name: str, not_in_font: str) -> None:
             + (f": {' '.join(map(repr, wrong))} cannot." if wrong else "."),
             culprits=[name[:_LONGEST_NAME]],
             next_step=f"Use up to {_LONGEST_NAME} letters, digits, _ and -.",
-        )
-
-
-def _check_dpi(sheet: Sheet, dpi: float) -> None:
-    area_inch2 = sheet.page.width_mm * sheet.page.height_mm / 25.4**2
-    # Larger pages take gigabytes of memory to draw.
-    most = (2.5e8 / area_inch2) ** 0.5
-    if not _LEAST_DPI <= dpi <= most:
-        raise DataError(
-            f"--dpi is {dpi:g}; {_LEAST_DPI:g} to {most:.0f} are possible on {sheet.page}.",
-            culprits=["--dpi"],
-            next_step="The PDF and the SVG are exact at any magnification.",
         )
 
 
