@@ -361,7 +361,7 @@ class Problem:
     def _moved_path(
         self, path: tuple[PathStep, ...], state: State, rows: IntArray
     ) -> tuple[FloatArray, list[FloatArray]]:
-        """Inverse of `product`, and Jacobians (m, 6, 6) of its right perturbation by each edge's."""
+        """Inverse of `product`, and Jacobians (m, 6, 6) of its right perturbation by an edge's."""
         back, slopes = np.broadcast_to(np.eye(4), (len(rows), 4, 4)), []
         for step in reversed(path):
             edge, before = self._edge(step, state, rows), back
@@ -511,24 +511,29 @@ class Problem:
         return np.asarray((self.repeat_counts * level**2)[:, None, None])
 
     @cached_property
-    def _covariance_and_inverse(self) -> FloatArray:
-        """(2, n, 6, 6) covariances of the observations at levels of one, and `weights`."""
+    def _own_covariance(self) -> FloatArray:
+        """(n, 6, 6) covariances of the observations at levels of one."""
         covariance = self.observations.covariance.copy()
         places = np.flatnonzero(~self.observations.has_rotation)
         covariance[places, :3, :] = covariance[places, :, :3] = 0.0
         # The residual and Jacobian rows of a rotation that was not measured are zero.
         covariance[places, :3, :3] = np.eye(3)
-        inverse, joined = np.zeros_like(covariance), ~self.alone
-        inverse[joined] = np.linalg.inv(covariance[joined])
-        return np.stack([covariance, inverse])
+        return covariance
+
+    @cached_property
+    def _own_weights(self) -> FloatArray:
+        """(n, 6, 6) `weights` at levels of one."""
+        inverse, joined = np.zeros_like(self._own_covariance), ~self.alone
+        inverse[joined] = np.linalg.inv(self._own_covariance[joined])
+        return inverse
 
     def covariance(self, noise: Noise) -> FloatArray:
         """Covariances (n, 6, 6) of the observations' own noise."""
-        return np.asarray(self._variances(noise) * self._covariance_and_inverse[0])
+        return np.asarray(self._variances(noise) * self._own_covariance)
 
     def weights(self, noise: Noise) -> FloatArray:
         """Inverses (n, 6, 6) of `covariance`; zero for observations that are `alone`."""
-        return np.asarray(self._covariance_and_inverse[1] / self._variances(noise))
+        return np.asarray(self._own_weights / self._variances(noise))
 
     def total_covariance(self, linear: Linear, noise: Noise) -> FloatArray:
         """Covariances (n, 6, 6) of the residuals, including the flange errors."""

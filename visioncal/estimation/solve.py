@@ -138,9 +138,7 @@ def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
     The (n,) mask `kept` is of those that remain.
     """
     whitening = Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
-    information, gradient, *_ = whitening.equations(
-        problem, fit.state, problem.linear(fit.state)
-    )
+    information, gradient, *_ = whitening.equations(problem, fit.state, problem.linear(fit.state))
     moving, step = problem.moving, np.zeros(problem.size)
     step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
     return fit.state.moved(step)
