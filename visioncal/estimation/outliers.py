@@ -10,6 +10,7 @@ Where frames may have moved, the search begins with the earliest stops, before l
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -74,7 +75,7 @@ class InlierFit:
     distances: Distances  # Distance of each observation from the prediction of the others.
     moves: tuple[Move, ...]  # The moves, in the order in which they were found.
 
-    @property
+    @cached_property
     def part(self) -> Problem:
         """The problem of the inliers."""
         return self.problem.subset(self.used)
@@ -137,7 +138,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         return find_inliers(problem, state)
     used, fit = _trimmed_core(problem, state, _early(problem))
     moves: list[Move] = []
-    used, fit = _widened(problem, used, fit)
+    used, fit = widened(_ObservationSearch(problem), used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
         found = find_move(problem, fit, relative_squares < 1.0, movable)
@@ -149,7 +150,6 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         involved = problem.observations.involves(move.twin)
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
-    used, fit = _widened(problem, used, fit)
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 

@@ -255,6 +255,7 @@ def left_out_residuals(
     for units without observations in the (n,) mask `among`.
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
+    all_jacobians = linear.jacobian
     errors, own, (unit_of, _) = (
         problem.error_covariance(noise),
         problem.covariance(noise),
@@ -267,7 +268,7 @@ def left_out_residuals(
             continue
         by_errors, jacobian = (
             array.reshape(6 * len(rows), -1)
-            for array in (linear.by_errors[rows], linear.jacobian_of(rows))
+            for array in (linear.by_errors[rows], all_jacobians[rows])
         )
         total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
         inverse = covariance_from(total - jacobian @ fitted @ jacobian.T)

@@ -181,23 +181,22 @@ def find_steps(
     ]
     every = np.concatenate([np.zeros(0, dtype=np.int64), *columns])
     ends = np.cumsum([0, *map(len, columns)])
-    stops, sums, gradients = list[int](), list[FloatArray](), list[FloatArray]()
-    for stop, information, gradient in equations_from(widened, start, every):
-        across, alone = information[:, :size], information[:, every]
-        sums.append(np.stack([alone, alone - across @ fitted @ across.T]))
-        stops.append(stop)
-        gradients.append(gradient)
-    all_blocks, all_slopes = np.array(sums), np.array(gradients)
+    equations = [*equations_from(widened, start, every)]
+    stops = np.array([stop for stop, *_ in equations])
     freedom, tried = _residual_freedom(problem, fit), Counter[str]()
     for candidate in candidates:
         tried[candidate.kind] += len(candidate.stops)
-    found = dict[int, tuple[int, FloatArray, FloatArray, float]]()
+    steps = []
     for at, candidate in enumerate(candidates):
-        mine, among = np.arange(ends[at], ends[at + 1]), np.isin(stops, candidate.stops)
+        mine, among = slice(ends[at], ends[at + 1]), np.isin(stops, candidate.stops)
         if not among.any():
             continue
-        slopes = all_slopes[among][:, mine]
-        blocks = all_blocks[among][:, :, mine[:, None], mine]
+        some = [equations[index] for index in np.flatnonzero(among)]
+        slopes = np.array([gradient[mine] for *_, gradient in some])
+        information = np.array([rows[mine] for _, rows, _ in some])
+        across, alone = information[:, :, :size], information[:, :, columns[at]]
+        left = alone - (across @ fitted) @ np.swapaxes(across, 1, 2)
+        blocks = np.stack([alone, left], axis=1)
         scale = np.sqrt(
             np.maximum(np.diagonal(blocks[:, 0], axis1=1, axis2=2), np.finfo(float).tiny)
         )
@@ -205,7 +204,7 @@ def find_steps(
         sound = np.linalg.eigvalsh(scaled).min(axis=(1, 2)) >= ROUNDING
         covariances = covariance_from(blocks[sound, 1])
         values = -(covariances @ slopes[sound][:, :, None])[:, :, 0]
-        squares, count = -np.sum(slopes[sound] * values, axis=1), len(mine)
+        squares, count = -np.sum(slopes[sound] * values, axis=1), slopes.shape[1]
         many = freedom / (kinds if candidate.kind == FRAME else 1)
         chance = FALSE_ALARM / tried[candidate.kind]
         limit = count * float(f_limit(chance, count, max(0.5 * many, 6.0)))
@@ -213,18 +212,14 @@ def find_steps(
         if shown.max(initial=0.0) > 0.0:
             best = int(np.argmax(shown))
             share = min(float(shown[best]) / freedom, _MOST_EXPLAINED)
-            stop = np.array(stops)[among][sound][best]
-            found[at] = int(stop), values[best], covariances[best], -freedom * np.log1p(-share)
-    steps = []
-    for stop, information, _ in equations_from(widened, start, every) if found else ():
-        for at, (first, value, covariance, gain) in found.items():
-            if first == stop:
-                before = -fitted @ information[ends[at] : ends[at + 1], :size].T @ value
-                after = before.copy()
-                if candidates[at].effect is None:
-                    after[columns[at]] += value
-                spread = (np.outer(before, before) + np.outer(after, after)) / 2.0
-                steps.append(Step(candidates[at], stop, value, covariance, gain, spread))
+            stop, value = int(stops[among][sound][best]), values[best]
+            before = -fitted @ across[sound][best].T @ value
+            after = before.copy()
+            if candidate.effect is None:
+                after[columns[at]] += value
+            spread = (np.outer(before, before) + np.outer(after, after)) / 2.0
+            gain = -freedom * float(np.log1p(-share))
+            steps.append(Step(candidate, stop, value, covariances[best], gain, spread))
     return sorted(steps, key=lambda step: -step.gain)
 
 

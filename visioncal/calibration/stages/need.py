@@ -152,6 +152,16 @@ class Picks:
         return " and ".join(within)
 
 
+def least_precise(picks: Sequence[Picks]) -> Picks:
+    """The picks whose least need of position is the largest."""
+    worst = max(picks, key=lambda pick: pick.budget_mm["total"])
+    for other in picks:
+        # A probability takes a tenth of the time of a least need.
+        if other.probability(Need(mm=worst.good_for_mm)) < NeedLimits.probability[0]:
+            worst = other
+    return worst
+
+
 def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) -> NeedMet | None:
     """The probability that picks are within a need; None without a need or predictions.
 

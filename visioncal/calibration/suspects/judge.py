@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.need import Picks, need_met
+from visioncal.calibration.stages.need import Picks, least_precise, need_met
 from visioncal.calibration.suspects.judged import Findings
 from visioncal.calibration.suspects.limits import (
     collect_findings,
@@ -111,12 +111,12 @@ def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | N
     least = max((doubt.until_mm for doubt in doubts), default=0.0)
     if not picks or np.isinf(least):
         return None
-    return max(least, *(pick.good_for_mm for pick in picks))
+    return max(least, least_precise(picks).good_for_mm)
 
 
 def _good_for(findings: Findings, good_for_mm: float, status: VerdictStatus) -> Finding:
     verb = "would be" if status == "bad" else "is"
-    worst = max(findings.picks, key=lambda pick: pick.good_for_mm)
+    worst = least_precise(findings.picks)
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     return Finding(

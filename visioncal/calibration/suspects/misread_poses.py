@@ -15,7 +15,7 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.core.errors import VisioncalError
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 
@@ -55,7 +55,7 @@ def with_misreading(run: RunState) -> RunState:
 
 def with_open_chains(run: RunState) -> RunState:
     """Looks for misread poses before the fit where chains do not close; notes turned boards."""
-    if run.mount is None or not closes(run):
+    if run.mount is None or not closes(run.base_from_flange, run.poses_of_one_board, run.mount):
         run = with_misreading(run)
     return run if run.misread else run.noting((), turned_boards(run))
 
@@ -71,8 +71,9 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         return
     for robot in run.session.robots:
         for pair in pairs_of(run, robot):
-            part = _of_pair(run, robot, pair)
-            hint = None if closes(part) else next(_misread_poses(part), None)
+            if closes(run.robots[robot].base_from_flange, pair.poses, pair.mount):
+                continue
+            hint = next(_misread_poses(_of_pair(run, robot, pair)), None)
             if hint is None:
                 continue
             if hint.do is not None and hint.do.command:
@@ -164,13 +165,15 @@ def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     )
 
 
-def closes(run: RunState) -> bool:
+def closes(
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
+) -> bool:
     """Whether the chain of one robot closes as declared; true with too few views to show it."""
-    both = _both_sides(run.base_from_flange, run.poses_of_one_board)
+    both = _both_sides(base_from_flange, seen)
     robot, camera = np.moveaxis(both, 1, 0)
     return (
         len(robot) < FEWEST_ROWS
-        or robust_fits(robot_part(robot, run.session.mount)[None], camera[None])[0].closes
+        or robust_fits(robot_part(robot, mount)[None], camera[None])[0].closes
     )
 
 

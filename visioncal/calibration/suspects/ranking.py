@@ -124,8 +124,9 @@ def rank_causes(
     # A sigma far beyond its limit alone makes a result bad, with no likely mistake.
     is_likely = any(finding.probability >= _LIKELIER for finding in found)
     decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
-    unmet = met is not None and met.probability < NeedLimits.probability[0]
-    too_large = any(pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks)
+    enough, limit = NeedLimits.probability[0], Need(mm=CalibrationLimits.sigma_mm[0])
+    unmet = met is not None and met.probability < enough
+    too_large = any(pick.probability(limit) < enough for pick in picks)
     is_sized = any(doubt.until_mm == 0.0 or doubt.kind == UNEXPLAINED for doubt in doubts)
     if picks and not decides and (unmet or (met is None and too_large and is_sized)):
         causes = {finding.kind for finding in found if finding.probability}

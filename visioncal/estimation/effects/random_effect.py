@@ -79,7 +79,7 @@ def find_random_effects(
         shares=np.concatenate([likelihood.model.shares, shares], axis=1),
         prior=None if prior is None else prior.beside(np.zeros(len(effects)), np.inf),
     )
-    levels = np.maximum(likelihood.white[0].ravel(), LEAST_SIGMA)
+    levels = np.maximum(fit.noise.robots.ravel(), LEAST_SIGMA)
     low = np.full(first + len(effects), np.log(LEAST_SIGMA))
     logs = np.log(np.concatenate([levels, _ABOVE * np.array(typical)]))
     found = model.maximised(logs, low, np.log(MOST_SIGMA))
