@@ -52,10 +52,7 @@ def _place(
     needs: Sequence[Part],
     touched_by: str | None = None,
 ) -> _Place:
-    """Resolves the calibration and the frame's destination, before anything is computed.
-
-    Of a cell, `touched_by` is the default robot: the only one that the touches name.
-    """
+    """Resolves the calibration and the frame's destination, before anything is computed."""
     name, path, file = transform_name(kind, options.name), options.calibration, options.out
     result = calibration = folder = None
     frames: Mapping[str, Frame] = {}

@@ -126,10 +126,7 @@ def _flange(values: Sequence[float]) -> FloatArray:
 def _flange_of(
     session: Session, views: Sequence[View], calibration: Calibration
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Flange pose and joint angles of a calibrated arm at the one chosen view.
-
-    A stationary camera needs neither.
-    """
+    """Flange pose and joint angles of a calibrated arm at the one chosen view."""
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":
         return None, None
@@ -154,13 +151,7 @@ def _flange_of(
 def _plane_of(
     words: str, sigma_mm: float, calibration: Calibration, boards: Mapping[str, Edge]
 ) -> tuple[Plane, str]:
-    """Parses a plane as in `FORMS`, whose height has a sigma [mm].
-
-    Frames are those of the calibration, and targets of a cell (`boards`, by their transforms).
-
-    Returns:
-        The plane, and a warning about its frame; empty where there is none.
-    """
+    """Parses a plane as in `FORMS`, whose height has a sigma [mm]."""
     sigma_m = 1e-3 * sigma_mm
     if words.startswith("z="):
         return Plane.horizontal(_height_m(words), sigma_m), ""

@@ -80,11 +80,7 @@ def names_in(words: str, option: str) -> tuple[str, ...]:
 
 
 def _check(is_right: bool, words: str, option: str, needed: str) -> None:
-    """Refuses a value of an option.
-
-    Raises:
-        DataError: It is not what is needed.
-    """
+    """Refuses a value of an option."""
     if not is_right:
         raise DataError(f"{option} is {words[:80]!r}; {needed}.", culprits=[option])
 

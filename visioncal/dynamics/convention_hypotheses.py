@@ -79,10 +79,7 @@ def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known
 
 
 def _unexplained(base: BaseModel, measured: Measured, *, known: bool) -> FloatArray:
-    """(n,) share of the power of each joint's torques that is left.
-
-    By the robot's own inertias and friction where `known`, else by the best fit.
-    """
+    """(n,) share of the power of each joint's torques that is left."""
     robot, torques = base.model.robot, measured.torques_nm
     if known:
         predicted, joints = _predicted(robot, measured.motion), range(robot.joint_count)

@@ -318,11 +318,7 @@ def _fitted(
     centre: FloatArray,
     setting: FitSettings,
 ) -> PointsFit:
-    """The fit with the points' common errors in its covariance.
-
-    `causes` are as in `PointsFit`; its worst directions are those at the points' `centre` in the
-    fixture [m].
-    """
+    """The fit with the points' common errors in its covariance."""
     fit = agreement.fit
     noise_m = counted_noise_m(fit, setting.expected_m)
     covariance = measured.carried(fit.by_points, np.hypot(noise_m, pairs.nominal_sigma_m))

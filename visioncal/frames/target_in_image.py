@@ -194,11 +194,7 @@ def _with_jacobians(
     noise_px: float,
     distance_m: float,
 ) -> tuple[Compressed, FloatArray]:
-    """One refined candidate with its Jacobians, with corners numbered by its symmetry.
-
-    Returns:
-        The candidate, and its (6, m) Jacobian by the lens's field beyond its model.
-    """
+    """One refined candidate with its Jacobians, with corners numbered by its symmetry."""
     # With the rotation p applied, corner i lies where corner p[i] was: that id becomes i.
     ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
     turned = replace(corners, ids=ids).take(np.argsort(ids))

@@ -148,10 +148,7 @@ class _CandidateViews:
 
     @property
     def limit(self) -> float:
-        """Outlier limit of the squared distance, corrected for the number of images.
-
-        F distributed, since the noise levels are estimated.
-        """
+        """Outlier limit of the squared distance, corrected for the number of images."""
         tail = FALSE_REJECTION / len(self.views)
         return 6.0 * float(f_limit(tail, 6, min(self.freedom, 1e6)))
 
@@ -173,10 +170,7 @@ class _ImageInliers:
 
 
 def _find_inliers(candidates: _CandidateViews) -> _ImageInliers:
-    """Finds the inlier images of a target.
-
-    Where no more than half are inliers, the correct ones are unknown, and all are kept.
-    """
+    """Finds the inlier images of a target."""
     best: tuple[float, IntArray, FloatArray] | None = None
     half = len(candidates.views) // 2 + 1
     for seed in (place for view in candidates.views for place in view):
@@ -410,10 +404,7 @@ def place_target(
 def _inlier_warnings(
     fit: _ImageInliers, labels: Sequence[str], looks: Sequence[PoseCandidates], stops: int | None
 ) -> Iterator[str]:
-    """Warnings on the inliers of a target's images.
-
-    `stops` is the number of the robot's stops, None where the robot is not between.
-    """
+    """Warnings on the inliers of a target's images."""
     count = len(labels)
     for at in np.flatnonzero(~fit.inliers).tolist():
         yield (

@@ -199,10 +199,7 @@ def _write(
     others: Sequence[str] = (),
     without: Collection[str] = (),
 ) -> Written:
-    """Writes results and drawings as one generation; a drawing that fails is left out.
-
-    The main result is first in `results`; files named in `others` and `without` are removed.
-    """
+    """Writes results and drawings as one generation; a drawing that fails is left out."""
     drawings = {name: draw for name, draw in drawings.items() if name not in without}
     undrawn: list[FailedDrawing] = []
 

@@ -44,8 +44,6 @@ _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
 )
-# Plausible range of temperatures [deg C]; every plausible temperature in kelvin is above it.
-_COLDEST_C, _HOTTEST_C, _ZERO_K = -60.0, 200.0, 273.15
 # Largest plausible numbers by unit, with the message for a larger one. The limits of metres and
 # radians admit poses in micrometres and turns in degrees. Stamps beyond the year 2286 do not
 # resolve microseconds, and are in milliseconds or less.
@@ -59,7 +57,6 @@ _SIZES: Mapping[str, tuple[float, str]] = {
     "a": (1e6, "{0:g} A is no current of a motor"),
     "n": (25_000.0, "{0:g} N is no force on a robot's flange; write newtons"),
 }
-_HEAVIEST_KG = 2500.0
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 # Limit in other columns, so that squares and products do not overflow.
 _LARGEST = 1e60
@@ -75,23 +72,16 @@ def is_number(column: str) -> bool:
 def column_of(name: str) -> Column:
     """A column of views.csv or a stream with the plausible range of its numbers."""
     if name == "payload_kg":
-        words = "{:g} kg is no payload; 0 to " + f"{_HEAVIEST_KG:g} kg are taken"
-        return Column(name, 0.0, _HEAVIEST_KG, words.format)
+        return Column(name, 0.0, 2500.0, "{:g} kg is no payload; 0 to 2500 kg are taken".format)
     rate = _RATE.fullmatch(name)
     unit = rate[1] if rate else name.rpartition("_")[2] if is_number(name) else ""
     if unit == "c":
-        return Column(name, _COLDEST_C, _HOTTEST_C, _no_temperature)
+        words = (
+            "{:g} deg C is no temperature of a robot or its air; write degrees Celsius, no kelvin"
+        )
+        return Column(name, -60.0, 200.0, words.format)
     most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
     return Column(name, -most, most, words.format)
-
-
-def _no_temperature(value: float) -> str:
-    is_kelvin = _HOTTEST_C < value < _HOTTEST_C + _ZERO_K
-    kelvin = f": it looks like kelvin, {value - _ZERO_K:.1f} deg C" if is_kelvin else ""
-    return (
-        f"{value:g} deg C is no temperature of a robot or its air{kelvin}; write degrees Celsius "
-        f"from {_COLDEST_C:g} to {_HOTTEST_C:g}"
-    )
 
 
 @cache

@@ -121,11 +121,7 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
 def _stops(
     declaration: Declaration, views: Sequence[View]
 ) -> list[tuple[Sequence[View], dict[str, View]]]:
-    """Groups rows by stop number; without one, by runs in which their robot stood still.
-
-    Returns:
-        The rows of each stop, and for each robot the row with the pose that most of them agree on.
-    """
+    """Groups rows by stop number; without one, by runs in which their robot stood still."""
     groups: dict[tuple[int, int], list[View]] = {}
     rows_of: dict[str, list[View]] = {}
     for view in views:

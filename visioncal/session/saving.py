@@ -74,12 +74,7 @@ def _write_below(folder: Path, path: str, data: bytes | str) -> None:
 
 
 def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
-    """Moves target and robot files into the session's folder.
-
-    Returns:
-        The content of session.toml with paths in the folder, and the files' texts by these paths.
-        Built-in names are kept.
-    """
+    """Moves target and robot files into the session's folder."""
     declaration, placed, texts = session.declaration, dict(session.document), dict[str, str]()
     stored: tuple[tuple[Kind, str, Mapping[str, Any] | None], ...] = (
         ("target", "target", session.target_document),

@@ -57,10 +57,7 @@ def home_posture(arm: DhArm, base_from_flange: FloatArray, rng: np.random.Genera
 def _reachable(
     arm: DhArm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
 ) -> tuple[FloatArray, Mask]:
-    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) mask of acceptable ones.
-
-    The search starts at (m, n) postures [rad]; links must stay above the floor.
-    """
+    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) mask of acceptable ones."""
     reach = inverse(arm, base_from_flange, starts)
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
     return reach.joints, np.asarray(good & (lowest_m(arm, reach.joints) > floor_m))

@@ -5,7 +5,6 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -139,18 +138,8 @@ class TableReader(NumberChecks):
             following += len(row) == width
             if len(row) != width:
                 words = f"it has {len(row)} fields, but the header has {width} columns"
-                step = ""
-                # A decimal comma makes two whole numbers of one, `0,3`.
-                whole = [_INTEGER.fullmatch(cell.strip()) is not None for cell in row]
-                if len(row) > width and any(map(all, pairwise(whole))):
-                    words += "; decimal commas may be the cause"
-                    step = (
-                        "Write decimal points; or separate the cells of all lines by semicolons, "
-                        "and decimal commas are read, too."
-                    )
                 # Before the problems of the next row that is read.
-                problem = TableProblem(table.place(at), words, step)
-                self._problems.append((following, problem))
+                self._problems.append((following, TableProblem(table.place(at), words)))
 
     def texts(self, name: str) -> list[str]:
         """(count,) cells of a column, without surrounding blanks; empty where there is none."""

@@ -45,12 +45,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
-    """Finds the fields of the robot's or the camera's poses by the words of their names.
-
-    Returns:
-        The name of a matrix or a whole pose, or those of position and rotation; empty where no name
-        fits, or those of several poses do.
-    """
+    """Finds the fields of the robot's or the camera's poses by the words of their names."""
     sizes = {
         name: numbers.reshape(len(fields), -1).shape[1]
         for name, numbers in fields.numbers.items()

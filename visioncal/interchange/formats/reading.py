@@ -344,10 +344,7 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
 
 
 def _pendant(path: Path) -> Fields | None:
-    """Reads lines with poses in a maker's notation, each with the name of its image if it has one.
-
-    None where neither of the first two lines holds such a pose.
-    """
+    """Lines with poses in a maker's notation, with names of images; None where there are none."""
     lines = [
         (f"{path.name}, line {at}", line)
         for at, line in enumerate(read_plain_text(path).splitlines(), start=1)

@@ -106,11 +106,7 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
 
 
 def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
-    """Reads positions and rotations of other columns or forms; None where there are none.
-
-    Returns:
-        The views.csv with the same positions and identity rotations, and the poses as written.
-    """
+    """Reads positions and rotations of other columns or forms; None where there are none."""
     if not (folder / "views.csv").is_file():
         return None
     table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")

@@ -148,10 +148,7 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
 def _coordinates(
     fields: Fields, given: Sequence[str], unit: str | None, option: str
 ) -> tuple[FloatArray, float]:
-    """Positions (n, 3) [m], NaN where a cell is empty, and the length of their unit [m].
-
-    A stated unit overrides that in the columns' names.
-    """
+    """Positions (n, 3) [m], NaN where a cell is empty, and the length of their unit [m]."""
     names = tuple(map(fields.find, given)) or known_names(fields, [_AXES], ())
     if not names:
         raise DataError(

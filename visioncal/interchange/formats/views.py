@@ -143,10 +143,7 @@ VISP = ForeignFormat(
 
 
 def _families(folder: Path) -> list[tuple[str, dict[int, Path]]]:
-    """Groups a folder's data files by their names without the number, the largest group first.
-
-    A group has one file a view: `pose_000.txt`, `pose_001.txt`, ...
-    """
+    """Groups a folder's data files by their names without the number, the largest group first."""
     groups: dict[str, dict[int, Path]] = defaultdict(dict)
     for file in files_in(folder):
         number = number_in(file.name)

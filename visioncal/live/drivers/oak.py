@@ -216,19 +216,11 @@ def _stop(pipeline: Handle) -> None:
 
 
 def _factory_intrinsics(handler: Handle, socket: str, resolution: tuple[int, int]) -> Camera:
-    """Reads a camera's intrinsics from a device's calibration.
+    """Reads a camera's intrinsics from a device's calibration; raises DriverError.
 
     Depthai's CalibrationHandler uses single precision, and one matrix per camera at one size of the
     sensor, from which others follow by scaling to cover and cropping about the middle; distortion
     is OpenCV's 14 coefficients, or the fisheye's 4.
-
-    Args:
-        handler: Its CalibrationHandler.
-        socket: The camera, such as `CAM_A`.
-        resolution: (width, height) of the pictures, scaled and cropped from the sensor's [px].
-
-    Raises:
-        DriverError: It has none of this camera, or its lens model is not supported.
     """
     dai = depthai()
     board_socket = getattr(dai.CameraBoardSocket, socket)

@@ -60,12 +60,7 @@ class _Detours:
         self._failed_searches = 0
 
     def path(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
-        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour.
-
-        Returns:
-            Via postures (j, n), without the ends; or, where no path was found, the index in
-            `Collisions.names` of the pair of bodies that collides on the straight one.
-        """
+        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour."""
         blocked = self._collisions.path_contact(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
@@ -85,11 +80,7 @@ class _Detours:
         return np.array(kept[:-1]).reshape(-1, len(start))
 
     def _rrt_connect(self, start: FloatArray, end: FloatArray) -> list[FloatArray] | None:
-        """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000).
-
-        Returns:
-            Postures (n,) from start to end; None where the trees did not meet.
-        """
+        """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000)."""
         low = np.maximum(np.minimum(start, end) - _ASIDE_RAD, self._lower)
         high = np.minimum(np.maximum(start, end) + _ASIDE_RAD, self._upper)
         trees = (_Tree(start), _Tree(end))

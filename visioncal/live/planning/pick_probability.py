@@ -128,11 +128,7 @@ def check_need(need: Need, judged: str) -> None:
 def _pick_covariances(
     cell: PlanCell, covariance: FloatArray, noise: FloatArray, q: FloatArray
 ) -> FloatArray:
-    """Covariances (k, 6, 6) of picks of objects at the target's poses from (k, n) postures [rad].
-
-    All are in the axes of what carries the camera: the flange, or the base. The covariance (6, 6)
-    is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
-    """
+    """Covariances (k, 6, 6) of picks at the target, in the axes of what carries the camera."""
     middle = corner_positions(cell.target).mean(axis=0)
     points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]

@@ -170,11 +170,7 @@ class _Planning:
     begun: SessionStart | None  # Session to which the stops are added; None for none.
 
     def drivable_design(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
-        """Chooses stops that a safe path connects.
-
-        Returns:
-            The design, the path through it, and what blocked the stops that were replaced.
-        """
+        """Chooses stops that a safe path connects."""
         remaining = np.arange(len(self.found.q))
         blockers: list[str] = []
         for attempt in range(_ROUNDS):

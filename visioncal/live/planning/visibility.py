@@ -96,10 +96,7 @@ class BoardViews:
         self.distance_m = cell.limits.distance_m or self._filling_m(float(np.nanmin(tangents)))
 
     def _filling_m(self, half: float) -> tuple[float, float]:
-        """Distances at which the board fills the image of that half width, or has been observed.
-
-        It stays in the image if the guesses are off [m].
-        """
+        """Distances at which the board fills the image of that half width, or has been observed."""
         # At a distance d the board is off by the errors of both positions, by d times the error of
         # the camera's rotation, and by half its own size times the error of its own rotation.
         cell, radius = self._cell, 0.5 * board_size_m(self._cell.target)

@@ -43,12 +43,7 @@ def log_arms(
 
 
 def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Capsules and balls of arms by their (m, n, 4, 4) frames of joints and flange [m].
-
-    Returns:
-        For m n links their lengths, radii, start points and rotations from the z axis, and for
-        m (n - 1) joints their centres and radii, arm after arm; neither base nor flange is a joint.
-    """
+    """Capsules and balls of arms by their (m, n, 4, 4) frames of joints and flange [m]."""
     origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
     links = np.diff(origins, axis=1)
     lengths_m = np.linalg.norm(links, axis=2)

@@ -47,8 +47,8 @@ def read_session(path: Path) -> Session:
             culprits=[str(path)],
             next_step="Give the .rrd that visioncal wrote.",
         )
-    names, kept = codec.image_names(record), cast("ImagesKept", record.text("images"))
-    digests = dict(zip(names, record.texts("digests"), strict=True))
+    names, kept = codec.image_names(record), cast("ImagesKept", record["images"])
+    digests = dict(zip(names, record["digests"], strict=True))
     digests = {name: digest for name, digest in digests.items() if digest}
     places: dict[str, _Place] = {}
     for frame, _, batch in chunks(path, (paths.IMAGE,)):
@@ -75,7 +75,7 @@ def read_calibration(path: Path) -> Calibration | None:
         DataError: The file cannot be read, or the result is damaged.
     """
     record = _record(path, paths.CALIBRATION)
-    text = "" if record is None else record.text("calibration")
+    text = record and record["calibration"]
     return Calibration.from_json(text, str(path)) if text else None
 
 
@@ -93,19 +93,14 @@ def read_evidence(path: Path) -> tuple[ViewEvidence, ...]:
 
 
 def _record(path: Path, entity: str) -> codec.Record | None:
-    """The record of an entity; None if the file is no recording of visioncal's.
-
-    Raises:
-        DataError: It is damaged, or of another format.
-    """
+    """The record of an entity; None if the file is no recording of visioncal's."""
     is_ours = False
     for _, found, batch in chunks(path, (paths.SESSION, paths.CALIBRATION)):
         is_ours = True
         try:
-            record = codec.Record.read(batch)
+            record = codec.read_record(batch, path)
         except _DAMAGE:
             continue
-        codec.check_format(record, path)
         if found == entity:
             return record
     if is_ours:

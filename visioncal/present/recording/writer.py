@@ -70,7 +70,7 @@ def write_recording(
     with recording(path, session, blueprint, images, searches or {}) as recorder:
         _draw(recorder.stream, session, calibration, seen_of)
         text = "" if calibration is None else calibration.text
-        codec.result_record(text, evidence).log(recorder.stream, paths.CALIBRATION)
+        codec.log_record(recorder.stream, paths.CALIBRATION, codec.result_record(text, evidence))
 
 
 @contextmanager
@@ -110,7 +110,8 @@ def recording(
             recorder.at(row)
             digests.append(_log_image(recorder.stream, session, view, images, found))
         stored = {} if images == "full" else found
-        codec.session_record(session, images, digests, stored).log(recorder.stream, paths.SESSION)
+        record = codec.session_record(session, images, digests, stored)
+        codec.log_record(recorder.stream, paths.SESSION, record)
         recorder.lay_out(blueprint)
         recorder.keep()
         yield recorder

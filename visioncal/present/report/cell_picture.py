@@ -82,10 +82,7 @@ def _height(named: tuple[Sequence[float], str]) -> float:
 
 
 def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Parallel projection of points (n, 3) [m] to the drawing.
-
-    It is from the side where the named points (k, 3) are farthest from each other.
-    """
+    """Parallel projection of points (n, 3) [m] to the drawing."""
     angles = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
     cos, sin, level = np.cos(angles), np.sin(angles), np.zeros(_SIDES)
     rise = np.sin(_ELEVATION_RAD)

@@ -191,13 +191,7 @@ class AprilGrid(Board):
 def _grid_tags(
     image: Image, dictionary: str, border: int, enough: float
 ) -> tuple[IntArray, FloatArray]:
-    """Tags in a (h, w) grey image whose corners touch dark squares, without ids that appear twice.
-
-    The search stops at `enough` tags.
-
-    Returns:
-        (t,) ids, ascending, and (t, 4, 2) corners in OpenCV's order, to one or two pixels [px].
-    """
+    """Ids (t,), ascending, and corners (t, 4, 2) [px] of tags whose corners touch dark squares."""
     corners: dict[int, FloatArray] = {}
     for copy in _copies(image):
         parameters = cv2.aruco.DetectorParameters()
@@ -239,17 +233,7 @@ def _copies(image: Image) -> Iterator[_Copy]:
 def _ordered_tags(
     target: Target, numbers: IntArray, px: FloatArray, own: Mask
 ) -> tuple[FloatArray, float]:
-    """Orders the corners of tags as on the page, and measures the layout's misfit.
-
-    Args:
-        target: Grid.
-        numbers: (t,) tag numbers on the grid.
-        px: (t, 4, 2) corners in OpenCV's order [px].
-        own: (t,) mask of the tags to use.
-
-    Returns:
-        (t, 4, 2) ordered corners, and the misfit of `layout_misfit`; 0 for a single tag.
-    """
+    """Orders the corners of tags as on the page, and measures the layout's misfit."""
     # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
     rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
     if own.sum() < 2:

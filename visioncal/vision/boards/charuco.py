@@ -315,15 +315,7 @@ def _places(ids: IntArray, columns: int, *, legacy: bool) -> FloatArray:
 def _charuco_of(
     image: Image, markers: Sequence[Marker], columns: int, share: float, *, legacy: bool
 ) -> Identity | None:
-    """The board of a layout that markers fit, with the corners of its detector; None without.
-
-    Args:
-        image: (h, w) grey image.
-        markers: The markers.
-        columns: Number of squares along x.
-        share: Marker side over square side, approximately.
-        legacy: Whether square 0 holds a marker.
-    """
+    """The board of a layout that markers fit, with the corners of its detector; None without."""
     ids = np.array([marker.number for marker in markers])
     squares = _places(ids, columns, legacy=legacy)
     rows = int(squares[:, 1].max()) + 1

@@ -178,10 +178,7 @@ def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
 
 
 def _centres(image: Image, target: Target) -> FloatArray | None:
-    """(n, 2) centres of a grid's dark circles in a (h, w) grey image [px]; None where none is seen.
-
-    Of the orders that form the grid, the least rotated one.
-    """
+    """(n, 2) centres of a grid's dark circles in a grey image [px]; None where none is seen."""
     blobs = find_blobs(image)
     if len(blobs.px) < _LEAST:
         return None

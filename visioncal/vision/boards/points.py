@@ -247,12 +247,7 @@ def points_of(
 
 
 def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[str, str]]:
-    """Problems of a table of points, each with an instruction.
-
-    Args:
-        names: Columns of the table, point, x_m, y_m and z_m first.
-        values: (columns, n) cells; of another shape if the rows are uneven.
-    """
+    """Problems of a table of points, each with an instruction."""
     if values.ndim != 2:
         yield "has rows of several lengths, or cells that are no numbers", "Fill in all cells."
         return
