@@ -20,10 +20,11 @@ from support.advice import failures, printed_commands
 from support.commands import every_command, started, turned_poses, visioncal, write_poses
 from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
 from support.marks import slow
+from support.samples import made_up
 from typer.main import get_command
 
 import visioncal as visioncal_package
-from visioncal.calibration.run import STAGES, calibrate
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import dynamics, progress
 from visioncal.cli.app import app, main
@@ -51,7 +52,6 @@ from visioncal.simulation import (
     write_session,
 )
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
-from visioncal.simulation.records import cell_session
 
 FILES = ["calibration.json", "recording.rrd", "report.html"]
 # What moves a terminal's cursor, colours it, or turns the direction of its text.
@@ -143,7 +143,7 @@ def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor
     out = tmp_path / "out"
     out.mkdir()
     (out / "calibration.json").write_text("an earlier result")
-    done = started("calibrate", poor, "-o", out)
+    done = visioncal("calibrate", poor, "-o", out)
     assert (done.status, done.out) == (2, "")
     assert "the camera's offset along the tool's" in done.err
     assert "Traceback" not in done.err
@@ -271,45 +271,30 @@ def test_names_that_help_lists_are_those_of_the_files():
     assert cell_names() == SIMULATED_CELLS
 
 
-PANDAS = """
-    import sys
-    import pyarrow
+SMALL = """
+from visioncal.cli import app as it
+
+def command():
+    import sys, numpy, pyarrow, scipy.linalg, threadpoolctl
     # Of another type than arrow would find, so that it looks at what it was given.
     assert pyarrow.array([1, 2], pyarrow.uint8()).to_pylist() == [1, 2]
-    print("pandas" in sys.modules)
-"""
-BLAS = """
-    import numpy, scipy.linalg, threadpoolctl
-    print({it["num_threads"] for it in threadpoolctl.threadpool_info()})
+    print("pandas" in sys.modules, {it["num_threads"] for it in threadpoolctl.threadpool_info()})
+
+it.app = command
+it.main()
+import pandas, pyarrow
+assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1
 """
 
 
-@pytest.mark.parametrize(
-    ("before", "command", "after", "said"),
-    [
-        # Arrow does not load pandas while a command runs, and does so afterwards.
-        (
-            "import pyarrow",
-            PANDAS,
-            "import pandas\n"
-            'assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1',
-            "False",
-        ),
-        ("", BLAS, "", "{1}"),
-    ],
-    ids=["pandas", "threads of BLAS"],
-)
-def test_libraries_are_kept_small_in_commands(before, command, after, said):
-    code = (
-        f"{before}\nfrom visioncal.cli import app as it\n\ndef command():\n{command}\n"
-        f"it.app = command\nit.main()\n{after}\n"
-    )
+def test_libraries_are_kept_small_in_commands():
+    """Arrow does not load pandas while a command runs, but afterwards; BLAS has one thread."""
     limits = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"}
-    environment = {it: value for it, value in os.environ.items() if it not in limits}
-    words = [sys.executable, "-c", code]
+    environment = {name: value for name, value in os.environ.items() if name not in limits}
+    words = [sys.executable, "-c", SMALL]
     done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == said
+    assert done.stdout.strip() == "False {1}"
 
 
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
@@ -409,7 +394,7 @@ def test_every_command_ends_so():
 
 
 def test_a_lens_that_is_held_has_no_ratio_of_error_and_sigma():
-    found = calibrate(cell_session(simulate(CellOptions(views=12)), "cell", seen="corners"))
+    found = made_up().calibration
     held = replace(found.camera, covariance=np.zeros((9, 9)))
     edges = {name: edge.matrix for name, edge in found.edges.items()}
     rows = [*truth_rows(replace(found, camera=held), edges, held.camera)]

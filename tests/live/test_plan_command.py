@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.table import parse_csv, read_views
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CellOptions, cell_session, simulate, write_session
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")
 
@@ -28,8 +27,6 @@ CELL = {
     "--guess-deg": "2",
     "--candidates": "60",
 }
-
-ONE_AXIS = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
 
 
 def plan(source, out, *more, **cell):
@@ -53,8 +50,10 @@ def document(planned):
 
 @pytest.fixture(scope="module")
 def one_axis(tmp_path_factory):
+    options = CellOptions(robot="ur5e", views=5, motion="one_axis", seed=1)
     folder = tmp_path_factory.mktemp("sessions") / "one axis"
-    return write_session(simulate(ONE_AXIS), folder)
+    cell_session(simulate(options), "one axis", seen="corners").save(folder)
+    return folder
 
 
 def test_a_plan_has_a_table_a_program_a_preview_and_all_of_it_as_json(planned, document):
@@ -109,30 +108,6 @@ def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, do
     # Six decimals.
     np.testing.assert_allclose(moves, wanted, atol=1e-6)
     assert sum("popup" in value and "take images/" in value for value in inside) == 6
-
-
-@pytest.mark.slow
-def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_path):
-    """Plan, record, calibrate anew: all through the command line, the recording simulated."""
-    visioncal("plan", one_axis, "--add", 5, "-o", tmp_path, "--candidates", 100).good()
-    document = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
-    added = np.array([stop["q"] for stop in document["stops"]])
-    cell = simulate(ONE_AXIS)
-    both = np.concatenate([cell.robot.joints, added])
-    whole = simulate(replace(ONE_AXIS, motion="free"), both)
-    session = write_session(whole, tmp_path / "whole")
-    planned = sorted(stop["view"] for stop in document["stops"])
-    assert planned == [view.number for view in Session.load(session).views][-5:]
-    visioncal("calibrate", session, "-o", tmp_path / "out", "--level", "hand-eye").good()
-    result = Calibration.load(tmp_path / "out")
-    assert result.verdict.status != "bad"
-    edge = result.edges["flange_from_cam"]
-    # The same noise makes the same sigma; with ten views it is itself known to a fifth or so, and
-    # what the plan took for noise is what five views showed.
-    assert 0.5 < edge.sigma_mm / document["predicted"]["after"]["sigma_mm"] < 2.0
-    away = whole.transforms["flange_from_cam"][:3, 3] - edge.transform.translation
-    # Three sigma of three numbers together.
-    assert 1e3 * np.linalg.norm(away) < 3.0 * edge.sigma_mm
 
 
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):

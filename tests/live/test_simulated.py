@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.live_cell import FakeClock
-from support.marks import slow
 
 from visioncal.cli import demo
 from visioncal.core.transforms import exp, invert, pose_difference
@@ -112,9 +111,8 @@ def errors_px(image, exact):
     return found.px[mine] - exact.px[theirs]
 
 
-@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
-def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
-    cell = a_cell(mount=mount)
+def test_at_rest_corners_are_as_good_as_in_a_written_session():
+    cell = a_cell(mount="eye-to-hand")
     scene, live = prepare_scene(cell), LiveView(cell)
     written = [errors_px(render(scene, index), cell.exact_corners[index]) for index in range(3)]
     taken = [

@@ -130,7 +130,6 @@ def test_watching_needs_no_remote_control_and_moves_nothing(controller):
     ("fault", "message", "safety"),
     [
         ("protective-stop", "PROTECTIVE_STOP.*Enable Robot", "protective-stop"),
-        ("emergency-stop", "EMERGENCY_STOP.*emergency-stop button", "emergency-stop"),
         ("remote-off", "local control.*Remote Control", "normal"),
     ],
 )

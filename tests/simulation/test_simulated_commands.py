@@ -127,15 +127,6 @@ def test_readings_of_a_tracker_are_calibrated(read, place):
     assert misfit(probe, edges["flange_from_probe"], among) < MOST
 
 
-@pytest.fixture(scope="module")
-def cell(place):
-    """A whole cell with touches and torques, calibrated."""
-    folder, out = place / "whole", place / "whole-out"
-    done("simulate", folder, "--cell", "two-arms", "--no-images", "--touches", "--torques")
-    done("calibrate", folder, "-o", out)
-    return folder, out
-
-
 def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_knocked(place):
     first, again = place / "whole-1", place / "whole-2"
     shipped = Path(simulation.__file__).parent / "cells" / "two-arms.toml"

@@ -44,27 +44,14 @@ class NetworkCamera:
     period_s: float = 0.02  # From one picture to the next [s].
     password: str = ""  # `user:password` that it asks for; empty for none.
     cut: tuple[int, ...] = ()  # Numbers of pictures that it sends half.
-    stalls_at: int = 1 << _BITS  # The picture from which on it sends nothing.
-    ends_at: int = 1 << _BITS  # The picture from which on it is closed.
     # When each picture was drawn, by its number, on the monotonic clock [s].
     drawn_s: list[float] = field(default_factory=list)
     ended: threading.Event = field(default_factory=threading.Event)
 
-    def wait_for(self, number: int) -> None:
-        """Waits until a picture has been drawn, or nobody has taken one for long."""
-        idle_s = 0.0
-        while len(self.drawn_s) <= number and idle_s < 1.0:
-            count = len(self.drawn_s)
-            time.sleep(self.period_s)
-            idle_s = 0.0 if len(self.drawn_s) > count else idle_s + self.period_s
-
     def parts(self) -> Iterator[bytes]:
         """The parts of the answer, at the camera's pace."""
         due_s = time.monotonic()
-        while len(self.drawn_s) < self.ends_at and not self.ended.is_set():
-            if len(self.drawn_s) >= self.stalls_at:
-                self.ended.wait()
-                return
+        while not self.ended.is_set():
             time.sleep(max(due_s - time.monotonic(), 0.0))
             due_s += self.period_s
             yield self._part(len(self.drawn_s))

@@ -51,6 +51,4 @@ def _acknowledge(step: CaptureEvent) -> None:
 
 if __name__ == "__main__":
     planned = fake_plan(int(sys.argv[2]))
-    print("begun", flush=True)
     recorded(Path(sys.argv[1]), planned, *fake_devices(planned), watch=_acknowledge, resume=True)
-    print("done", flush=True)
