@@ -21,6 +21,7 @@ DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
 # A controller in the same network answers within milliseconds.
 _CONNECT_S = 0.8
 _ANSWER_S = 1.0
+_WAIT_S = 1.0
 _BANNER = "Universal Robots Dashboard Server"
 _HEADER = struct.Struct(">HB")
 # Types of RTDE's frames: request of a version, output recipe, start, state.
@@ -207,7 +208,7 @@ def read_tool_offset(host: str) -> list[float]:
     Raises:
         DriverError: The controller cannot be reached, or does not report it.
     """
-    ends_s = time.monotonic() + 1.0
+    ends_s = time.monotonic() + _WAIT_S
     try:
         link = connect(host, _PORTS[0], "the primary interface")
     except DriverError:
