@@ -74,12 +74,6 @@ def test_results_come_back_exactly(sample, tmp_path):
     assert read_evidence(path) == ()
 
 
-def test_folder_to_recording_to_folder(sample, recorded, tmp_path):
-    sample.session.save(tmp_path / "folder")
-    read_session(recorded).save(tmp_path / "again")
-    assert_same(Session.load(tmp_path / "folder"), Session.load(tmp_path / "again"))
-
-
 @pytest.mark.parametrize("name", ["ric_charuco_eye_to_hand", "visp_franka_eye_in_hand"])
 def test_real_session_round_trip(name, tmp_path):
     folder = DATA / name
@@ -287,11 +281,6 @@ def test_changed_result_leaves_the_session(sample, bare, tmp_path):
     path.write_bytes(data.replace(b"2026-11-20T10:11:12", b"2026-11-20T10:11:13"))
     raised(DataError, "its result cannot be read or was changed", read_calibration, path)
     assert_same(sample.session, Session.load(path))
-
-
-def test_a_pipe_is_no_recording(tmp_path):
-    os.mkfifo(tmp_path / "pipe.rrd")
-    raised(DataError, "is no regular file", Session.load, tmp_path / "pipe.rrd")
 
 
 def test_residuals_of_views_left_out_are_drawn_to_scale(sample, bare):

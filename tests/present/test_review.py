@@ -27,17 +27,6 @@ def command(*arguments):
     return [sys.executable, "-m", "visioncal", "show", "--viewer", *map(str, arguments)]
 
 
-def review(*arguments, **environment):
-    return subprocess.run(
-        command(*arguments),
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=ENVIRONMENT | environment,
-    )
-
-
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     """A folder as `visioncal calibrate` leaves it, of which only the recording matters here."""
@@ -113,8 +102,7 @@ def stub(tmp_path):
     return put
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_native_viewer_ends_with_all_that_it_started(number, out, stub, tmp_path):
+def test_the_native_viewer_ends_with_all_that_it_started(out, stub, tmp_path):
     told = tmp_path / "told.json"
     process = subprocess.Popen(
         command(out), stderr=subprocess.PIPE, text=True, env=ENVIRONMENT | stub(STUB)
@@ -124,7 +112,7 @@ def test_the_native_viewer_ends_with_all_that_it_started(number, out, stub, tmp_
         while not told.exists() and time.monotonic() < end:
             time.sleep(0.05)
         viewer = json.loads(told.read_text())
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=60) == 0
         assert process.stderr.read() == ""
     finally:
@@ -141,23 +129,31 @@ def test_the_native_viewer_ends_with_all_that_it_started(number, out, stub, tmp_
     assert not state.exists() or state.read_text().split()[2] == "Z"
 
 
-def test_a_viewer_that_cannot_open_a_window_points_to_the_browser(out, stub):
-    script = "print('earlier'); print('no display: DISPLAY is not set'); raise SystemExit(3)"
-    done = review(out, **stub(script))
-    assert done.returncode == 2
-    assert "status 3: no display: DISPLAY is not set" in done.stderr
-    assert "--web" in done.stderr
+@pytest.mark.parametrize(
+    ("more", "script", "words"),
+    [
+        (
+            (),
+            "print('earlier'); print('no display: DISPLAY is not set'); raise SystemExit(3)",
+            ("status 3: no display: DISPLAY is not set", "--web"),
+        ),
+        (
+            ("--web",),
+            "print('compiled without web_viewer'); raise SystemExit(2)",
+            ("compiled without web_viewer",),
+        ),
+    ],
+    ids=["no window", "no web viewer"],
+)
+def test_a_viewer_that_cannot_open_says_what_else_can(out, stub, more, script, words):
+    environment = ENVIRONMENT | stub(script)
+    told = {"capture_output": True, "text": True, "env": environment}
+    done = subprocess.run(command(out, *more), check=False, **told)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert all(word in done.stderr for word in words)
 
 
-def test_rerun_without_a_web_viewer_is_an_error_with_a_next_step(out, stub):
-    done = review(out, "--web", **stub("print('compiled without web_viewer'); raise SystemExit(2)"))
-    assert done.returncode == 2
-    assert "compiled without web_viewer" in done.stderr
-    assert done.stdout == ""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_reruns_own_server_answers_this_machine_alone_and_ends_with_the_command(number, out):
+def test_reruns_own_server_answers_this_machine_alone_and_ends_with_the_command(out):
     process = subprocess.Popen(
         command(out, "--web"),
         stdout=subprocess.PIPE,
@@ -173,7 +169,7 @@ def test_reruns_own_server_answers_this_machine_alone_and_ends_with_the_command(
         assert [is_open("127.0.0.1", port) for port in ports] == [True, True]
         # A server on all addresses would answer at the other loopback addresses, too.
         assert not any(is_open("127.0.0.2", port) for port in ports)
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
         # The kernel may close a server's connections after its process has ended.
         ended = time.monotonic()

@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from support.arm_documents import calibrated
 from support.drawn import column
 from support.findings import with_findings
-from support.kept import assert_same_evidence
 from support.samples import BASE_FROM_FIXTURE, FLANGE_FROM_TOOL, made_up, with_frames
 
 from visioncal.core.transforms import exp, invert
@@ -21,13 +20,11 @@ from visioncal.present.recording import (
     arm,
     board,
     paths,
-    read_calibration,
-    read_evidence,
     write_recording,
 )
 from visioncal.present.report import plots
 from visioncal.present.viewer import blueprint
-from visioncal.results import Edge, to_document
+from visioncal.results import Edge
 from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.boards import find_target
 from visioncal.vision.targets import corner_positions, outline, target_from_document
@@ -181,18 +178,9 @@ def test_axes_of_rotation_and_their_reverse_are_one_point():
     np.testing.assert_allclose(points[3], [[0.0, 0.0]], atol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def sample():
-    return made_up()
-
-
-def with_arm(sample, document):
-    return with_findings(sample, {"kinematics": document})
-
-
-def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
-    path = tmp_path / "recording.rrd"
-    calibration = with_arm(sample, calibrated())
+def test_the_arm_is_drawn_as_calibrated(samples, tmp_path):
+    path, sample = tmp_path / "recording.rrd", samples["images and joints"]
+    calibration = with_findings(sample, {"kinematics": calibrated()})
     write_recording(path, sample.session, calibration, sample.evidence, None)
     q = sample.session.views[4].joints_rad
     ours = calibration.calibrated_robot.link_frames(q[None])[0, :, :3, 3]
@@ -200,31 +188,12 @@ def test_the_arm_is_drawn_as_calibrated(sample, tmp_path):
     np.testing.assert_allclose(drawn, [np.zeros(3), *ours[:-1]], atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def framed():
-    return with_frames(made_up())
-
-
-@pytest.fixture(scope="module")
-def framed_file(framed, tmp_path_factory):
-    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
-    write_recording(path, framed.session, framed.calibration, framed.evidence, None)
-    return path
-
-
-def test_recordings_give_the_frames_back(framed, framed_file):
-    calibration = read_calibration(framed_file)
-    assert calibration is not None
-    assert to_document(calibration) == to_document(framed.calibration)
-    assert to_document(calibration)["frames"].keys() == framed.calibration.frames.keys()
-    assert_same_evidence(framed.evidence, read_evidence(framed_file))
-
-
 @pytest.mark.parametrize(
     ("child", "parent", "expected"),
     [("tool", "flange", FLANGE_FROM_TOOL), ("fixture", "base", BASE_FROM_FIXTURE)],
 )
-def test_frames_hang_where_they_belong(framed_file, child, parent, expected):
+def test_frames_hang_where_they_belong(recordings, child, parent, expected):
+    framed_file = recordings["tools and fixtures"]
     entity = f"{paths.FRAMES}/{child}"
     assert column(framed_file, entity, "Transform3D:parent_frame")[0].tolist() == [parent]
     assert column(framed_file, entity, "Transform3D:child_frame")[0].tolist() == [child]
