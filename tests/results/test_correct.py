@@ -340,7 +340,7 @@ def test_another_branch_is_told(stored, result):
     assert run(*command, "--widest-deg", 0).status == 2
 
 
-def test_singular_postures_are_told(stored, result):
+def test_ways_through_singular_postures_are_found(stored, result):
     """A UR's wrist is singular where joint 5 is zero; the way through turns joint 4 far."""
     joints = np.tile([*HOME[:4], 0.0, 0.3], (41, 1))
     joints[:, 4] = np.linspace(-0.1, 0.1, 41)
@@ -348,8 +348,7 @@ def test_singular_postures_are_told(stored, result):
     done = run(
         "correct", table, "-c", stored, "--seed-joints", "0.4,-1.3,1.5,-1.75,-0.1,0.3"
     ).good()
-    assert "nearly singular; at t.csv, line 2" in done.err
-    # Reached all the same, to the digits of the table.
+    # To the digits of the table.
     for row, pose in zip(rows_of(done.out), result.robot.base_from_flange(joints), strict=True):
         (there,) = result.base_from_flange(numbers(row, JOINTS)[None]).as_matrix()
         assert there == pytest.approx(pose, abs=1e-6)

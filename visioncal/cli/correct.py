@@ -11,7 +11,7 @@ from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
-from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
+from visioncal.core.number_format import did_you_mean, figure, mm_and_deg
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.result_files import load_calibration
@@ -87,7 +87,6 @@ def correct_command(options: CorrectOptions) -> None:
     warnings = [
         *bad,
         *_warn_turns(arm, targets, corrected, options.widest_deg),
-        *_warn_singular(arm, targets, corrected.q, rows),
     ]
     if options.payload_kg and not arm.compliance.any():
         warnings.append(
@@ -188,26 +187,6 @@ def _warn_turns(
         )
     if len(rows) > _MOST_SHOWN:
         yield f"And {len(rows) - _MOST_SHOWN} more targets of the kind."
-
-
-def _warn_singular(
-    arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArray
-) -> Iterator[str]:
-    """Warns near singularities, where a correction of a millimetre turns a joint far."""
-    turns = arm.turns_deg_per_mm(q[rows])
-    # Away from singularities a millimetre turns joints by some tenths of a degree at most.
-    near = np.flatnonzero(turns.max(axis=1) > 5.0)
-    if not len(near):
-        return
-    worst = near[int(np.argmax(turns[near].max(axis=1)))]
-    joint = int(np.argmax(turns[worst]))
-    largest_deg = float(turns[worst, joint])
-    turn_words = f"{largest_deg:.0f}" if largest_deg < 90.0 else "over 90"
-    yield (
-        f"{some_of([targets.places[rows[index]] for index in near])}: nearly singular; at "
-        f"{targets.places[rows[worst]]} a millimetre turns {arm.real.joint_names[joint]} by "
-        f"{turn_words} deg. Move slowly there, or keep away from it."
-    )
 
 
 def _report(

@@ -85,19 +85,6 @@ class CalibratedArm:
             q - joint_deflections(self.real, q, self.compliance, loads, self.weight_moments)
         )
 
-    def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
-        """Largest joint rotation for a millimetre of the flange at constant orientation.
-
-        Args:
-            q: (m, n) joint positions [rad or m].
-
-        Returns:
-            (m, n) [deg/mm], large near singular postures; zero for a prismatic joint.
-        """
-        joints_flange_jacobian = np.linalg.pinv(self.real.joint_jacobian(q))
-        turns = np.linalg.norm(joints_flange_jacobian[:, :, 3:], axis=2)
-        return np.where(self.real.chain.prismatic, 0.0, 1e-3 * np.rad2deg(turns))
-
 
 def _without_arm(calibration: Calibration) -> DataError:
     name = calibration.session_name
