@@ -161,20 +161,12 @@ def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:
 
 
 def boxes_of(kept: ClearanceOptions) -> tuple[Box, ...]:
-    """Obstacles.
-
-    Raises:
-        DataError: A box is malformed.
-    """
+    """Obstacles; raises DataError."""
     return tuple(_box_of(box) for box in kept.boxes or ())
 
 
 def floor_of(kept: ClearanceOptions) -> float | None:
-    """Height of the floor in the base [m]; None for no floor.
-
-    Raises:
-        DataError: It is no number.
-    """
+    """Height of the floor in the base [m]; None for no floor; raises DataError."""
     if kept.floor.strip().lower() == "none":
         return None
     return 1e-3 * numbers_in(kept.floor, "--floor", "z")[0]
@@ -239,11 +231,7 @@ def _report(plan: Plan) -> None:
 
 
 def find_source(name: str) -> Source:
-    """Loads a robot, a session or a calibration, whichever is named.
-
-    Raises:
-        DataError: It cannot be read.
-    """
+    """Loads a robot, a session or a calibration, whichever is named; raises DataError."""
     path = Path(name)
     if path.is_dir() and (path / _SESSION).is_file() and not (path / CALIBRATION).is_file():
         return Source(f"session {name}", session=Session.load(path))
@@ -288,11 +276,7 @@ def chosen_part(source: Source, words: PlanOptions) -> tuple[Source, PlanOptions
 def begun_session(
     source: Source, words: PlanOptions, kept: Kept, progress: Progress
 ) -> SessionStart:
-    """The session to which stops are added.
-
-    Raises:
-        DataError: There is none, or it has too few views to start from.
-    """
+    """The session to which stops are added; raises DataError."""
     session = source.session
     if session is None:
         raise DataError(
@@ -312,11 +296,7 @@ def begun_session(
 
 
 def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
-    """The cell of a new plan, from a calibration or from options.
-
-    Raises:
-        DataError: Something is missing or cannot be read.
-    """
+    """The cell of a new plan, from a calibration or from options; raises DataError."""
     if source.calibration is not None:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)

@@ -16,11 +16,7 @@ _PACKAGES = {
 
 
 def client_library(module: str, extra: str) -> ModuleType:
-    """Imports a library that an extra brings.
-
-    Raises:
-        DriverError: It is not installed, with the command that installs it.
-    """
+    """Imports a library that an extra brings; raises DriverError."""
     try:
         return import_module(module)
     except ImportError as error:

@@ -289,11 +289,7 @@ class Excitation:
 def excite(
     allowed: MotionLimits, request: ExcitationRequest, progress: Progress | None = None
 ) -> Excitation:
-    """Searches for the motion that determines the base parameters best.
-
-    Raises:
-        DegenerateError: No motion was found that keeps all limits.
-    """
+    """Searches for the motion that determines the base parameters best; raises DegenerateError."""
     with one_blas_thread():
         return _ExcitationSearch(allowed, request, progress).run()
 

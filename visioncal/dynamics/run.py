@@ -152,11 +152,7 @@ def validate_session(
 def conditioned_streams(
     session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Conditioned]:
-    """Reads a session's streams, filtered like those of an identification.
-
-    Raises:
-        DataError: The robot is another one, there is no such stream, or a stream is wrong.
-    """
+    """Reads a session's streams, filtered like those of an identification; raises DataError."""
     robot, session = identified.robot, select_arm(session, request.robot)
     names = _torque_streams(session, request.streams)
     recorded = [_read(session, robot, name, request) for name in names]

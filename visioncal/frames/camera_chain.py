@@ -97,11 +97,7 @@ class CalibratedCamera:
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
-        """Reads the camera from a calibration.
-
-        Raises:
-            DataError: The calibration has no camera: it was made from measured poses.
-        """
+        """Reads the camera from a calibration; raises DataError."""
         result = calibration.camera
         if result is None:
             raise DataError(
@@ -270,11 +266,7 @@ def point_jacobian(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
 
 
 def checked_pose(pose: FloatArray, name: str) -> None:
-    """Checks that a matrix is a pose in metres.
-
-    Raises:
-        DataError: It is no (4, 4) rigid transform, or its offset is longer than any arm reaches.
-    """
+    """Checks that a matrix is a pose in metres; raises DataError."""
     if fault := rigid_fault(pose):
         raise DataError(f"{name}: not a (4, 4) rigid transform: {fault}.", culprits=[name])
     length = float(np.linalg.norm(pose[:3, 3]))

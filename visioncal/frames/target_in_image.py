@@ -125,11 +125,7 @@ def target_pose_candidates(
 
 
 def check_image_size(eye: CalibratedCamera, image: Image, label: str) -> None:
-    """Checks that an image is grey and of the camera's resolution.
-
-    Raises:
-        DataError: It is not.
-    """
+    """Checks that an image is grey and of the camera's resolution; raises DataError."""
     width, height = eye.camera.resolution
     if image.shape != (height, width):
         shown = " x ".join(map(str, image.shape[1::-1] + image.shape[2:]))

@@ -176,11 +176,7 @@ def check_lengths(rows: TouchRows) -> None:
 
 
 def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
-    """Checks that the poses (n, 4, 4) are unique.
-
-    Raises:
-        DataError: Two are equal: one row is a copy.
-    """
+    """Checks that the poses (n, 4, 4) are unique; raises DataError."""
     numbers = np.nan_to_num(poses.reshape(len(poses), -1))
     differences = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
     first, second = np.nonzero(np.triu(differences < 1e-9, 1))

@@ -131,11 +131,7 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
 
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration, read from a document of `to_document`.
-
-    Raises:
-        DataError: It is of another schema, or no calibration; the message names the field.
-    """
+    """Fields of a calibration, read from a document of `to_document`; raises DataError."""
     check_schema(document)
     form: CalibrationForm | CellForm
     if "tree" in document:

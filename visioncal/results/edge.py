@@ -121,11 +121,7 @@ class PoseForm:
         return cls(matrix, transform.rotation.as_quat(), matrix[:3, 3])
 
     def pose(self, path: str) -> FloatArray:
-        """(4, 4) the checked transform.
-
-        Raises:
-            DataError: The matrix is not rigid, or the forms are of different poses.
-        """
+        """(4, 4) the checked transform; raises DataError."""
         matrix, rotation = self.matrix, self.matrix[:3, :3]
         if (
             matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]

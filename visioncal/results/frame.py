@@ -61,11 +61,7 @@ class FrameFile:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads a file of frames.
-
-        Raises:
-            DataError: It is missing, or not a file of frames of a known schema.
-        """
+        """Reads a file of frames; raises DataError."""
         with reading(str(path), "frames", "Run visioncal tcp or visioncal fixture again."):
             return cls(_read_file(parse_stored(read_bytes(path), str(path))))
 

@@ -23,11 +23,7 @@ _ROBOT_FORM = WrittenForm(
 
 
 def check_schema(document: Mapping[str, Any]) -> None:
-    """Checks that a result is of the schema that this version reads.
-
-    Raises:
-        DataError: It is of another.
-    """
+    """Checks that a result is of the schema that this version reads; raises DataError."""
     schema = document.get("schema")
     if schema != SCHEMA:
         is_newer = isinstance(schema, int) and schema > SCHEMA

@@ -57,11 +57,7 @@ def select_matching(
 
 
 def check_mount(session: Session, calibration: Calibration) -> None:
-    """Checks that the session's camera is mounted as the calibrated one.
-
-    Raises:
-        DataError: It is not.
-    """
+    """Checks that the session's camera is mounted as the calibrated one; raises DataError."""
     check_one_of_each(session)
     if session.mount != calibration.mount:
         raise DataError(
@@ -75,11 +71,7 @@ def check_mount(session: Session, calibration: Calibration) -> None:
 def check_resolution(
     session: Session, calibration: Calibration, resolution: tuple[int, int]
 ) -> None:
-    """Checks that images have the calibrated camera's resolution.
-
-    Raises:
-        DataError: They do not.
-    """
+    """Checks that images have the calibrated camera's resolution; raises DataError."""
     camera = calibration.camera
     if camera is None or resolution == camera.camera.resolution:
         return

@@ -42,11 +42,7 @@ class FrameTree:
     def between(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> Edge:
-        """Transform between any two frames; see `Calibration.between`.
-
-        Raises:
-            DataError: There is no such frame, or a robot's pose is needed.
-        """
+        """Transform between any two frames; see `Calibration.between`; raises DataError."""
         near, far = self.placement(first), self.placement(second)
         matrix, jacobian = self.compose(
             near[0] if near else first, far[0] if far else second, poses

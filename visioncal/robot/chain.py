@@ -152,11 +152,7 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
 
 
 def chain_from_document(table: DocumentTable) -> Chain:
-    """Reads a chain from a description of `chain_document`.
-
-    Raises:
-        DataError: A field is missing or invalid.
-    """
+    """Reads a chain from a description of `chain_document`; raises DataError."""
     rows = joint_tables(table)
     names = tuple(name for name, _ in rows)
     lower, upper = (
@@ -201,11 +197,7 @@ def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
 
 
 def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
-    """Joint tables of a description, with their names.
-
-    Raises:
-        DataError: There is no row, or two of one name.
-    """
+    """Joint tables of a description, with their names; raises DataError."""
     rows = table.content.get("joint")
     if not isinstance(rows, Sequence) or not rows or not all(isinstance(r, Mapping) for r in rows):
         raise table.refuse("joint", rows, "one [[joint]] table for each joint")
@@ -222,11 +214,7 @@ def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
 
 
 def subtable(table: DocumentTable, key: str) -> DocumentTable:
-    """A nested table; empty where it is absent.
-
-    Raises:
-        DataError: The field is no table.
-    """
+    """A nested table; empty where it is absent; raises DataError."""
     content = table.content.get(key, {})
     if not isinstance(content, Mapping):
         raise table.refuse(key, content, f"a [{key}] table")

@@ -80,9 +80,5 @@ def robot_file(document: Mapping[str, Any], named: str = "") -> tuple[str, str]:
 
 
 def load_robot(name_or_path: str, tip: str | None = None, folder: Path | None = None) -> Robot:
-    """Loads a robot's model; the arguments are those of `read_robot_document`.
-
-    Raises:
-        DataError: There is no such robot, or its description is invalid.
-    """
+    """Loads a robot's model; the arguments are those of `read_robot_document`; raises DataError."""
     return Robot.from_document(read_robot_document(name_or_path, tip=tip, folder=folder))

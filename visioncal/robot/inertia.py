@@ -165,11 +165,7 @@ class LogCholesky:
 
     @classmethod
     def around(cls, known: Inertias) -> Self:
-        """Builds coordinates that are zero at known bodies.
-
-        Raises:
-            DataError: One of them is physically inconsistent.
-        """
+        """Builds coordinates that are zero at known bodies; raises DataError."""
         pseudo = pseudo_inertias(known.values)
         values, vectors = np.linalg.eigh(pseudo)
         inconsistent = np.flatnonzero(

@@ -33,12 +33,7 @@ class UrdfArm(NamedTuple):
 
 
 def arm_of_urdf(table: DocumentTable) -> UrdfArm:
-    """Reads the arm from a URDF's root to the tip.
-
-    Raises:
-        DataError: The URDF cannot be parsed or lacks the tip, or a joint before it has more than
-            one degree of freedom.
-    """
+    """Reads the arm from a URDF's root to the tip; raises DataError."""
     import pinocchio as pin
 
     text = table.text("urdf")

@@ -62,11 +62,7 @@ class Loads:
         payload_m: FloatArray | Sequence[float],
         force_n: FloatArray | Sequence[float],
     ) -> Self:
-        """Loads of `count` stops, each value for all or one per stop.
-
-        Raises:
-            DataError: A mass is negative, a number is not finite, or a shape does not fit.
-        """
+        """Loads of `count` stops, each value for all or one per stop; raises DataError."""
         try:
             loads = cls(
                 np.broadcast_to(np.asarray(payload_kg, dtype=float), (count,)),
@@ -274,11 +270,7 @@ class DriveLimits:
 
     @classmethod
     def of_rows(cls, rows: Sequence[DocumentTable]) -> "DriveLimits":
-        """Reads the limits from a table of joints.
-
-        Raises:
-            DataError: One is not positive.
-        """
+        """Reads the limits from a table of joints; raises DataError."""
         limits = [
             [row.number(key, positive=True) if key in row.content else np.inf for key in RATE_KEYS]
             for row in rows

@@ -330,11 +330,7 @@ def seed_of(*numbers: int) -> int:
 
 
 def exercise(options: ExerciseOptions) -> Exercised:
-    """Moves an arm and records it.
-
-    Raises:
-        DataError: The arm's dynamics are unknown.
-    """
+    """Moves an arm and records it; raises DataError."""
     empty = real_dynamics(options.robot, np.random.default_rng([options.seed, 0]), stribeck=True)
     built = empty if options.load is None else empty.carrying(options.load)
     rng, count, rate = np.random.default_rng([options.seed, 1]), len(built.bodies), options.rate_hz

@@ -112,11 +112,7 @@ def mounted_single(options: CellOptions) -> dict[str, FloatArray]:
 
 
 def postures_single(options: CellOptions, placed: Mapping[str, FloatArray]) -> FloatArray:
-    """(s, n) postures of the nominal arm, aimed at the boards in turn [rad].
-
-    Raises:
-        DataError: The arm cannot reach enough poses with a board in the image.
-    """
+    """(s, n) postures of the nominal arm, aimed at the boards in turn [rad]; raises DataError."""
     arm, boards, cam = arm_named(options.robot), options.layout.boards, placed["cam"]
     in_hand = options.mount == "eye-in-hand"
     joints = np.zeros((options.views, arm.a.size))

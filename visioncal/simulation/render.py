@@ -207,11 +207,7 @@ def developed(light: Float32Array, camera: CameraOptions, noise: np.random.Gener
 
 
 def encode(image: Image, jpeg_quality: int | None) -> bytes:
-    """Encodes an image as JPEG, or as PNG without a quality.
-
-    Raises:
-        DataError: OpenCV cannot encode it.
-    """
+    """Encodes an image as JPEG, or as PNG without a quality; raises DataError."""
     if jpeg_quality is None:
         done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     else:

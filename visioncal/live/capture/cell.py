@@ -59,11 +59,7 @@ class LiveCell:
     clock: Clock = field(default_factory=HostClock)
 
     def state(self) -> ArmState:
-        """Reads the arm's state.
-
-        Raises:
-            DriverError: It is stopped, its connection is lost, or the state is old.
-        """
+        """Reads the arm's state; raises DriverError."""
         state = self.arm.state()
         age_s = self.clock.now() - state.stamp_s
         if age_s > _STALE_S:
@@ -87,11 +83,7 @@ class LiveCell:
         return state
 
     def joints(self) -> FloatArray:
-        """Present joint angles (n,) [rad].
-
-        Raises:
-            DriverError: The arm reports no state, or is stopped.
-        """
+        """Present joint angles (n,) [rad]; raises DriverError."""
         q = self.state().q
         if q is None:
             raise DriverError(

@@ -42,11 +42,7 @@ class Consent:
 
     @classmethod
     def of(cls, command: str, ask: Callable[[str], str], *, yes: bool) -> Self:
-        """How a command gets consent.
-
-        Raises:
-            DataError: Nobody can be asked: stdin is no terminal, and there is no `--yes`.
-        """
+        """How a command gets consent; raises DataError."""
         if not (yes or sys.stdin.isatty()):
             raise DataError(
                 f"{command}: nobody can be asked whether the arm may move: stdin is no terminal.",
@@ -56,11 +52,7 @@ class Consent:
         return cls(None if yes else ask)
 
     def to(self, motion: str) -> None:
-        """Asks for consent to one motion; `a` allows all that follow, too.
-
-        Raises:
-            DataError: It is refused, or the input has ended.
-        """
+        """Asks for consent to one motion; `a` allows all that follow, too; raises DataError."""
         while self.ask is not None:
             question = (
                 f"{motion}. Is the cell clear, and a hand on the stop button? "
@@ -186,11 +178,7 @@ def check_same_arm(live: LiveCell, robot: Robot, q: FloatArray) -> None:
 
 
 def check_limits(robot: Robot, q: FloatArray) -> None:
-    """Checks joint angles (n,) [rad] against the arm's limits.
-
-    Raises:
-        DataError: One is beyond them.
-    """
+    """Checks joint angles (n,) [rad] against the arm's limits; raises DataError."""
     outside = (q < robot.lower_rad) | (q > robot.upper_rad)
     if outside.any():
         joint = robot.joint_names[int(np.argmax(outside))]

@@ -260,11 +260,7 @@ class Journal:
         return journal
 
     def append(self, number: int, taken: TakenView) -> View:
-        """Writes a view; when this returns, it is flushed to the disk.
-
-        Raises:
-            DataError: It cannot be written; the session is unchanged.
-        """
+        """Writes a view; when this returns, it is flushed to the disk; raises DataError."""
         image = f"{_IMAGES}/{number:03d}.png"
         view = self._facts.view_of(number, image, taken, self._offset_s)
         # Low compression: noise hardly compresses, and speed matters more.
@@ -282,11 +278,7 @@ class Journal:
         return view
 
     def check_room(self) -> None:
-        """Checks that the disk has room for one more view.
-
-        Raises:
-            DataError: It has not.
-        """
+        """Checks that the disk has room for one more view; raises DataError."""
         width, height = self._facts.resolution
         self._check_room(width * height, "the next view")
 

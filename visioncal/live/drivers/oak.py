@@ -70,11 +70,7 @@ class OakCamera:
             self._closing = closing.pop_all()
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
-        """Returns a picture whose exposure began after the call.
-
-        Raises:
-            DriverError: None came in time; it may be unplugged.
-        """
+        """Returns a picture whose exposure began after the call; raises DriverError."""
         requested_at = time.monotonic()
         waiting = Stopwatch()
         with _worded(self._dai, self.name):

@@ -165,11 +165,7 @@ class StateStream:
         return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
 
     def check(self) -> None:
-        """Checks that states arrive.
-
-        Raises:
-            DriverError: None came for 0.8 s, or the connection is closed.
-        """
+        """Checks that states arrive; raises DriverError."""
         if self.alive:
             return
         how = (
@@ -318,12 +314,7 @@ class UrArm:
         )
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
-        """Starts a motion to a posture and returns; see `MovingArm`.
-
-        Raises:
-            DriverError: It was opened to be watched only, is lost or stopped, or the controller
-                refuses.
-        """
+        """Starts a motion to a posture and returns; see `MovingArm`; raises DriverError."""
         goal = np.asarray(q, dtype=float)
         if goal.shape != (6,) or not np.isfinite(goal).all():
             raise DriverError(
@@ -365,12 +356,7 @@ class UrArm:
         self._motion_timer.restart()
 
     def moving(self) -> bool:
-        """Whether the last motion is still in progress.
-
-        Raises:
-            DriverError: It was interrupted: the controller is lost, a safety stop, or its program
-                ended.
-        """
+        """Whether the last motion is still in progress; raises DriverError."""
         self._check_open()
         self._states.check()
         if self._moves_before is None:

@@ -123,11 +123,7 @@ class Dashboard:
             )
 
     def ask(self, line: str) -> str:
-        """Sends a line and returns the answer.
-
-        Raises:
-            DriverError: There is none.
-        """
+        """Sends a line and returns the answer; raises DriverError."""
         try:
             self._socket.sendall(line.encode("ascii") + b"\n")
         except OSError as error:
@@ -163,11 +159,7 @@ class Dashboard:
 
 
 def check_states_come(host: str) -> None:
-    """Checks that the controller sends states, by receiving one.
-
-    Raises:
-        DriverError: It is no RTDE server, or sends nothing.
-    """
+    """Checks that the controller sends states, by receiving one; raises DriverError."""
     label = f"{host}:{RTDE_PORT}"
     with connect(host, RTDE_PORT, "RTDE") as link, link.makefile("rb") as file:
         try:
@@ -203,11 +195,7 @@ def _read(file: BinaryIO) -> tuple[int, bytes]:
 
 
 def read_tool_offset(host: str) -> list[float]:
-    """Reads the active tool offset: x, y, z [m] and a rotation vector [rad].
-
-    Raises:
-        DriverError: The controller cannot be reached, or does not report it.
-    """
+    """Reads the active tool offset: x, y, z [m] and a rotation vector [rad]; raises DriverError."""
     ends_s = time.monotonic() + _WAIT_S
     try:
         link = connect(host, _PORTS[0], "the primary interface")
@@ -245,11 +233,7 @@ class Condition:
     remote: bool  # Whether it is in remote control; True where it does not report it.
 
     def check_moves(self) -> None:
-        """Checks that it can be moved from outside.
-
-        Raises:
-            DriverError: It cannot, with the remedy.
-        """
+        """Checks that it can be moved from outside; raises DriverError."""
         if self.safety not in ("NORMAL", "REDUCED"):
             raise self._refuse(
                 f"is stopped by its safety system: {self.safety}",
@@ -266,11 +250,7 @@ class Condition:
             )
 
     def check_reports(self) -> None:
-        """Checks that it reports its joint positions.
-
-        Raises:
-            DriverError: It does not, with the remedy.
-        """
+        """Checks that it reports its joint positions; raises DriverError."""
         if self.mode not in _REPORTING_MODES:
             raise self._refuse(f"does not know where its joints are: its mode is {self.mode}")
 
@@ -284,11 +264,7 @@ class Condition:
 
 
 def read_condition(host: str) -> Condition:
-    """Reads the condition from the dashboard.
-
-    Raises:
-        DriverError: It cannot be reached, is not a UR's, or is too old.
-    """
+    """Reads the condition from the dashboard; raises DriverError."""
     with Dashboard(host) as dashboard:
         version = _read_version(host, dashboard.ask("PolyscopeVersion"))
         model = dashboard.ask("get robot model")

@@ -106,11 +106,7 @@ def words_of(need: Need) -> str:
 
 
 def check_need(need: Need, judged: str) -> None:
-    """Refuses a need that a plan cannot be made for.
-
-    Raises:
-        DataError: A number is not above zero, or the stops are not for the camera's pose.
-    """
+    """Refuses a need that a plan cannot be made for; raises DataError."""
     for name, value in (("mm", need.mm), ("deg", need.deg)):
         if value is not None and not 0.0 < value < np.inf:
             raise DataError(

@@ -155,11 +155,7 @@ class PlanFile:
 
 
 def read_plan(path: Path | str) -> PlanFile:
-    """Reads a plan from its plan.json, or from the folder of it.
-
-    Raises:
-        DataError: There is none, or it is not a valid plan.
-    """
+    """Reads a plan from its plan.json, or from the folder of it; raises DataError."""
     path = Path(path)
     file = path / _FILE if path.is_dir() else path
     document = parse_stored(read_text(file), str(file))

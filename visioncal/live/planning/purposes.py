@@ -57,11 +57,7 @@ PURPOSES: Mapping[str, Purpose] = MappingProxyType(
 
 
 def purpose_of(name: str, culprit: str = "purpose") -> Purpose:
-    """Finds a purpose by its name.
-
-    Raises:
-        DataError: There is no purpose of that name; the culprit is where it was given.
-    """
+    """Finds a purpose by its name; raises DataError."""
     if name not in PURPOSES:
         raise DataError(
             f"{culprit} is {name!r}; stops can be planned for {', '.join(PURPOSES)}.",

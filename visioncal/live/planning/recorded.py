@@ -52,11 +52,7 @@ class PartialCalibration:
 def calibrate_partially(
     session: Session, *, progress: Progress | None = None
 ) -> PartialCalibration:
-    """Calibrates the hand-eye level of a session as far as it goes.
-
-    Raises:
-        DataError: The input is wrong or shows no target.
-    """
+    """Calibrates the hand-eye level of a session as far as it goes; raises DataError."""
     run = RunState(session, progress, level="hand-eye")
     for index, stage in enumerate(STAGES):
         if progress is not None:

@@ -69,11 +69,7 @@ class SimulatedCamera:
         self.settings: Mapping[str, str | float] = MappingProxyType(settings)
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
-        """Returns a picture whose exposure began after the call.
-
-        Raises:
-            DriverError: It is unplugged, or the next exposure ends after the timeout.
-        """
+        """Returns a picture whose exposure began after the call; raises DriverError."""
         requested_at = self._clock.now()
         exposure_s, rate_hz = self._exposure_s, self._rate_hz
         start = self._start + np.ceil((requested_at - self._start) * rate_hz) / rate_hz
@@ -139,20 +135,12 @@ class Bench:
         self.views: list[tuple[TakenView, TrueState]] = []
 
     def start(self, q: FloatArray) -> None:
-        """Starts the controller, its arm at a posture [rad].
-
-        Raises:
-            DriverError: It does not start.
-        """
+        """Starts the controller, its arm at a posture [rad]; raises DriverError."""
         self.controller = spawn(replace(self._options, q=tuple(q.tolist())))
 
     @contextmanager
     def connected(self) -> Iterator[LiveCell]:
-        """Opens the arm as a recording does, and closes it.
-
-        Raises:
-            DriverError: It cannot be opened.
-        """
+        """Opens the arm as a recording does, and closes it; raises DriverError."""
         camera = SimulatedCamera(
             self.truth, lambda at_s: self.controller.state(at_s.tolist()).q, rate_hz=30.0
         )

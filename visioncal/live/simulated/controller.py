@@ -525,11 +525,7 @@ class SimulatedController:
         return state
 
     def inject(self, fault: Fault) -> None:
-        """Injects a fault; returns when it has happened.
-
-        Raises:
-            DriverError: The controller is gone.
-        """
+        """Injects a fault; returns when it has happened; raises DriverError."""
         try:
             self._ask("inject", fault)
         except DriverError:

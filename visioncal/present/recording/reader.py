@@ -149,11 +149,7 @@ class RecordedImages(ImageStore):
     searches: Mapping[tuple[str, str], Searched]
 
     def read(self, path: str) -> bytes:
-        """Reads the bytes of one image file.
-
-        Raises:
-            DataError: It is not in the recording, or the recording changed since it was loaded.
-        """
+        """Reads the bytes of one image file; raises DataError."""
         if path not in self.digests:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         if self.kept != "full":

@@ -60,20 +60,12 @@ class Recorder:
             self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
 
     def at(self, row: int) -> None:
-        """Sets the row (the view's index in the session) of what is logged next.
-
-        Raises:
-            OSError: There is too little room for another view.
-        """
+        """Sets the row (the view's index in the session) of what is logged next; raises OSError."""
         _check_room(self._path.parent)
         self.stream.set_time(paths.TIMELINE, sequence=row)
 
     def keep(self) -> None:
-        """Flushes to the operating system.
-
-        Raises:
-            OSError: The data could not be written.
-        """
+        """Flushes to the operating system; raises OSError."""
         try:
             self.stream.flush(timeout_sec=_WRITTEN_S)
         except (RuntimeError, ValueError) as error:
@@ -84,11 +76,7 @@ class Recorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Writes the end of the file, and waits until it is on the disk.
-
-        Raises:
-            OSError: The file could not be written.
-        """
+        """Writes the end of the file, and waits until it is on the disk; raises OSError."""
         ending = Thread(target=_end, args=(self.stream,), daemon=True)
         ending.start()
         ending.join(0.0 if self._is_lost else _WRITTEN_S)

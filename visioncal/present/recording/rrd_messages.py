@@ -44,11 +44,7 @@ class MessageFrame:
 
 
 def scan(path: Path) -> tuple[MessageFrame, ...]:
-    """Locates the messages of a file, without the one of kind LAST.
-
-    Raises:
-        DataError: The file is missing, no `.rrd`, cut off, or a message's length is wrong.
-    """
+    """Locates the messages of a file, without the one of kind LAST; raises DataError."""
     missing = absence(path)
     if missing:
         raise DataError(
@@ -94,11 +90,7 @@ def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
 
 
 def read_payload(path: Path, frame: MessageFrame) -> bytes:
-    """Reads one message's payload.
-
-    Raises:
-        DataError: The file cannot be read, or has become shorter.
-    """
+    """Reads one message's payload; raises DataError."""
     try:
         with path.open("rb") as file:
             file.seek(frame.offset)

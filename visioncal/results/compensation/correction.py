@@ -52,11 +52,7 @@ class CalibratedArm:
     @classmethod
     @typed
     def of(cls, calibration: Calibration) -> Self:
-        """Reads both models from a calibration.
-
-        Raises:
-            DataError: It has no calibrated arm, or one with fewer than three joints.
-        """
+        """Reads both models from a calibration; raises DataError."""
         nominal, real = calibration.robot, calibration.calibrated_robot
         if nominal is None or real is None or not calibration.arm_is_calibrated:
             raise _without_arm(calibration)

@@ -79,11 +79,7 @@ def faint_jpeg(image: Image) -> bytes:
 
 
 def check_grey(image: Image, label: str) -> None:
-    """Checks that an image is grey.
-
-    Raises:
-        DataError: It does not have exactly two dimensions.
-    """
+    """Checks that an image is grey; raises DataError."""
     if image.ndim != 2:
         raise DataError(
             f"{label}: an array of the shape {image.shape}; (h, w) grey levels are needed.",
@@ -93,11 +89,7 @@ def check_grey(image: Image, label: str) -> None:
 
 
 def encode_png(image: Image | Image16) -> bytes:
-    """Encodes a (h, w) or (h, w, 3) image of 8 or 16 bits as png.
-
-    Raises:
-        DataError: The array has another shape or type.
-    """
+    """Encodes a (h, w) or (h, w, 3) image of 8 or 16 bits as png; raises DataError."""
     pixels: npt.NDArray[np.integer[Any]] = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3) or not pixels.size:
         raise DataError(
@@ -117,11 +109,7 @@ def shrunk(image: Image, factor: int) -> Image:
 
 
 def read_image(path: Path) -> Image:
-    """Reads a (h, w) grey image; see `decode_image`.
-
-    Raises:
-        DataError: The file is missing or cannot be decoded.
-    """
+    """Reads a (h, w) grey image; see `decode_image`; raises DataError."""
     image = decode_image(read_bytes(path, MOST_IMAGE_BYTES))
     if isinstance(image, str):
         raise DataError(

@@ -120,11 +120,7 @@ class BoardKind(ABC):
 
     @abstractmethod
     def read(self, table: DocumentTable, name: str) -> Target:
-        """Reads its description.
-
-        Raises:
-            DataError: A field is missing, of another type, or out of range.
-        """
+        """Reads its description; raises DataError."""
 
     @abstractmethod
     def corners(self, target: Target) -> FloatArray:
@@ -136,11 +132,7 @@ class BoardKind(ABC):
 
     @abstractmethod
     def cells(self, target: Target) -> tuple[Cells, ...]:
-        """Dark areas; those of two grids share at most a point.
-
-        Raises:
-            DataError: It cannot be printed.
-        """
+        """Dark areas; those of two grids share at most a point; raises DataError."""
 
     @abstractmethod
     def on_sheet(self, target: Target) -> tuple[str, str, str]:

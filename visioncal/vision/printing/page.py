@@ -117,11 +117,7 @@ def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
 
 
 def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
-    """Arranges a target on the first page with enough room.
-
-    Raises:
-        DataError: No page has enough room.
-    """
+    """Arranges a target on the first page with enough room; raises DataError."""
     pattern = draw_pattern(target)
     for page in pages:
         room = _room(target, pattern, page)

@@ -15,11 +15,7 @@ _SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def dark_cells(target: Target) -> tuple[Cells, ...]:
-    """Dark areas of a target; those of two grids share at most a point.
-
-    Raises:
-        DataError: The target is a rig that cannot be printed.
-    """
+    """Dark areas of a target; those of two grids share at most a point; raises DataError."""
     return kind_of(target).cells(target)
 
 
@@ -41,11 +37,7 @@ class Pattern:
 
 
 def draw_pattern(target: Target) -> Pattern:
-    """Shapes of a target; its corners are those of `targets.corner_positions`.
-
-    Raises:
-        DataError: The target is a rig of points that cannot be printed.
-    """
+    """Shapes of a target; its corners are those of `targets.corner_positions`; raises DataError."""
     kind = kind_of(target)
     (left, top), (right, bottom) = (array.tolist() for array in kind.extent_m(target))
     grids = dark_cells(target)
