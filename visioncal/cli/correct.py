@@ -67,7 +67,11 @@ def correct_command(options: CorrectOptions) -> None:
             (0.0, 0.0, 0.0),
         ),
     )
-    unreachable = tuple(_unreachable(targets, corrected))
+    unreachable = []
+    for row in np.flatnonzero(~corrected.reached):
+        left = mm_and_deg(1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row]))
+        why = f"out of reach within the joints' limits: the nearest posture leaves {left}"
+        unreachable.append((targets.places[row], why))
     rows = np.flatnonzero(corrected.reached)
     if unreachable and not (options.skip and len(rows)):
         count = len(targets)
@@ -159,17 +163,6 @@ def _seeds(seeds: FloatArray, words: str | None) -> FloatArray:
         seeds = seeds.copy()
         seeds[0] = first
     return seeds
-
-
-def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, str]]:
-    """Rows that cannot be reached, with the reason."""
-    for row in np.flatnonzero(~corrected.reached):
-        off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
-        left = mm_and_deg(off_mm, off_deg)
-        yield (
-            targets.places[row],
-            f"out of reach within the joints' limits: the nearest posture leaves {left}",
-        )
 
 
 def _warn_turns(

@@ -122,8 +122,14 @@ def plan_sweeps(allowed: MotionLimits, request: SweepRequest) -> Sweeps:
     rng = np.random.default_rng(request.seed)
     half = np.minimum(np.pi, allowed.half)
     drawn = allowed.middle + rng.uniform(-half, half, (300, len(half)))
-    clear = drawn[allowed.collisions.first_contact(drawn) < 0]
-    ranges = np.array([_free_ranges(allowed, value) for value in clear]).reshape(-1, len(half), 2)
+    clear, joints = drawn[allowed.collisions.first_contact(drawn) < 0], range(len(half))
+    # (k, n, 2) lowest and highest angles of each joint from the clear postures.
+    ranges = np.array(
+        [
+            [[_free_end(allowed, home, joint, sense) for sense in (-1, 1)] for joint in joints]
+            for home in clear
+        ]
+    ).reshape(-1, len(half), 2)
     order = np.argsort(-np.sort(ranges[:, :, 1] - ranges[:, :, 0], axis=1)[:, 0], kind="stable")
     breaches: tuple[str, ...] = ("everywhere something is too near",)
     # The best are planned in full.
@@ -195,14 +201,6 @@ def _move(allowed: MotionLimits, joint: int, begin: float, end: float) -> Iterat
     )
     ramp_s = max(_SHORTEST_RAMP_S, 1.5 * speed / acceleration)
     yield Stroke(joint, begin, end, speed, ramp_s, sweeps=False)
-
-
-def _free_ranges(allowed: MotionLimits, home: FloatArray) -> FloatArray:
-    """(n, 2) free range of each joint from a clear posture, as lowest and highest [rad]."""
-    joints = range(len(home))
-    return np.array(
-        [[_free_end(allowed, home, joint, sense) for sense in (-1, 1)] for joint in joints]
-    )
 
 
 def _free_end(allowed: MotionLimits, home: FloatArray, joint: int, sense: int) -> float:

@@ -14,7 +14,6 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from threading import Lock
-from types import ModuleType
 from typing import Any, TypeAlias
 from weakref import finalize
 
@@ -127,14 +126,11 @@ class BagImages(ListedImages[tuple[str, bool, int]]):
         return bytes(message.data) if is_compressed else _png(message, topic)
 
 
-def _rosbags(name: str) -> ModuleType:
-    return client_library(f"rosbags.{name}", "ros")
-
-
 @contextmanager
 def _opened(source: Path) -> Iterator[Reader]:
     """An open reader of a bag of any form; raises DataError."""
-    highlevel, typesys = map(_rosbags, ("highlevel", "typesys"))
+    names = ("rosbags.highlevel", "rosbags.typesys")
+    highlevel, typesys = (client_library(name, "ros") for name in names)
     paths = sorted(source.glob("*.bag")) if source.is_dir() else [source]
     with _bag_errors(source):
         # Bags of old versions of ROS 2 do not hold the definitions of their messages.

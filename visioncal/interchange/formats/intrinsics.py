@@ -18,14 +18,9 @@ from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.kind import metres
 from visioncal.vision.targets import read_target, target_from_document, target_names
 
-
-def _millimetres(text: str) -> float:
-    return metres(float(text))
-
-
 _READ: Mapping[str, Callable[[str], object]] = {
     **dict.fromkeys(("columns", "rows", "id"), int),
-    **dict.fromkeys(("square_m", "marker_m", "size_m"), _millimetres),
+    **dict.fromkeys(("square_m", "marker_m", "size_m"), lambda mm: metres(float(mm))),
     "dictionary": str,
     "spacing": float,
     "legacy": bool,

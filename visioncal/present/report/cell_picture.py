@@ -71,14 +71,11 @@ def cell_picture(
     for line, strip in zip(lines, strips, strict=True):
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y in project(strip))
         drawing.path(line.colour, line.width, f"M{path}", _ROUND)
-    for (x, y), name in sorted(zip(project(middles).tolist(), starts, strict=True), key=_height):
+    named = zip(project(middles).tolist(), starts, strict=True)
+    for (x, y), name in sorted(named, key=lambda item: item[0][1]):
         lowest = max(y + 4.0, lowest + LINE_HEIGHT)
         drawing.text(x + 12.0, lowest, name, "start", _HALO)
     return drawing.svg("The cell: its arms, and cameras and boards in the views", _HEIGHT)
-
-
-def _height(named: tuple[Sequence[float], str]) -> float:
-    return named[0][1]
 
 
 def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray], FloatArray]:

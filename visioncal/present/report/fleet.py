@@ -21,9 +21,5 @@ def fleet_page(rows: Sequence[FleetRow]) -> str:
         rows=rows,
         states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
         icon_of=lambda value: _ICONS.get(value.verdict, "bad"),
-        figure=_figure,
+        figure=lambda value: "" if value is None else significant(value),
     )
-
-
-def _figure(value: float | None) -> str:
-    return "" if value is None else significant(value)

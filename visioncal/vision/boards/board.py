@@ -1,7 +1,6 @@
 """Boards whose corners a template refines, found by quick searches where these suffice."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar
 
@@ -48,7 +47,9 @@ class Board(BoardKind):
 
     def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
         """Corners by a quick search, or in a reduced copy if that finds the whole board."""
-        for factor in self._factors(image):
+        sides = max(image.shape), min(image.shape)
+        factors = [by for by in (4, 2) if sides[0] > by // 2 * self.long_side_px and sides[1] >= by]
+        for factor in [*factors, 1] if self.has_quick_search else factors:
             small = image if factor == 1 else shrunk(image, factor)
             seen = self.search(small, target, quick=self.has_quick_search)
             if isinstance(seen, DetectedCorners) and len(seen.ids) == len(self.corners(target)):
@@ -61,14 +62,6 @@ class Board(BoardKind):
                 return seen
         seen = self.search(image, target)
         return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
-
-    def _factors(self, image: Image) -> Iterator[int]:
-        """Factors by which the image is reduced for quick searches."""
-        for factor in (4, 2):
-            if max(image.shape) > factor // 2 * self.long_side_px and min(image.shape) >= factor:
-                yield factor
-        if self.has_quick_search:
-            yield 1
 
     def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
         refined = self.refine(image, target, seen.ids, seen.px)

@@ -181,7 +181,13 @@ class Charuco(Board):
             return NotFound(
                 "markers are seen twice: another board with the same markers is in the image"
             )
-        if _misfit(_by_id(marker_px, marker_ids), target) > LAYOUT_MISFIT:
+        by_id = {
+            int(marker): np.asarray(px, dtype=float).reshape(4, 2)
+            for marker, px in zip(np.ravel(marker_ids), marker_px, strict=True)
+        }
+        on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(by_id, target))
+        is_checked = len(on_board) >= _LAYOUT_MARKERS
+        if is_checked and layout_misfit(on_board, in_image) > LAYOUT_MISFIT:
             return NotFound("the markers do not lie as the target describes them", misfit=True)
         if np.size(ids) == 0 or px is None:
             return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
@@ -223,13 +229,6 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     return board
 
 
-def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
-    return {
-        int(marker): np.asarray(px, dtype=float).reshape(4, 2)
-        for marker, px in zip(np.ravel(marker_ids), marker_px, strict=True)
-    }
-
-
 def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]:
     """Corners of the detected markers on the board [m], and in the image [px]."""
     board = charuco_board(target)
@@ -240,11 +239,6 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
         return np.empty((0, 2)), np.empty((0, 2))
     on_board = np.concatenate([places[marker][:, :2] for marker in on_target])
     return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in on_target])
-
-
-def _misfit(markers: _Markers, target: Target) -> float:
-    on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(markers, target))
-    return layout_misfit(on_board, in_image) if len(on_board) >= _LAYOUT_MARKERS else 0.0
 
 
 def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
