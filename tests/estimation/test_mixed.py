@@ -1,17 +1,15 @@
 """Sizes of noise, lenses and errors of arms: the mixed model, its likelihood, and intervals."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated, known_of
-from support.marks import slow
 from support.problems import observed as observed_world
 from support.problems import world
 
-from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
@@ -34,12 +32,10 @@ from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.gating import gate
-from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels, displacements, distances
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.mixed import (
     CommonRows,
-    LikelihoodValue,
     MixedModel,
     SizePrior,
     Units,
@@ -299,23 +295,6 @@ def test_what_is_eliminated_is_noise_that_corners_share(corners):
     assert np.abs(apart).max() < 1e-2
 
 
-def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():
-    """Residuals (100,) of known variance 1 + 99, of which the search starts with a hundredth."""
-
-    def at(logs):
-        v = np.exp(2.0 * logs)
-        share = v / (1.0 + v)
-        value = 50.0 * np.log(1.0 + v) + 50.0 * 100.0 / (1.0 + v)
-        slope = 100.0 * share * (1.0 - 100.0 / (1.0 + v))
-        return LikelihoodValue(float(value[0]), slope, 200.0 * np.diag(share**2))
-
-    best = np.array([0.5 * np.log(99.0)])
-    low, high = np.array([-9.0]), np.array([9.0])
-    model, enough = SimpleNamespace(at=at, prior=None), at(best).value + 1.0
-    likely = MixedModel.maximised(model, np.array([-2.3]), low, high, enough, 1e-7)
-    assert likely.value == pytest.approx(at(best).value, abs=1e-6)
-
-
 def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     cell = simulate(replace(FINE, views=12))
     session = known_of(cell).session
@@ -344,13 +323,6 @@ def lasting(rng, poses):
     return found
 
 
-def drifting(rng, poses):
-    """Noise, and a base that moves evenly from the first stop to the last."""
-    twist = 3.0 * SIGMAS * rng.normal(size=6) * np.linspace(-1, 1, len(poses))[:, None]
-    base = np.einsum("sij,sj->si", adjoint(invert(poses)), twist)
-    return base / SIGMAS + white(rng, poses)
-
-
 def smooth(rng, poses):
     """Errors that follow where the flange is, over some 0.3 m."""
     waves, phases = rng.normal(size=(6, 3)) / 0.3, rng.uniform(0, 6, 6)
@@ -371,7 +343,7 @@ def fitted(errors, seed, stops=22):
     return problem, fit_problem(problem, state)
 
 
-@pytest.mark.parametrize("errors", [white, slow(lasting), slow(drifting), smooth])
+@pytest.mark.parametrize("errors", [white, smooth])
 def test_errors_are_as_large_as_the_covariance_says(errors):
     before, after = [], []
     for seed in range(12):
@@ -382,15 +354,11 @@ def test_errors_are_as_large_as_the_covariance_says(errors):
         before.append(away @ np.linalg.solve(covariance, away) / 6)
         more = misfit_covariance(problem, fit.state, fit.noise, ROBOT, found)[:6, :6]
         after.append(away @ np.linalg.solve(covariance + more, away) / 6)
-    # A mean of 72 squares is known to 0.17, and levels of few stops leave some 0.3. Seen 0.8, 0.4,
-    # 1.0 and 0.4: what lasts for ten stops is hardly told from what lasts for a hundred, and of a
-    # smooth error, what looks the same in all views is counted though there is none.
+    # A mean of 72 squares is known to 0.17, and levels of few stops leave some 0.3. Seen 0.8 and
+    # 0.4: of a smooth error, what looks the same in all views is counted though there is none.
     assert 0.3 < np.mean(after) < 1.6
     if errors is white:
         # A model that is not needed costs an eighth of a sigma here.
-        assert np.mean(after) > 0.65 * np.mean(before)
-    elif errors is drifting:
-        # An even drift hardly moves the answer, and does not count as wandering, which does.
         assert np.mean(after) > 0.65 * np.mean(before)
     else:
         assert np.mean(before) > 1.5 * np.mean(after)
@@ -405,20 +373,6 @@ def test_noise_is_no_error_of_the_arm_and_what_lasts_is():
     # Too few stops say nothing.
     problem, fit = fitted(white, 0, stops=5)
     assert find_pose_errors(problem, fit.state, fit.noise, ROBOT) is None
-
-
-def test_many_stops_are_put_by_some_columns():
-    problem, fit = fitted(lasting, 2, stops=240)
-    found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-    assert found.is_significant
-    assert found.basis.shape[2] <= 360
-    # Noise and errors together are what single stops show, as far as the edges do not take it up.
-    squares = np.sum(found.basis**2, axis=2).mean(axis=0).reshape(2, 3).mean(axis=1)
-    assert np.sqrt(squares + found.white**2) == pytest.approx(found.fit_sigmas, rel=0.5)
-    # Nine tenths of the last value: ten stops and more are as good as one.
-    more = misfit_covariance(problem, fit.state, fit.noise, ROBOT, found)
-    covariance = covariance_of(problem, fit)
-    assert np.trace(more[3:6, 3:6]) > 3.0 * np.trace(covariance[3:6, 3:6])
 
 
 def bent(curvature: float, seen: list[float]):
@@ -555,20 +509,6 @@ def test_the_mean_of_noise_is_no_tool(tool_m):
         np.testing.assert_allclose(found, tool, atol=5e-5)
     else:
         np.testing.assert_array_equal(found, np.eye(4))
-
-
-@pytest.mark.slow
-def test_intervals_of_the_noise_hold_the_truth():
-    inside, truth = np.zeros(2), np.array([5e-5, 3e-5])
-    for seed in range(20):
-        cell = simulate(replace(FINE, seed=seed, views=12))
-        result = calibrated(cell, joints=False).assessment
-        low, high = noise_intervals(result.problem, result.state, result.noise)[0].T
-        assert np.all(low <= result.noise.robots[0])
-        assert np.all(result.noise.robots[0] <= high)
-        inside += (low <= truth) & (truth <= high)
-    # 95 % of 20 are 19; under 16 comes in one run of four hundred.
-    assert np.all(inside >= 16)
 
 
 def test_links_base_and_flange_move_the_flange_as_their_bases_say():

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.marks import slow
 from support.parts import (
     away,
     even,
@@ -19,7 +18,6 @@ from support.parts import (
     some_frame,
 )
 from support.touched import (
-    EXACT,
     POINTS,
     TIP,
     TURN,
@@ -38,14 +36,12 @@ from visioncal.estimation.pivot import fit_pivot, tool_problem
 from visioncal.estimation.pointfit import PointPairs, fit_features, fit_points, fixture_problem
 from visioncal.estimation.points import Groups, Placement, fit_groups
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.procrustes import align
 from visioncal.estimation.robust import small_sets
 
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])
 SIGMA = 1e-4
 NOISE_M = 1e-4
 ONE_EACH = ("origin", "x", "xy")
-NAMES = [f"P{at}" for at in range(40)]
 ROBOT = Noise.of_robot(5e-5, 3e-5)
 
 
@@ -293,11 +289,10 @@ def shifted(problem, at, by):
     return Lines(problem.jacobian, values, problem.observed, problem.known)
 
 
-@pytest.mark.parametrize("partial", [slow(False), True])
-def test_the_covariance_is_the_scatter(partial):
+def test_the_covariance_is_the_scatter():
     squared, levels = [], []
     for seed in range(200):
-        problem = lines(seed, partial=partial)
+        problem = lines(seed, partial=True)
         fit = fit_groups(problem)
         error = fit.state - TRUTH
         squared.append(error @ np.linalg.solve(fit.covariance, error))
@@ -390,37 +385,6 @@ def noisy(touches, rng, noise_m=NOISE_M):
     )
 
 
-def test_known_noise_stands_where_no_touch_is_to_spare():
-    frame, touches = featured(4, ONE_EACH)
-    found = fit_features(replace(touches, covariances=even(3, NOISE_M)), expected_noise_m=0.0)
-    assert np.allclose(
-        found.fit.covariance, feature_bound(found.fit.state.frame, touches, NOISE_M), rtol=1e-5
-    )
-    expected = fit_features(touches, expected_noise_m=NOISE_M)
-    assert expected.fit.sigma == NOISE_M
-    assert np.allclose(expected.fit.covariance, found.fit.covariance, rtol=1e-3)
-    error = away(found.fit.state.frame, frame)
-    # Chi-square of 6 stays under 23 in all but one case of a thousand.
-    assert error @ np.linalg.solve(found.fit.covariance, error) < 23.0
-
-
-def test_a_touch_that_tells_no_direction_does_no_harm():
-    """One of the x touches is on the origin, which is on the x axis, too."""
-    frame, touches = featured(12, (*ONE_EACH, "x", "xy", "origin"))
-    points = touches.measured.copy()
-    points[3] = points[0] + NOISE_M * np.array([-1.0, 0.5, 0.5])
-    found = fit_features(replace(touches, measured=points))
-    assert found.mask.all()
-    # A few times 0.1 mm over 0.2 m.
-    assert np.abs(away(frame, found.fit.state.frame)).max() < 3e-3
-    points[3] = points[0]
-    guesses = list(fixture_problem(replace(touches, measured=points)).guesses())
-    # 2 x 2 x 2 sets of three touches, of which two are on one line, and the means.
-    assert len(guesses) == 9
-    turns = [guess.frame[:3, :3] for guess in guesses]
-    assert all(np.allclose(turn @ turn.T, np.eye(3)) for turn in turns)
-
-
 def measured_part(seed, count, noise_m=NOISE_M):
     """A frame and the points of a part that lies there."""
     rng = np.random.default_rng(seed)
@@ -445,23 +409,6 @@ def test_known_and_unknown_noise_add_up():
     assert np.median(levels) == pytest.approx(2 * NOISE_M, rel=0.1)
 
 
-def test_weights_reach_the_bound():
-    errors, plain, bounds = [], [], []
-    for seed in range(120):
-        rng = np.random.default_rng(seed)
-        frame, nominal, known = some_frame(rng), some_drawing(rng, 6), uneven(rng, 6)
-        pairs = pairs_of(nominal, placed(frame, nominal) + noise_of(known, rng), known)
-        fit = fit_groups(fixture_problem(pairs))
-        errors.append(away(frame, fit.state.frame) ** 2)
-        plain.append(away(frame, align(pairs.measured, nominal)) ** 2)
-        bounds.append(np.diag(point_bound(frame, nominal, known)))
-    share = np.sqrt(np.mean(errors, axis=0) / np.mean(bounds, axis=0))
-    # A sum of 120 squares scatters by 6 % in its root, and the noise's level costs a little.
-    assert share.max() < 1.2
-    # Even weights ignore that each point is ten times better in two directions.
-    assert np.sqrt(np.mean(plain, axis=0) / np.mean(bounds, axis=0)).min() > 1.5
-
-
 def test_the_frame_moves_with_each_point_as_it_says():
     frame, pairs = measured_part(5, 5, 0.0)
     pairs = replace(pairs, covariances=uneven(np.random.default_rng(5), 5))
@@ -481,22 +428,6 @@ def rejected(fit):
     return np.flatnonzero(~fit.agreement.mask).tolist()
 
 
-def test_the_gradient_is_exact_far_from_closing_too():
-    made = touches_of(Job(tips=3, points=2, axes=2), 2)
-    problem = tool_problem(made.touches, EXACT, oriented=True)
-    twist = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.01])
-    state = Placement(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
-
-    def cost(step):
-        return np.sum(problem.linearise(problem.move(state, step)).residuals ** 2) / 2
-
-    groups = problem.linearise(state)
-    gradient = np.einsum("mij,mi->j", groups.jacobian, groups.residuals)
-    expected = [(cost(value) - cost(-value)) / 2e-6 for value in 1e-6 * np.eye(12)]
-    # Central differences of a cost of 0.01 are exact to rounding over the step.
-    assert gradient == pytest.approx(np.array(expected), abs=1e-10)
-
-
 def test_the_robots_noise_is_carried_to_the_touched_point():
     made = touches_of(Job(tips=1, axes=1), 3)
     problem = tool_problem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
@@ -512,24 +443,15 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
         assert known[at] == pytest.approx(slope @ slope.T, rel=1e-5, abs=1e-11)
 
 
-@pytest.mark.parametrize(
-    "job", [Job(tips=6, axes=2), *(slow(job) for job in (Job(noise=ROBOT), Job(tips=4, points=3)))]
-)
-def test_error_and_covariance_agree(job):
-    squared = []
-    for seed in range(30):
-        made = touches_of(job, seed)
-        fit = fit_pivot(made.touches, job.noise)
-        free = np.arange(0 if job.axes else 3, 6)
-        error = error_of(fit.flange_from_tool) if job.axes else np.zeros(6)
-        if not job.axes:
-            error[3:] = fit.flange_from_tool[:3, 3] - TIP
-        covariance = fit.covariance[np.ix_(free, free)]
-        squared.append(error[free] @ np.linalg.solve(covariance, error[free]))
-    size = len(free)
+def test_error_and_covariance_agree():
+    squared = 0.0
+    for seed in range(20):
+        fit = fit_pivot(touches_of(Job(tips=6, axes=2), seed).touches)
+        error = error_of(fit.flange_from_tool)
+        squared += error @ np.linalg.solve(fit.covariance, error)
     # An F distribution over 24 degrees of freedom or more: 9 % over its size on average, and its
-    # standard deviation is at most 1.2 sqrt(2 size); four standard errors of the mean.
-    assert abs(np.mean(squared) - 1.09 * size) < 4 * 1.2 * np.sqrt(2 * size / 30)
+    # standard deviation is at most 1.2 sqrt(2 6); four standard errors of the mean.
+    assert abs(squared / 20 - 1.09 * 6) < 4 * 1.2 * np.sqrt(2 * 6 / 20)
 
 
 def test_the_covariance_is_the_bound_where_the_noise_is_known():

@@ -8,7 +8,6 @@ import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated
 from support.edges import inliers_of
-from support.marks import slow
 from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
 from visioncal.calibration.stages.init_frames import init_network
@@ -25,11 +24,8 @@ from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import (
-    SIZES_M,
-    TURN_PER_M,
     CalibrationPosterior,
     ChangeHypothesis,
-    RepeatedStops,
     evidence_of,
     undone,
     with_change,
@@ -46,7 +42,7 @@ from visioncal.estimation.solve import (
     left_out_residuals,
     solve_problem,
 )
-from visioncal.estimation.steps import Step, evidence, find_steps, frames_of
+from visioncal.estimation.steps import find_steps, frames_of
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -128,45 +124,14 @@ def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
     assert stops == [5, 4, 3, 2, 1, 0]
 
 
-def still_cell(seed):
-    """A cell whose fixed cameras see fixed boards again and again, at rest."""
-    cell, problem = problem_of(seed, stops=16)
-    problem = replace(problem, with_repeats=True)
-    assert problem.repeat_counts.max() > 1.0
-    return problem, fit_problem(problem, true_state(cell, problem.tree))
-
-
 def test_repeats_do_not_pass_for_a_step():
-    for seed in range(6):
-        problem, fit = still_cell(seed)
-        assert not find_steps(problem, fit, frames_of(problem, tuple(problem.unknown)))
-
-
-@pytest.mark.slow
-def test_steps_are_as_likely_as_their_evidence_says():
-    """Half of the cells have one, of the sizes that steps have; robots hide the smallest."""
-    frame, found = "target_b", []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        cell = replace(world(rng, 14), robot_sigmas={"a": (1e-3, 1e-3), "b": (1e-3, 1e-3)})
-        steps = rng.random() < 0.5
-        twist = steps * rng.choice(SIZES_M) * np.repeat([TURN_PER_M, 1.0], 3) * rng.normal(size=6)
-        changed = {(frame, stop): moved(cell.truth[frame], twist) for stop in range(6, 14)}
-        problem = observed(cell, rng, changed)
+    """Of fixed boards that fixed cameras see again and again, at rest."""
+    for seed in range(3):
+        cell, problem = problem_of(seed, stops=16)
+        problem = replace(problem, with_repeats=True)
+        assert problem.repeat_counts.max() > 1.0
         fit = fit_problem(problem, true_state(cell, problem.tree))
-        (candidate,) = frames_of(problem, [frame])
-        unmoved = Step(candidate, 6, np.zeros(6), np.eye(6), 0.0, np.zeros((0, 0)))
-        gain, wider, _ = evidence(problem, fit, unmoved)
-        assert f"{frame}@2" in wider.unknown
-        found.append((steps, 1.0 / (1.0 + np.exp(-0.5 * gain))))
-    stepped, likely = np.array(found).T
-    # The number of steps is off by as much as they are uncertain; a few are never seen, and none
-    # is seen where there is none.
-    spread = np.sqrt(np.sum(likely * (1.0 - likely)))
-    assert 1.0 < spread < 4.0
-    assert abs(np.sum(stepped - likely)) < 3.0 * spread
-    assert stepped[likely > 0.99].all()
-    assert np.sum(likely > 0.99) > 16
+        assert not find_steps(problem, fit, frames_of(problem, tuple(problem.unknown)))
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():
@@ -298,17 +263,6 @@ def test_residuals_of_views_left_out_are_those_of_fits_without_them():
         assert square == pytest.approx(inside.squares[view], rel=1e-2)
 
 
-def doubled(problem):
-    """Every view twice, as two that know half as much each."""
-    again = np.repeat(np.arange(len(problem)), 2)
-    seen = problem.observations.take(again)
-    return replace(
-        problem,
-        observations=replace(seen, covariance=2.0 * seen.covariance),
-        effects=tuple(effect.take(again) for effect in problem.effects),
-    )
-
-
 def test_shared_errors_of_flanges_are_eliminated_exactly():
     """Against the covariance of all observations, written out."""
     cell, problem = problem_of(3, stops=6)
@@ -347,7 +301,7 @@ def causes_of(problem, rng):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("size", [0.0, 0.4, 1.5])
+@pytest.mark.parametrize("size", [0.0, 1.5])
 def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
     rng = np.random.default_rng(3)
     data, state = stops_of(mount, rng)
@@ -463,19 +417,6 @@ def belief_of(state, freedom=np.inf, sigma=1e-5):
     return CalibrationPosterior(state, sigma**2 * np.eye(12), NOISE, freedom)
 
 
-def test_noise_that_explains_more_than_all_sources_is_no_failure():
-    data, state = stops_of("eye-in-hand", np.random.default_rng(5))
-    belief, count = belief_of(state, sigma=1.0), len(data)
-    repeated = RepeatedStops(
-        np.zeros(1, dtype=np.int64),
-        np.zeros((1, 6)),
-        np.eye(count + 1),
-        np.append(data.observations.stops, count),
-        4.0 * belief.covariance,
-    )
-    assert np.isfinite(evidence_of(data, replace(belief, repeated=repeated)).likelihood)
-
-
 def test_misfit_and_evidence_follow_their_distributions():
     rng = np.random.default_rng(5)
     data, state = stops_of("eye-in-hand", rng)
@@ -558,7 +499,7 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     np.testing.assert_allclose(column, difference, atol=4e-3 * np.abs(difference).max())
 
 
-@pytest.mark.parametrize("rate_hz", [10, 30, 50, 100])
+@pytest.mark.parametrize("rate_hz", [10, 50])
 def test_stamps_since_1970_are_matched_as_those_near_zero(rate_hz) -> None:
     begin_s = 1_700_000_000.0
     times_s = np.arange(0.0, 9.95, 1.0 / rate_hz)
@@ -593,39 +534,31 @@ def answered(given, **changes):
     return problem, fit_problem(problem, known.assessment.state)
 
 
-@pytest.mark.parametrize("views", [6, slow(20)])
-def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom(views):
+def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom():
     # Corners know poses far better than the robot stands.
-    problem, fit = answered(True, views=views, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)
+    problem, fit = answered(True, views=6, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)
     expected = expected_levels(problem, fit.state, fit.noise)
     # Corners' own noise takes some of the freedom; the sum over the scales is right to 1e-3.
     ratio = (expected / fit.noise.robots) ** 2
-    np.testing.assert_allclose(ratio - 1.0, 2.0 / (6 * views - 14.0), rtol=0.15)
-    if views == 6:  # A level that may be zero is expected to be what the corners hide.
-        problem, fit = answered(True, views=6, seed=1, robot_sigma_m=0.0, robot_sigma_rad=0.0)
-        at = replace(fit.noise, robots=np.full((1, 2), 1e-9))
-        assert 1e-6 < expected_levels(problem, fit.state, at)[0, 1] < 1e-4
+    np.testing.assert_allclose(ratio - 1.0, 2.0 / (6 * 6 - 14.0), rtol=0.15)
+    # A level that may be zero is expected to be what the corners hide.
+    problem, fit = answered(True, views=6, seed=1, robot_sigma_m=0.0, robot_sigma_rad=0.0)
+    at = replace(fit.noise, robots=np.full((1, 2), 1e-9))
+    assert 1e-6 < expected_levels(problem, fit.state, at)[0, 1] < 1e-4
 
 
-def of_kind(problem, kind):
-    """The problem with two views a stop, with places of one point, or with combined noise."""
-    if kind == "two a stop":
-        return doubled(problem)
-    if kind == "places":  # Which leave a flange's rotation open.
-        return seen_otherwise(problem, has_rotation=np.zeros(len(problem), dtype=bool))
-    if kind == "combined":
-        unknown = np.zeros_like(problem.observations.covariance)
-        return replace(seen_otherwise(problem, covariance=unknown), is_combined=True)
-    return problem
+def combined(problem, **changes):
+    """The problem with one noise of robot and camera."""
+    unknown = np.zeros_like(problem.observations.covariance)
+    return replace(seen_otherwise(problem, covariance=unknown, **changes), is_combined=True)
 
 
-KINDS = ["one a stop", "two a stop", "places", "combined"]
-
-
-@pytest.mark.parametrize("kind", [*map(slow, KINDS[:3]), KINDS[3]])
+@pytest.mark.parametrize("kind", ["one a stop", "places", "combined"])
 def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
     problem, fit = answered(False, views=8, seed=6)
-    problem = of_kind(problem, kind)
+    if kind == "places":  # Which leave a flange's rotation open.
+        problem = seen_otherwise(problem, has_rotation=np.zeros(len(problem), dtype=bool))
+    problem = combined(problem) if kind == "combined" else problem
     moves = np.random.default_rng(0).standard_normal((8, 6, 3))
     nothing = PriorInformation(np.zeros((3, 3)), np.zeros(3))
     effect = Effect.free("arm", nothing, flange_jacobian={ROBOT: moves})
@@ -634,7 +567,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     beside = robot_likelihood(problem, fit.state, fit.noise).beside(0, moves)
     expected = robot_likelihood(wider, there, fit.noise)
     np.testing.assert_allclose(beside.jacobian, expected.jacobian, rtol=1e-6, atol=1e-9)
-    if kind == "places":  # These leave rotations open: the rounding of none decides the likelihood.
+    if kind != "combined":
         return
     # What the wider problem has left of the arm's columns beside them is rounding.
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
@@ -652,17 +585,14 @@ def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
     assert np.flatnonzero(~found.used).tolist() == [17]
 
 
-@pytest.mark.parametrize(("times", "combined"), [slow(2, True), (3, False)])
-def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, combined):
+def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it():
     """Each stop looked at several times, with the camera's own noise each time."""
+    times = 3
     problem = answered(True, seed=1)[0].with_effects([])
     seen = problem.observations.take(np.repeat(np.arange(len(problem)), times))
     noise = np.random.default_rng(5).standard_normal((len(seen), 6))
     step = np.einsum("nij,nj->ni", np.linalg.cholesky(seen.covariance), noise)
     problem = replace(problem, observations=replace(seen, measured=seen.measured @ exp(step)))
-    if combined:
-        uneven = np.ones(len(seen), dtype=bool)
-        problem = seen_otherwise(of_kind(problem, "combined"), is_uneven=uneven)
     assert inliers_of(problem).used.all()
     measured = problem.observations.measured
     for rows in ([4 * times + 1], [*range(4 * times, 5 * times)]):

@@ -1,9 +1,7 @@
 """The closed-form hand-eye solvers: every solver on every kind of problem."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +15,6 @@ from visioncal.estimation.closed_form import (
     SOLVERS,
     HandEye,
     Solver,
-    complete,
     lone_axis,
     rotation_pairs,
 )
@@ -57,7 +54,6 @@ COARSE = World(robot_mm=0.3, robot_mrad=0.5, camera_mm=0.2, camera_mrad=0.3)
 
 NOISY_WORLDS = {
     "precise robot": PRECISE,
-    "coarse robot": COARSE,
     "any roll": replace(COARSE, roll_deg=180.0),
     "tilts of 5 deg": replace(PRECISE, tilt_deg=5.0, roll_deg=5.0),
     "eye-to-hand": replace(COARSE, mount="eye-to-hand"),
@@ -223,22 +219,16 @@ def seen_in(world: World) -> Build:
 EXACT: dict[str, Build] = {
     "3 views": free(3),
     "4 views": free(4),
-    "20 views": free(20),
     "200 views": free(200),
     "1 cm": free(20, reach_m=0.01),
     "3 m": free(20, reach_m=3.0),
-    "3 views, 3 m": free(3, 1.0, reach_m=3.0),
     "half turn about x": x_turned(1, 0, 0),
-    "half turn about y": x_turned(0, 1, 0),
     "half turn about z": x_turned(0, 0, 1),
     "half turn, oblique": x_turned(1, -1, 1),
-    "half turn, another": x_turned(0.2, 0.5, -0.9),
     "almost a half turn": x_turned(0.2, 0.5, -0.9, 1e-6),
-    "almost a half turn about z": x_turned(0, 0, 1, 1e-9),
     "no turn": lambda rng: free_poses(rng, 10, 1.0, 0.5, rigid(np.eye(3), np.full(3, 0.1))),
     "small tilts, 3 views": small_tilts(3, 0.5),
     "small tilts": small_tilts(20, 0.5),
-    "small tilts, 1 cm": small_tilts(20, 0.01),
     "small tilts, 3 m": small_tilts(20, 3.0),
     "half turns between views": half_turns_between_views,
     "turning on the spot": turning_on_the_spot,
@@ -263,9 +253,7 @@ def test_exact_views_give_the_truth(solver: Solver, build: Build):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize(
-    "label", ["precise robot", "coarse robot", "any roll", "tilts of 5 deg", "eye-to-hand"]
-)
+@pytest.mark.parametrize("label", NOISY_WORLDS)
 def test_noise_hurts_no_more_than_in_opencv(name: str, label: str):
     problems = [simulate(NOISY_WORLDS[label], seed) for seed in range(30)]
     ours = [SOLVERS[name](problem.robot, problem.camera).x for problem in problems]
@@ -277,20 +265,6 @@ def test_noise_hurts_no_more_than_in_opencv(name: str, label: str):
         # The bound over 200 seeds is 1.05, kept by the benchmark. The ratio of two medians of
         # the same 30 sets scatters by another 5 %, since different solvers weigh noise apart.
         assert np.median(own) <= 1.10 * np.median(np.nan_to_num(other, nan=np.inf))
-
-
-@pytest.mark.parametrize(
-    "world",
-    [World(robot_mrad=0.5), World(camera_mrad=0.5), World(robot_mrad=0.5, mount="eye-to-hand")],
-    ids=["the robot's", "the camera's", "the robot's, at the target"],
-)
-def test_rotation_noise_acts_at_its_shortest_lever(world: World):
-    """With X's rotation known, its translation errs by what noise does at the better point."""
-    problems = [simulate(world, seed) for seed in range(60)]
-    errors = [shift_error(complete(p.robot, p.camera, p.x[:3, :3]).x, p.x) for p in problems]
-    # Fixed at the better end of the line from target to camera the median is 0.04 to 0.08 mm, at
-    # the worse end 0.17 to 0.20 mm, and half-way up to 0.12 mm.
-    assert np.median(errors) < 1e-4
 
 
 def one_axis(rng: np.random.Generator) -> tuple[Problem, FloatArray]:
@@ -347,24 +321,12 @@ def test_what_the_robot_moves_by_determines_the_turn_about_a_lone_axis(rise_m: f
         np.testing.assert_allclose(found.x[:3, 3], [*x[:2, 3], 0.0], atol=1e-9)
 
 
-def still(travels_m: float) -> Build:
-    """Rotations that are equal to the last bit."""
-
-    def build(rng: np.random.Generator) -> Problem:
-        poses = rigid(np.eye(3), rng.uniform(-travels_m, travels_m, size=(5, 3)))
-        return Problem(poses, np.linalg.inv(poses), np.eye(4), np.eye(4))
-
-    return build
-
-
 POOR: dict[str, Build] = {
     "one axis": lambda rng: one_axis(rng)[0],
     "one axis, noise": lambda rng: shaken(one_axis(rng)[0], rng),
     "no rotation": no_rotation,
     "no rotation, noise": lambda rng: shaken(no_rotation(rng), rng),
     "two views": free(2, 1.0),
-    "resting": still(0.0),
-    "sliding": still(0.3),
     # What is noisy is a rotation, too.
     "noise": seen_in(COARSE),
 }
@@ -427,14 +389,3 @@ def test_the_table_of_solvers_cannot_be_changed_and_pairs_are_limited():
     for count in (1000, 3000):
         pairs = rotation_pairs(*np.tile(np.eye(4), (2, count, 1, 1)))
         assert pairs.weight.size == count * 99 // 2
-
-
-@all_solvers
-def test_measured_poses_agree_with_published_result(solver: Solver, real_data: Path):
-    """The 50 pose pairs of MoveIt's own test, whose camera stands beside the robot."""
-    path = real_data / "pose_pairs_small/moveit_eye_to_hand_50.json"
-    pairs = np.array(json.loads(path.read_text(encoding="utf-8")))
-    found = solver(np.linalg.inv(pairs[:, 0]), pairs[:, 1])
-    # MoveIt's test asserts this place to 1 cm; residuals of 4.6 mm over 50 views leave 1 mm,
-    # and its own solver weighs the views differently from all of ours.
-    np.testing.assert_allclose(found.x[:3, 3], [0.659, -0.249, 0.830], atol=0.005)

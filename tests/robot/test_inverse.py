@@ -138,10 +138,7 @@ def test_five_axes_reach_the_position_and_nearly_the_rotation():
     assert not reached(real, pose, q)[0].reached
 
 
-ARMS = [name for name in robot_names() if load_robot(name).joint_count >= 6]
-
-
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", ["ur10e", "irb120", "panda", "gen3"])
 def test_random_starts_lead_to_poses_in_reach_by_all_branches(name):
     robot, rng = load_robot(name), np.random.default_rng(2)
     inverse = Inverse(robot)

@@ -8,8 +8,6 @@ from visioncal.simulation.instrument_session import (
     random_postures,
 )
 
-# Shoulder and elbow yield, the rest does not [N m/rad].
-STIFFNESS = (np.inf, 1.4e6, 9e5, np.inf, np.inf, np.inf)
 GRAVITY = 9.80665
 LOADS_N = (0.0, 10.0, 20.0, 50.0)
 HUNG = tuple(Payload(kg=load / GRAVITY) for load in LOADS_N)
