@@ -6,10 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from support.boards import charuco, checkerboard, circles
+from support.boards import charuco, circles
 from support.commands import visioncal as command
 from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session, edit, sound_session
-from support.marks import slow
 from support.rendered import Shot, photograph
 
 import visioncal
@@ -59,18 +58,16 @@ def first_of_blurred(shown, sigma_px):
     return visioncal.doctor(session).findings[0]
 
 
-@pytest.mark.parametrize(("columns", "sigma_px"), [slow(9, 2.9), (12, 2.9)])
-def test_a_board_too_blurred_for_its_markers_is_no_other_board(columns, sigma_px):
-    found = first_of_blurred(charuco(columns, 6), sigma_px)
+def test_a_board_too_blurred_for_its_markers_is_no_other_board():
+    found = first_of_blurred(charuco(12, 6), 2.9)
     assert "no view shows the target" in found.words
     assert "sharp, near enough and not mirrored" in found.do.words
 
 
-@pytest.mark.parametrize("shown", [circles(4, 7, asymmetric=True), slow(checkerboard(7, 4))])
-def test_a_board_without_markers_has_to_be_stated(shown):
-    found = first_of_blurred(shown, 0.0)
+def test_a_board_without_markers_has_to_be_stated():
+    found = first_of_blurred(circles(4, 7, asymmetric=True), 0.0)
     assert "no view shows the target" in found.words
-    assert f'kind = "{shown.kind}", columns' in str(found.do)
+    assert 'kind = "circles", columns' in str(found.do)
     assert 'target = "board.toml" in session.toml' in str(found.do)
 
 
@@ -105,22 +102,10 @@ def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_matrix_of_larger_images_is_named(tmp_path):
-    folder = broken_session(tmp_path / "session", BROKEN["the lens of larger images"])
-    first, *_ = visioncal.doctor(folder).findings
-    cause = visioncal.calibrate(folder).verdict.causes[0]
-    for found in (first, cause):
-        assert found.kind == "other_lens"
-        assert "are not this camera's, or of images of another size" in found.words
-
-
-@pytest.mark.parametrize("more", [slow(1), slow(-1)])
-def test_squares_in_the_place_of_inner_corners_are_named(tmp_path, more):
+def test_squares_in_the_place_of_inner_corners_are_named(tmp_path):
     options = replace(Mistake().options, target=BOARDS["checkerboard"], views=4)
     folder = sound_session(tmp_path / "squares", Mistake(options=options))
-    described = (
-        f'kind = "checkerboard"\ncolumns = {9 + more}\nrows = {6 + more}\nsquare_m = 0.025\n'
-    )
+    described = 'kind = "checkerboard"\ncolumns = 10\nrows = 7\nsquare_m = 0.025\n'
     (folder / "board.toml").write_text(described)
     edit(folder, lambda text: text.replace("checkerboard_9x6_25mm", "board.toml"))
     (found,) = visioncal.doctor(folder).findings

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
-from support.marks import slow
 from support.tracked import errors_of, known_of
 
 import visioncal
 from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
@@ -28,31 +28,26 @@ PROBE, POINT, POINTS = (
     InstrumentOptions(),
     InstrumentOptions(points=THREE),
 )
-PROBE_FIRST = pytest.mark.parametrize(
-    "options", [PROBE, *(slow(item) for item in (POINT, POINTS))], ids=["probe", "point", "three"]
-)
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 
 
-@PROBE_FIRST
+@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
 def test_errors_follow_their_covariance(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
-    by_sigma = []
-    for seed in range(5):
+    squares = 0.0
+    for seed in range(3):
         shop = tracked(replace(options, seed=seed))
         known = known_of(session_of(shop), level="hand-eye")
-        error, covariance = (
-            errors_of(shop, known)[kept],
-            known.assessment.covariance[np.ix_(kept, kept)],
-        )
-        by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
-    # Chi-square of 45 or 60 degrees of freedom over these: beyond is one in a thousand.
-    assert np.mean(by_sigma) == pytest.approx(1.0, abs=0.78)
+        error = errors_of(shop, known)[kept]
+        covariance = known.assessment.covariance[np.ix_(kept, kept)]
+        squares += float(error @ np.linalg.solve(covariance, error))
+    # In one case of a thousand chi-square is beyond either.
+    low, high = chi2_limit(np.array([0.9995, 0.0005]), 3 * len(kept))
+    assert low < squares < high
 
 
-@pytest.mark.parametrize("options", [PROBE, slow(POINTS)], ids=["probe", "three"])
-def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options):
-    shop = tracked(replace(options, **WRONG, stops=40))
+def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace():
+    shop = tracked(replace(PROBE, **WRONG, stops=40))
     known = known_of(session_of(shop))
     assert known.robot_arm.kinematics.level == "geometry"
     assert known.verdict.status == "good"
@@ -122,9 +117,8 @@ def test_without_a_model_poses_give_the_frames_alone():
     assert all(point.sigma_mm < 0.024 for point in result.points)
 
 
-@PROBE_FIRST
-def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path):
-    session_of(tracked(replace(options, **WRONG))).save(tmp_path / "shop")
+def test_outputs_are_whole_and_the_recording_gives_them_again(tmp_path):
+    session_of(tracked(replace(PROBE, **WRONG))).save(tmp_path / "shop")
     out = tmp_path / "out"
     done = command("calibrate", tmp_path / "shop", "-o", out)
     assert done.status == 0, done.err
@@ -143,7 +137,7 @@ def test_outputs_are_whole_and_the_recording_gives_them_again(options, tmp_path)
         "deg" in found["left_out"][0],
         rotation.any(),
     ]
-    assert with_rotations == [options.poses] * 4
+    assert all(with_rotations)
     again = visioncal.calibrate(visioncal.Session.load(out / "recording.rrd"))
     again.save(tmp_path / "again.json")
     # What is calibrated by a call has no folder for its commands.
@@ -262,10 +256,10 @@ def test_motion_that_tells_too_little_is_refused(change, words):
         known_of(session_of(tracked(POINT)), solver="tsai")
 
 
-@pytest.mark.parametrize(("options", "joint", "slip_deg"), [(POINT, 3, 0.15), slow(PROBE, 1, -0.1)])
-def test_a_joint_that_slips_between_readings_is_named(options, joint, slip_deg):
+def test_a_joint_that_slips_between_readings_is_named():
     """Functions of the joints would explain much of it, and leave the result good."""
-    shop = tracked(replace(options, **WRONG, stops=40))
+    joint, slip_deg = 3, 0.15
+    shop = tracked(replace(POINT, **WRONG, stops=40))
     slipped = shop.joints.copy()
     slipped[20:, joint - 1] += np.deg2rad(slip_deg)
     known = known_of(session_of(replace(shop, joints=slipped)))

@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import arm_found, calibrated, known_of, reporting
-from support.edges import solved
 from support.live_cell import postures_in_view, true_cell
-from support.loaded import HUNG, NOMINAL, STIFFNESS, loaded_postures
 from support.marks import slow
 from support.tracked import known_of as tracked_known
 from support.wrong_arms import CARRIED, COBOT, GOOD, SAGGING, WRONG_LINKS, error_m, target_in_camera
@@ -28,7 +26,6 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.identifiability import observability_indices
-from visioncal.estimation.parameters import free_parameters
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.workspace import postures
@@ -37,10 +34,9 @@ from visioncal.live.planning.information import stop_factors
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
-from visioncal.robot import Loads, Robot, WeightFunctions, convert_table, load_robot, table_of
-from visioncal.robot.tables import table_from_document
+from visioncal.robot import Loads, Robot, WeightFunctions, load_robot
 from visioncal.simulation import CellOptions, Payload, simulate
-from visioncal.simulation.arms import forward, loaded_joints
+from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (
     InstrumentOptions,
     InstrumentRecord,
@@ -106,49 +102,6 @@ def identified(data, convention=None):
     level = ArmLevel(level="nominal", unknowns=0, rms_mm=0.0, held_out_mm=0.0, likelihood_ratio=0.0)
     result = ArmResult(level="nominal", levels=(level,))
     return add_parameters(result, data, convention)
-
-
-COMPLIANCE = tuple(float(value) for value in 1.0 / np.array(STIFFNESS))
-
-
-# The arm stretched out, with the longest lever that it has [rad].
-STRETCHED = np.array([[0.0, np.pi / 2, -np.pi / 2 + np.arctan2(0.18, 0.8), 0.0, 0.0, 0.0]])
-
-
-def loaded(
-    seed: int = 0, count: int = 15, sigma_m: float = 3e-5
-) -> tuple[InstrumentRecord, RunState]:
-    """The truth, and what is made of it."""
-    options = InstrumentOptions(
-        robot=NOMINAL.name,
-        sigma_m=sigma_m,
-        robot_sigma_m=1e-5,
-        robot_sigma_rad=1e-5,
-        dh_sigma_m=3e-4,
-        dh_sigma_rad=3e-4,
-        offset_sigma_rad=3e-4,
-        compliance_rad_per_nm=COMPLIANCE,
-        payloads=HUNG,
-        seed=seed,
-    )
-    shop = tracked(options, loaded_postures(count, seed))
-    return shop, tracked_known(session_of(shop))
-
-
-def deflection_m(shop: InstrumentRecord, q: FloatArray, load: Payload) -> FloatArray:
-    """(m, 3) how a load moves the real flange [m]."""
-    hung = loaded_joints(shop.true_arm, COMPLIANCE, q, [load] * len(q))
-    free = loaded_joints(shop.true_arm, COMPLIANCE, q, [Payload()] * len(q))
-    moved = forward(shop.true_arm, hung) - forward(shop.true_arm, free)
-    return np.asarray(moved[:, :3, 3])
-
-
-def predicted_m(known: RunState, q: FloatArray, load: Payload) -> FloatArray:
-    """(m, 3) how the calibrated model says that it does [m]."""
-    model, count = known.robot_arm.model, len(q)
-    hung = Loads.alike(count, load.kg, load.centre_m, load.force_n)
-    moved = model.base_from_flange(q, hung) - model.base_from_flange(q)
-    return np.asarray(moved[:, :3, 3])
 
 
 # Three axes and a wrist, with rails among them.
@@ -345,42 +298,6 @@ def test_readings_of_one_point_tell_three_values_less(name):
     assert (point.identifiable, point.determined) == (whole.identifiable - 3, whole.determined - 3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "convention"), [("ur5e", "hayati"), ("panda", "modified")])
-def test_sigmas_hold_the_errors_of_the_numbers(name, convention):
-    """Twenty arms drawn from what is known of them beforehand, and measured with noise."""
-    robot = load_robot(name)
-    like = convert_table(table_from_document(robot.document), convention)
-    rng, surprises = np.random.default_rng(3), []
-    for _ in range(20):
-        model = erring(robot)
-        q = postures(robot, 200)[rng.permutation(60)[:25]]
-        true = model.moved(ERROR_RAD * rng.normal(size=len(model.values)))
-        noise = exp(rng.normal(size=(2, 25, 6)) * np.repeat(NOISE.robots[0], 3))
-        flange = true.robot.base_from_flange(q) @ noise[0]
-        result = solved(problem_of(model, "eye-in-hand", q, flange, noise[1]))
-        found = model.moved(result.state.values)
-        arm = replace(
-            arm_data(robot, q),
-            problem=problem_of(found, "eye-in-hand", q, flange, noise[1]),
-            state=result.state,
-            noise=result.noise,
-            covariance=result.covariance,
-            model=found,
-        )
-        numbers, wanted = identified(arm, convention)[0], table_of(true.bare, convention, like=like)
-        pairs = zip(free_parameters(found, like), numbers.parameters, strict=True)
-        # What the frames hide keeps what was stated, which says nothing of the sigma.
-        surprises += [
-            (value.identified - parameter.value(wanted)) / value.sigma
-            for parameter, value in pairs
-            if value.sigma < 0.4 * ERROR_RAD * parameter.unit
-        ]
-    assert len(surprises) > 20 * 14
-    # Some four hundred squares, of which a few numbers of each arm hang together: 10 % each.
-    assert np.mean(np.square(surprises)) == pytest.approx(1.0, abs=0.25)
-
-
 Q = random_postures(tracked(OPTIONS).arm, 200, np.random.default_rng(1))
 
 
@@ -532,32 +449,6 @@ def test_weight_is_among_the_functions():
     assert again == pytest.approx(torques, abs=1e-6)
 
 
-@pytest.mark.slow
-def test_sagging_arms_of_known_and_of_unknown_weight_are_calibrated_with_their_sag():
-    for robot, views in ((None, 40), (of_unknown_weight(), 60)):
-        cell = simulate(replace(SAGGING, views=views, seed=4))
-        known = calibrated(cell, robot=robot)
-        assert known.robot_arm.kinematics.level == "elastic"
-        nominal = known.robot_arm.model.nominal
-        before = error_m(cell, calibrated(cell, joints=False), nominal)
-        # Hundred views leave 1 % in the median; forty are dearer.
-        assert error_m(cell, known, known.robot_arm.model) < 0.06 * before
-        elastic = arm_found(known).sections.elastic
-        stiff = [spring.stiffness_nm_per_rad is not None for spring in elastic.joints]
-        if robot is None:
-            # The first axis is upright: no weight turns it.
-            assert elastic.not_determined[0] == "shoulder_pan_joint"
-            assert all(stiff[1:4])
-        else:
-            assert not any(stiff)
-        words = "of which its model states nothing"
-        assert any(words in reason for reason in known.verdict.reasons) == (robot is not None)
-        q = postures(nominal)[:20]
-        # RigidTransform makes rotations orthonormal anew.
-        ours = known.robot_arm.model.base_from_flange(q)
-        assert result_of(known).base_from_flange(q).as_matrix() == pytest.approx(ours, abs=1e-12)
-
-
 def test_play_is_told_by_stops_from_both_sides_and_is_no_stiffness():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     worn = calibrated(cell)
@@ -678,39 +569,3 @@ def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for(
     assert calibrated(cell, joints=False).robot_arm.kinematics is None
     with pytest.raises(DataError, match="needs the joint angles of every view"):
         calibrated(cell, joints=False, level="kinematics")
-
-
-@pytest.mark.slow
-def test_a_level_that_explains_too_little_is_told():
-    known = calibrated(simulate(replace(WRONG_LINKS, seed=1)), level="offsets")
-    assert known.robot_arm.kinematics.level == "offsets"
-    words = "speak for more than the arm's offsets"
-    assert any(words in reason for reason in known.verdict.reasons)
-    assert known.verdict.status != "good"
-    right = calibrated(simulate(replace(GOOD, seed=3)), level="kinematics")
-    assert right.robot_arm.kinematics.level == "nominal"
-    assert any("The arm stays as stated" in reason for reason in right.verdict.reasons)
-
-
-@pytest.mark.slow
-def test_the_workspace_sigma_holds_the_error():
-    sure = replace(WRONG_LINKS.target, square_sigma_m=1e-5 * WRONG_LINKS.target.square_m)
-    cell = simulate(replace(WRONG_LINKS, seed=7, target=sure))
-    known = calibrated(cell)
-    sigma = float(np.sqrt(np.mean(place_sigmas_m(known) ** 2)))
-    # One world's error along the weakest direction, at three sigma.
-    assert error_m(cell, known, known.robot_arm.model.robot) < 3.0 * sigma
-
-
-@pytest.mark.slow
-def test_a_loaded_arm_read_by_a_tracker():
-    """Loads of 10, 20 and 50 N on a shoulder of 1.4e6 and an elbow of 9e5 N m/rad."""
-    shop, known = loaded(seed=2)
-    for joint in (1, 2):
-        spring, true = arm_found(known).sections.elastic.joints[joint], COMPLIANCE[joint]
-        assert abs(spring.compliance_rad_per_nm - true) < 3.0 * spring.sigma_rad_per_nm
-        assert spring.sigma_rad_per_nm < 0.1 * true
-    q = np.vstack([STRETCHED, shop.joints[::4]])
-    before = deflection_m(shop, q, HUNG[-1])
-    after = before - predicted_m(known, q, HUNG[-1])
-    assert np.linalg.norm(after) < 0.2 * np.linalg.norm(before)

@@ -8,17 +8,16 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, known_of, session_of
-from support.marks import slow
 from support.refusals import raised
 
-from visioncal.calibration.pipeline.result import result_of, view_evidence
+from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.run import STAGES, calibrate, run
+from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.core.types import MOUNTS, Camera, Target
+from visioncal.core.types import Camera, Target
 from visioncal.core.verdict import NOTE
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
@@ -59,8 +58,6 @@ AMBIGUOUS = replace(
     tilt_rad=(0.0, 0.3),
     seed=1,
 )
-# The second board is out of sight from where the first is looked at, unless it is turned less.
-NEAR = Second(turn_rad=0.6, tilt_rad=0.2)
 TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
 SIGMA_M = 5e-4
 X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
@@ -92,34 +89,15 @@ def test_a_closed_form_is_diagnosed_too():
     assert noise[1] == pytest.approx(noise[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("solver", ["joint", slow("park")])
-def test_views_held_back_may_be_ambiguous(solver):
+def test_views_held_back_may_be_ambiguous():
     cell = simulate(AMBIGUOUS)
     told = session_of(cell)
     views = tuple(replace(view, holdout=view.number % 4 == 0) for view in told.views)
-    plain = known_of(cell, session=replace(told, views=views), solver=solver)
-    for stage in (stage for stage in STAGES if stage.name in ("intrinsics", "pnp")):
-        plain = stage.run(plain)
-    held = range(0, 20, 4)
-    assert any(len(plain.poses[index].cam_from_target) > 1 for index in held)
-    known = calibrated(cell, session=replace(told, views=views), solver=solver)
+    known = calibrated(cell, session=replace(told, views=views))
+    assert any(len(known.poses[index].cam_from_target) > 1 for index in range(0, 20, 4))
     assert known.used == tuple(index for index in range(20) if index % 4)
     # Of the order of the used views': half a turn of the board would be metres.
     assert known.findings.pairs[0].holdout.mm < 5 * known.findings.held_out.mm
-
-
-def test_a_view_left_out_as_ambiguous_is_shown_by_its_best_pose():
-    # A small board far away: in frontal views perspective hardly tells the tilt's sign.
-    small = Target("small", "checkerboard", 5, 4, 0.025, 2.5e-5)
-    far = CellOptions(
-        target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
-    )
-    known = calibrated(simulate(far))
-    assert known.reasons[4].startswith("ambiguous")
-    shown = {view.view: view for view in view_evidence(known)}
-    np.testing.assert_array_equal(shown[4].cam_from_target, known.poses[4].cam_from_target[0])
-    assert shown[4].predicted_px is None
-    assert all(shown[view].predicted_px is not None for view in known.used)
 
 
 def test_a_session_that_holds_all_views_back_is_told_so():
@@ -134,27 +112,6 @@ def test_a_session_that_holds_all_views_back_is_told_so():
 def without(cell, views):
     """A cell that lacks some views."""
     return cell.only([at for at in range(len(cell.corners)) if at not in views])
-
-
-@pytest.mark.slow
-def test_all_boards_are_placed_as_well_as_their_sigmas_say():
-    """Six cells, each with boards whose sizes are off by what their files allow."""
-    squares, count = 0.0, 0
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        first, further = 1.0 + 1e-3 * rng.standard_normal(2)
-        second = replace(NEAR if seed % 4 < 2 else Second(), scale=further)
-        cell = simulate(
-            replace(TWO, mount=MOUNTS[seed % 2], board_scale=first, second=second, seed=seed)
-        )
-        known = calibrated(cell, joints=False)
-        assert len(known.used) == len(cell.corners)
-        error, covariance = error_of(cell, known), result_of(known).joint_covariance
-        assert error.shape == (18,)
-        squares += float(error @ np.linalg.solve(covariance, error))
-        count += len(error)
-    # Both tails at one in ten thousand.
-    assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1.0 - 1e-4, count)
 
 
 def test_each_image_is_searched_for_its_own_board(tmp_path):
@@ -216,11 +173,9 @@ def test_a_board_of_several_may_be_known_whole():
     assert sum("was used" in note and name in note for note in notes) == 3
 
 
-# Ten sigma, and so many that noise beside the priors would explain them.
-@pytest.mark.parametrize("off_m", [slow(0.005), 0.04])
-def test_only_the_components_that_views_contradict_are_left_out(off_m):
+def test_only_the_components_that_views_contradict_are_left_out():
     height = float(X[2, 3])
-    prior = {"x_m": float(X[0, 3]) + off_m, "y_m": float(X[1, 3]) - off_m, "z_m": height}
+    prior = {"x_m": float(X[0, 3]) + 0.04, "y_m": float(X[1, 3]) - 0.04, "z_m": height}
     found = calibrate(scara(0, {"flange_from_cam": prior | {"sigma_m": SIGMA_M}}))
     assert found.verdict.status == "check"
     doubts = [finding.words for finding in found.verdict.findings if finding.kind == "prior"]
@@ -293,12 +248,9 @@ REFINE, HOLD, RIGHT = {"intrinsics": "refine"}, {"intrinsics": "hold"}, by(0, 0,
         lens(FINE, by(4.0, 4.0, -3.0, 2.0), most=2.13, seeds=2, refined=True, **REFINE),
         lens(FINE, RIGHT, refined=True, status="good", **REFINE),
         lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, matrix_sigma_px=0.5),
-        slow(*lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, False, matrix_sigma_px=0.5, **HOLD)),
         # The corners' noise does not absorb the lens's error, and nothing is accused for it.
         lens(MARKER, within(6.0), 0.5, 1.7, 5, True, "good", matrix_sigma_px=6.0),
         # Without a prior, one marker tells no lens.
-        lens(MARKER, RIGHT, refined=False),
-        lens(MARKER, RIGHT, refined=False, matrix_sigma_px=6.0, **HOLD),
         lens(MARKER, RIGHT, refined=False, **REFINE),
         # A lens that is stated for images twice as large.
         lens(OF_HALF, by(520.0, 519.0, 320.0, 190.0), refined=True),
@@ -336,20 +288,22 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
 
 def test_a_fisheye_camera_goes_the_whole_way():
     surprises = []
-    for seed in range(4):
+    for seed in range(2):
         options = CellOptions(camera=fisheye_camera(), state_intrinsics=False, seed=seed)
         known = calibrated(cell := simulate(options))
         assert known.used == tuple(range(20))
         assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8
         surprises.append(mahalanobis_sq(cell, known))
-    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
-    assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
+    # Mean of 2 chi-square of 12 over 12: beyond this in one case of a thousand.
+    assert np.mean(surprises) < 2.13
 
 
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
-def test_boards_have_names_and_a_common_covariance(mount):
-    cell = simulate(replace(TWO, mount=mount, seed=3))
-    result = result_of(calibrated(cell))
+def test_boards_have_names_and_a_common_covariance_that_holds():
+    cell = simulate(replace(TWO, seed=3))
+    known = calibrated(cell)
+    result, error = result_of(known), error_of(cell, known)
+    # Chi-square of eighteen exceeds this in one case of a thousand.
+    assert error @ np.linalg.solve(result.joint_covariance, error) < 42.3
     assert list(result.edges) == list(cell.transforms)
     assert set(result.boards) == {"first", "second"}
     for at, edge in enumerate(result.edges.values()):
@@ -470,7 +424,6 @@ def test_measured_distances_of_another_scale_are_named_and_an_arm_that_is_off_is
     # A scale's sigma is a hundredth of a percent there; the factor has five digits.
     factor = float(named[0].do.words.split()[-1].rstrip("."))
     assert factor == pytest.approx(scale, abs=4e-4)
-    for seed in (0, 1):
-        arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3, seed=seed))
-        verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
-        assert "board_size" not in {finding.kind for finding in verdict.findings}
+    arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3))
+    verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
+    assert "board_size" not in {finding.kind for finding in verdict.findings}

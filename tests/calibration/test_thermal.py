@@ -18,7 +18,6 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import postures
-from visioncal.interchange.exports import document
 from visioncal.present.report.page import render
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
@@ -35,7 +34,6 @@ from visioncal.simulation import (
     simulate_warm_up,
 )
 from visioncal.simulation.arms import Heat, Warming, heated_poses
-from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 from visioncal.simulation.optics import fine_camera
 
 # What 100 minutes are to predict: the rest of five hours [s].
@@ -187,18 +185,6 @@ def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
     # Half a millimetre is no noise, and the reason for it may be what the warning says.
     failed = verify(replace(found.session, views=warm), found.calibration)
     assert not failed.passed
-
-
-@pytest.mark.slow
-def test_an_arm_that_is_off_is_calibrated_beside_its_drift():
-    found = warmed(replace(CELL, mount="eye-to-hand", dh_sigma_m=3e-4, dh_sigma_rad=5e-4, seed=2))
-    assert found.calibration.arm.level == "geometry"
-    assert drift_of(found).share < 0.2
-    # A file of the arm has no place for the drift, and says so to whoever reads it.
-    for form in ("robot-dh", "robot-urdf", "robot-json"):
-        written = document(found.calibration, form)
-        assert any("drifts with its temperature" in warning for warning in written.warnings)
-        assert "the arm with links at 21 deg C" in written.text
 
 
 @pytest.mark.parametrize("kind", ["temperatures", "currents"])
@@ -360,22 +346,3 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_p
     path.write_text("\n".join(map(",".join, [head, *rows])) + "\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"heat\.csv, line 2, column temp1_c: .*no kelvin"):
         Session.load(tmp_path / "warm")
-
-
-@pytest.mark.slow
-def test_an_instrument_that_reads_points_sees_the_drift(learnt):
-    """A place alone does not part a flange's rotation from its own: nothing fails at that."""
-    truth = learnt["temperatures"].truth
-    shop = tracked(InstrumentOptions(points=THREE[:1]), truth.robot.joints)
-    moved = truth.robot.true_base_from_flange @ invert(truth.robot.base_from_flange)
-    base = shop.base_from_instrument
-    read = [(stop, at, invert(base) @ moved[stop] @ base @ array) for stop, at, array in shop.rows]
-    plain = session_of(replace(shop, rows=tuple(read)))
-    columns = ("stamp_s", *plain.columns)
-    stamps = [repr(float(truth.stamps_s[stop])) for stop, _, _ in read]
-    pairs = zip(stamps, plain.views, strict=True)
-    cells = [[at, *(view.cell(name) for name in plain.columns)] for at, view in pairs]
-    session = Session.assemble(plain.document, columns, cells, plain.images)
-    session = session.with_streams({"heat": learnt["temperatures"].session.streams["heat"]})
-    found = calibrate(session, level="thermal").thermal
-    assert found.residual_mm.with_drift < 0.6 * found.residual_mm.without
