@@ -4,17 +4,13 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 
-from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert, log
-from visioncal.session import Session
 from visioncal.simulation import (
     CAMERAS,
     CellOptions,
     prepare_scene,
     render,
     simulate,
-    write_session,
 )
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target
 from visioncal.vision.targets import (
@@ -60,15 +56,3 @@ def test_centres_are_exact_and_rightly_numbered(board, camera):
         # The centre of an ellipse would be off by 0.05 px and more where it is seen aslant.
         assert np.sqrt(np.mean(error**2)) < 0.015
     assert isinstance(find_target(np.full((400, 600), 200, np.uint8), board), NotFound)
-
-
-def test_a_cell_is_calibrated_with_it(board, tmp_path):
-    cell = simulate(CellOptions(target=board, views=12, seed=4))
-    write_session(cell, tmp_path / "s")
-    result = run(Session.load(tmp_path / "s")).calibration
-    assert result.verdict.status == "good"
-    error = np.concatenate(
-        [log(invert(result.edges[name].matrix) @ true) for name, true in cell.transforms.items()]
-    )
-    # Twelve values, to one case in a thousand.
-    assert error @ np.linalg.solve(result.joint_covariance, error) < 32.9
