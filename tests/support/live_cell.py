@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DriverError
-from visioncal.core.types import Camera, CameraMount, FloatArray
+from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.drivers.protocols import ArmState, Frame, Safety
 from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.plan import Stop
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.live.planning.purposes import purpose_of
+from visioncal.live.simulated.controller import Motion
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.vision.boards.charuco import charuco_board
@@ -26,8 +27,6 @@ CYCLE_S, PERIOD_S, EXPOSURE_S = 0.002, 1.0 / 30.0, 0.01
 # A small image is enough for corners to a tenth of a pixel, and quick to make.
 LENS = Camera("brown", (640, 400), np.array([500.0, 500.0, 320.0, 200.0]), np.zeros(5))
 _PX_A_SQUARE = 40
-# A camera beside the robot stands farther off.
-FAR_LENS = replace(LENS, matrix=np.array([1000.0, 1000.0, 320.0, 200.0]))
 
 
 @dataclass
@@ -70,9 +69,7 @@ class FakeArm:
     halted: int = 0
     moves: int = 0
     stale: str = ""
-    goal: FloatArray | None = None
-    begun: float = 0.0
-    pace: tuple[float, float] = (1.0, 1.0)
+    motion: Motion | None = None
     _stuck: FloatArray | None = None
 
     def true_q(self, at: float) -> FloatArray:
@@ -89,34 +86,27 @@ class FakeArm:
 
     def _smooth(self, at: float) -> tuple[FloatArray, float | None]:
         """The joints of the trapezoid, and for how long they have been at its end."""
-        if self.goal is None:
+        if self.motion is None:
             return self.q0, None
-        way = self.goal - self.q0
-        far = float(np.abs(way).max())
-        if far == 0.0:
-            return self.goal, at - self.begun
-        v, a = self.pace
-        v = min(v, np.sqrt(far * a))
-        total = far / v + v / a
-        t = float(np.clip(at - self.begun, 0.0, total))
-        gone = min(0.5 * a * t * t, 0.5 * v * v / a)
-        gone += v * max(0.0, min(t, total - v / a) - v / a)
-        left = max(0.0, t - (total - v / a))
-        gone += v * left - 0.5 * a * left * left
-        since = at - self.begun - total
-        return self.q0 + way * (gone / far), since if since >= 0.0 else None
+        since = at - self.motion.ends_s
+        return self.motion.at(at)[0], since if since >= 0.0 else None
+
+    @property
+    def begun(self) -> float:
+        """When the motion began [s]."""
+        return np.inf if self.motion is None else self.motion.begins_s
 
     def state(self) -> ArmState:
         """What its encoders say."""
         self.clock.sleep(CYCLE_S)
         now = self.clock.now()
-        fails = self.failure and self.goal is not None and now - self.begun > self.fails_at
+        fails = self.failure and now - self.begun > self.fails_at
         if fails and self.failure == "gone":
             raise DriverError("fake ur5e: the link is lost.", next_step="Check the cable.")
         safety: Safety = "normal"
         if fails and self.failure in ("protective-stop", "emergency-stop"):
             safety = self.failure
-            self._freeze(now)
+            self._freeze()
         q = self._smooth(now)[0] if self.hidden else self.true_q(now)
         if self._stuck is not None:
             q = self._stuck
@@ -124,33 +114,23 @@ class FakeArm:
         pose = self.cell.robot.base_from_flange(q[None])[0]
         if self.stale == "joints":
             q = self.q0
-        return ArmState(
-            now,
-            pose,
-            q.copy(),
-            dq,
-            np.eye(4),
-            1.25,
-            np.array([0.0, 0.0, 0.04]),
-            np.full(6, 0.5),
-            np.full(6, 31.0),
-            safety,
-        )
+        load, driven = (1.25, np.array([0.0, 0.0, 0.04])), (np.full(6, 0.5), np.full(6, 31.0))
+        return ArmState(now, pose, q.copy(), dq, np.eye(4), *load, *driven, safety)
 
     def _speed(self, now: float) -> FloatArray:
         step = 1e-3
         pose = self._smooth if self.hidden else lambda at: (self.true_q(at), None)
         return (pose(now)[0] - pose(now - step)[0]) / step
 
-    def _freeze(self, now: float) -> None:
+    def _freeze(self) -> None:
         if self._stuck is None:
-            self._stuck = self._smooth(now)[0]
+            self._stuck = self._smooth(self.clock.now())[0]
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
         """Begins a trapezoid."""
         now = self.clock.now()
         self.q0 = self._smooth(now)[0]
-        self.goal, self.begun, self.pace = np.array(q), now, (speed, acceleration)
+        self.motion = Motion(now, self.q0, np.array(q), speed, acceleration)
         self.moves += 1
 
     def moving(self) -> bool:
@@ -158,12 +138,12 @@ class FakeArm:
         self.clock.sleep(CYCLE_S)
         if self._stuck is not None:
             return False
-        return self.goal is not None and self._smooth(self.clock.now())[1] is None
+        return self.motion is not None and self._smooth(self.clock.now())[1] is None
 
     def halt(self) -> None:
         """Stands still from now on."""
         self.halted += 1
-        self._freeze(self.clock.now())
+        self._freeze()
 
     def close(self) -> None:
         """Nothing is open."""
@@ -177,7 +157,6 @@ class FakeCamera:
     lens: Camera = LENS
     name: str = "fake camera"
     hidden_at: tuple[int, ...] = ()
-    unplugged_at: int = 10**9
     factory: Camera | None = None
     settings: dict[str, str | float] = field(default_factory=lambda: {"exposure_us": 10000.0})
     frames: int = 0
@@ -203,11 +182,6 @@ class FakeCamera:
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """A picture of the true arm's view, smeared where that moves."""
-        if self.arm.moves >= self.unplugged_at:
-            self.arm.clock.sleep(timeout_s)
-            raise DriverError(
-                f"fake camera: no picture in {timeout_s:g} s.", next_step="Check its cable."
-            )
         self.frames += 1
         begun = self.arm.clock.now()
         middle = begun + 0.5 * EXPOSURE_S
@@ -234,9 +208,8 @@ class FakeCamera:
         board_from_px[:2, 2] += 0.5 * scale
         warp = matrix_3x3(self.lens) @ pose[:3, [0, 1, 3]] @ board_from_px
         flags = cv2.INTER_AREA
-        seen = cv2.warpPerspective(
-            self._print, warp, self.lens.resolution, flags=flags, borderValue=120
-        )
+        size = self.lens.resolution
+        seen = cv2.warpPerspective(self._print, warp, size, flags=flags, borderValue=120)
         return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.float32)
 
     def close(self) -> None:
@@ -246,18 +219,9 @@ class FakeCamera:
 def true_cell(options: CellOptions) -> PlanCell:
     """The cell as it is, but for the arm's errors."""
     x, z = simulate(replace(options, views=1, motion="free")).transforms.values()
-    return PlanCell(
-        options.mount,
-        load_robot(options.robot),
-        options.camera,
-        options.target,
-        x,
-        z,
-        0.0,
-        0.0,
-        Noise.of_robot(options.robot_sigma_rad, options.robot_sigma_m),
-        options.pixel_sigma_px,
-    )
+    noise = Noise.of_robot(options.robot_sigma_rad, options.robot_sigma_m)
+    arm, seen = load_robot(options.robot), (options.camera, options.target)
+    return PlanCell(options.mount, arm, *seen, x, z, 0.0, 0.0, noise, options.pixel_sigma_px)
 
 
 def postures_in_view(options: CellOptions, count: int) -> FloatArray:
@@ -266,26 +230,20 @@ def postures_in_view(options: CellOptions, count: int) -> FloatArray:
     return simulate(replace(free, cut_views=0.0)).robot.joints
 
 
-def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand") -> PlanFile:
+def fake_plan(stops: int = 5, seed: int = 2) -> PlanFile:
     """A plan whose stops all see the board; its ways are not looked at."""
-    lens = LENS if mount == "eye-in-hand" else FAR_LENS
-    options = CellOptions(
-        robot="ur5e", mount=mount, camera=lens, views=stops, seed=seed, cut_views=0.0
-    )
+    drawn = {"views": stops, "seed": seed, "cut_views": 0.0}
+    options = CellOptions(robot="ur5e", camera=LENS, **drawn)
     # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
+    document = load_robot("ur5e").document
+    joints = [{**value, "body_radius_m": 0.01} for value in document["joint"]]
+    thin = Robot.from_document({**document, "joint": joints})
     limits = Limits(clearance_m=0.0, floor_m=None)
-    cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))
+    cell = replace(true_cell(options), limits=limits, robot=thin)
     q = simulate(options).robot.joints
     none = np.zeros((0, 6))
-    planned = tuple(
-        Stop(at + 1, value, none, f"words of stop {at + 1}") for at, value in enumerate(q)
-    )
+    planned = tuple(Stop(at, value, none, f"words of stop {at}") for at, value in enumerate(q, 1))
     return PlanFile(cell, purpose_of("hand-eye"), planned, "0" * 64, q[0] + 0.002)
-
-
-def _thin(robot: Robot) -> Robot:
-    joints = [{**value, "body_radius_m": 0.01} for value in robot.document["joint"]]
-    return Robot.from_document({**robot.document, "joint": joints})
 
 
 def fake_devices(plan: PlanFile, **changes) -> tuple[FakeArm, FakeCamera]:

@@ -1,18 +1,14 @@
 """Breaks one thing of an input, by chance: a byte, a row, a value, a picture, or a file itself.
 
-What is broken is chosen by what a file is, so that most of what comes out is read for a while.
+What is broken is chosen by what a file is, so that most of what comes out is read for a while. What
+was made to break a reader (bombs, pickles, entities, headers that lie) has tests of its own.
 """
 
-import io
 import json
 import os
-import pickle
 import random
 import re
 import shutil
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -40,13 +36,6 @@ _WORD = re.compile(rb"[\w.+-]+")
 _NUMBER = re.compile(rb"(?<![\w.-])-?\d+(\.\d+)?(e[+-]?\d+)?(?![\w.])")
 
 
-class Bomb:
-    """What a pickle would do: leave a file behind."""
-
-    def __reduce__(self):
-        return (open, ("executed", "w"))
-
-
 # --- Any file.
 
 
@@ -61,21 +50,10 @@ def flipped(data: bytes, chance: Chance) -> bytes:
     return bytes(changed)
 
 
-def part_moved(data: bytes, chance: Chance) -> bytes:
-    a, b = sorted(chance.randrange(len(data) + 1) for _ in range(2))
-    return data[b:] + data[a:b] + data[:a]
-
-
 def inserted(data: bytes, chance: Chance) -> bytes:
     at = chance.choice([0, chance.randrange(len(data) + 1)])
     new = [b"\0", b"\xef\xbb\xbf", b"\xff\xfe", b"\n", b"\xc3", chance.randbytes(20), b"\0" * 5000]
     return data[:at] + chance.choice(new) + data[at:]
-
-
-def other_content(_: bytes, chance: Chance) -> bytes:
-    cells = chance.choice([b"1,", b"[],", b"a: 1\n", b"<a/>"]) * 3_000_000
-    few = (b"", b"\n", b"\0" * 100, b"# a comment\n", chance.randbytes(1000), pickle.dumps(Bomb()))
-    return chance.choice([*few * 5, cells])
 
 
 # --- Text.
@@ -124,28 +102,6 @@ def deep(data: bytes, chance: Chance) -> bytes:
     return data[: chance.randrange(len(data) + 1)] + opening * chance.choice([100, 100_000])
 
 
-def other_encoding(data: bytes, chance: Chance) -> bytes:
-    text = data.decode("latin-1").replace("\n", chance.choice(["\n", "\r\n", "\r", "\n\n"]))
-    return text.encode(chance.choice(["utf-16", "utf-32", "latin-1"])) + b"\xe9"
-
-
-def executed(data: bytes, chance: Chance) -> bytes:
-    """What would execute, or grow beyond all bounds, where a library is trusting."""
-    yaml = b"a: &a [1,1,1,1,1,1,1,1,1]\n" + b"".join(
-        b"%c: &%c [*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c]\n" % (at + 1, at + 1, *([at] * 8))
-        for at in range(ord("a"), ord("m"))
-    )
-    xml = b'<!DOCTYPE l [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;">]><r>&b;</r>'
-    outside = b'<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]><r>&a;</r>'
-    tags = [
-        b"!!python/object/apply:os.system ['touch executed']\n",
-        b"!!opencv-matrix {rows: 100000, cols: 100000, dt: d, data: [1]}\n",
-        b"!!opencv-matrix {rows: -1, cols: 1.5, dt: 9999d, data: {}}\n",
-    ]
-    at = data.find(b": ") + 2
-    return chance.choice([yaml, xml, outside, *(data[:at] + tag + data[at:] for tag in tags)])
-
-
 # --- Tables, TOML and JSON.
 
 
@@ -170,22 +126,6 @@ def columns_changed(data: bytes, chance: Chance) -> bytes:
         row[a:] = chance.choice([[], [b""], [b"7"] * 10_000])
     between = chance.choice([b";", b"\t", b" ", b"|", b", "]) if how == 6 else b","
     return b"".join(between.join(row) + b"\n" for row in rows)
-
-
-def toml_table(data: bytes, chance: Chance) -> bytes:
-    """A table that is not expected, or one that is, as something else."""
-    heads = re.findall(rb"^\[+([^\]]+)\]+", data, re.MULTILINE)
-    head = chance.choice([*heads, b"camera", b"robot", b"need", b"prior.flange_from_cam", b"clock"])
-    new = [
-        b"[%s]\n",
-        b"[%s.x]\n",
-        b"[[%s]]\n",
-        b"%s = 1\n",
-        b"[%s]\nname = 1\n",
-        b"[%s]\nz_m = nan\n",
-    ]
-    line = chance.choice(new) % head
-    return line + data if chance.random() < 0.5 else data + b"\n" + line
 
 
 def json_value(data: bytes, chance: Chance) -> bytes:
@@ -219,28 +159,6 @@ def _broken(value: object, chance: Chance) -> object:
 # --- Pictures and arrays.
 
 
-def png_header(data: bytes, chance: Chance) -> bytes:
-    """A header that claims another size, depth or colour, with a sound checksum."""
-    if not data.startswith(b"\x89PNG") or len(data) < 33:
-        return data
-    own = struct.unpack(">II", data[16:24])
-    size = chance.choice([(30_000, 30_000), (0, 0), (2**31, 1), (2**32 - 1, 2**32 - 1), own])
-    kind = chance.choice([data[24:26], data[24:26], b"\x10\x02", b"\x01\x03", b"\x03\x09"])
-    return data[:8] + _chunk(b"IHDR", struct.pack(">II", *size) + kind + data[26:29]) + data[33:]
-
-
-def _chunk(name: bytes, content: bytes) -> bytes:
-    checked = name + content
-    return struct.pack(">I", len(content)) + checked + struct.pack(">I", zlib.crc32(checked))
-
-
-def png_of_zeros(_: bytes, __: Chance) -> bytes:
-    """A picture of some hundred million pixels, whole and sound, in 50 kB."""
-    body = zlib.compress(bytes((20_000 // 8 + 1) * 20_000), 1)
-    head = _chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 1, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + _chunk(b"IDAT", body) + _chunk(b"IEND", b"")
-
-
 def other_picture(data: bytes, chance: Chance) -> bytes:
     """The same picture with another depth, size, colour or format; or the beginning of none."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
@@ -258,36 +176,18 @@ def other_picture(data: bytes, chance: Chance) -> bytes:
     return bytes(cv2.imencode(suffix, changed)[1])
 
 
-def lying_array(_: bytes, chance: Chance) -> bytes:
-    """An array that claims to be larger, one that is, or one of objects."""
-    file, how = io.BytesIO(), chance.randrange(3)
-    if how == 0:
-        header = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s,), }" % (10**12)
-        np.save(file, np.zeros(3))
-        data = file.getvalue()
-        return data[:10] + header.ljust(118).encode() + data[128:]
-    if how == 1:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            archive.writestr("R_gripper2base.npy", b"\0" * 60_000_000)
-    else:
-        np.save(file, np.array([Bomb()], dtype=object), allow_pickle=True)
-    return file.getvalue()
-
-
-ANY: tuple[Bytes, ...] = (truncated, flipped, part_moved, inserted, other_content)
-TEXT: tuple[Bytes, ...] = (word_replaced, word_replaced, number_changed, number_changed,
-                           lines_changed, deep, other_encoding, executed)  # fmt: skip
+ANY: tuple[Bytes, ...] = (truncated, flipped, inserted)
+TEXT: tuple[Bytes, ...] = (word_replaced, number_changed, lines_changed, deep)
 # By the end of a file's name: what is broken of it alone, and what of others as well.
 KINDS: dict[str, tuple[tuple[Bytes, ...], tuple[Bytes, ...]]] = {
-    ".csv": ((columns_changed, columns_changed, word_replaced, number_changed, lines_changed,
-              columns_changed), (*ANY, *TEXT)),
-    ".toml": ((word_replaced, number_changed, toml_table), (*ANY, *TEXT)),
-    ".json": ((json_value, json_value, json_value, number_changed), (*ANY, *TEXT)),
+    ".csv": ((columns_changed, columns_changed, *TEXT[:3]), (*ANY, *TEXT)),
+    ".toml": (TEXT[:2], (*ANY, *TEXT)),
+    ".json": ((json_value, json_value, number_changed), (*ANY, *TEXT)),
+    ".png": ((other_picture,), ANY),
     ".rrd": (ANY, ANY),
-    ".npz": ((flipped, truncated, lying_array), ANY),
-    ".png": ((png_header, other_picture, other_picture, png_of_zeros), ANY),
+    ".npz": (ANY, ANY),
     "": (TEXT, ANY),
-}  # fmt: skip
+}
 # How often a file itself is broken, and else how often by the rules of what it is.
 _AS_FILE, _BY_KIND = 0.15, 0.7
 
