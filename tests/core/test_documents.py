@@ -173,15 +173,6 @@ def test_pickles_are_not_opened(file, tmp_path):
     raised(DataError, "no arrays", read_arrays, file("b.npz", pickle.dumps(Executed())))
 
 
-def test_an_array_that_lies_about_its_size_is_not_allocated(file):
-    stored = io.BytesIO()
-    np.save(stored, np.zeros(3))
-    data = stored.getvalue().replace(b"(3,), }" + b" " * 10, b"(3000000000000,), }"[:17])
-    raised(DataError, "no arrays", read_arrays, file("a.npy", stored.getvalue()[:-5]))
-    with pytest.raises(DataError):
-        read_arrays(file("b.npy", data))
-
-
 def test_a_zip_bomb_is_not_unpacked(file):
     stored = io.BytesIO()
     with zipfile.ZipFile(stored, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -241,8 +232,6 @@ def test_tables_are_read_as_spreadsheets_write_them(file, encoding):
 
 def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
     raised(DataError, "line 2: a NUL byte", read_json, file("a.json", b"[\n\0]"))
-    raised(DataError, "is a folder, and no file", read_yaml, tmp_path)
-    raised(DataError, "does not exist", read_yaml, tmp_path / "absent.yaml")
     # A hole in the file: nothing is written to the disk.
     with (tmp_path / "large.csv").open("wb") as large:
         large.truncate(60_000_000)
@@ -271,6 +260,7 @@ def changed(data, mark, offset, value):
 WHOLE = npz(npy("<f8", "(2,)", bytes(16)))
 HOSTILE = {
     "one-byte float.npy": (npy("<f1", "(3,)", b"abc"), "no (arrays|numbers)"),
+    "cut.npy": (npy("<f8", "(3,)", bytes(19)), "no arrays"),
     "hidden size.npy": (npy("<f8", f"({10**11}, {10**11}, 0)"), "no arrays"),
     "open shape.npy": (npy("<i8", "(3"), "no arrays"),
     # Fields of the entry in the archive's directory: flags, packing, and where the file begins.

@@ -4,13 +4,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.kept import assert_same, assert_same_evidence
 from support.refusals import raised
 from support.samples import made_up, tool_frame, with_frames
 
-from visioncal.calibration.run import Run, run
+from visioncal.calibration.run import Run
 from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.core.errors import DataError
@@ -19,7 +18,6 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_stored, rewrite_result
 from visioncal.present.recording import read_calibration, read_evidence, read_session
 from visioncal.results import Calibration, FrameFile, to_document
-from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 
 
@@ -59,21 +57,6 @@ def test_all_files_are_as_before_with_the_frames(sample, folder):
     report = (folder / "report.html").read_text(encoding="utf-8")
     assert "Tools and fixtures" in report
     assert "data:image/jpeg" in report
-
-
-def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
-    write_session(simulate(CellOptions(views=12)), tmp_path / "cell", images=False)
-    session = Session.load(tmp_path / "cell")
-    first = run(session)
-    write_outputs(tmp_path / "out", session, first)
-    frames = with_frames(sample).calibration.frames
-    rewrite_result(tmp_path / "out", replace(first.calibration, frames=frames))
-    assert not Session.load(tmp_path / "out" / "recording.rrd").warnings
-    again = run(tmp_path / "out" / "recording.rrd").calibration
-    assert again.session_sha256 == first.calibration.session_sha256
-    for name, edge in first.calibration.edges.items():
-        assert np.array_equal(again.edges[name].matrix, edge.matrix)
-    assert np.array_equal(again.joint_covariance, first.calibration.joint_covariance)
 
 
 def test_results_of_another_session_are_refused(sample, folder):

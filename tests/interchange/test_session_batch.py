@@ -3,7 +3,6 @@
 import html
 import os
 import signal
-import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -93,7 +92,13 @@ def test_what_was_done_is_kept(fleet, tmp_path):
     assert states.pop("robot_1/week_1") == "done"
     assert set(states.values()) == {"kept"}
     assert all(of(name) == before[name] for name in states)
-    # Other options are other results.
+    # Other facts are another session, and other options are other results.
+    table = fleet / "robot_0/week_0/views.csv"
+    whole = table.read_text()
+    table.write_text("\n".join(whole.splitlines()[:-1]) + "\n")
+    (row,) = batch(fleet / "robot_0/week_0", tmp_path / "robot_0", without=BARE).rows
+    table.write_text(whole)
+    assert (row.state, row.views) == ("done", 9)
     asked = batch(fleet / "robot_*", tmp_path, without=BARE, need_mm=1.0)
     assert [row.state for row in asked.rows] == 4 * ["done"]
 
@@ -207,25 +212,3 @@ def test_a_lost_scheduler_leaves_what_is_finished(fleet, tmp_path, monkeypatch):
         for row in parquet.read_table(tmp_path / "batch.parquet").to_pylist()
     }
     assert states == {"week_0": "done", "week_1": "failed"}
-
-
-@pytest.mark.usefixtures("here")
-def test_a_session_whose_facts_changed_is_done_again(fleet, tmp_path):
-    name = "robot_0/week_0"
-    first = batch(fleet / name, tmp_path / "out", workers=1, without=BARE)
-    assert [row.state for row in first.rows] == ["done"]
-    table = fleet / name / "views.csv"
-    whole = table.read_text()
-    try:
-        table.write_text("\n".join(whole.splitlines()[:-1]) + "\n")
-        (row,) = batch(fleet / name, tmp_path / "out", workers=1, without=BARE).rows
-    finally:
-        table.write_text(whole)
-    assert (row.state, row.views) == ("done", 9)
-
-
-def test_a_scheduler_needs_the_extra(fleet, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1").refused(
-        "pip install 'distributed"
-    )

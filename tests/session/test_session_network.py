@@ -303,15 +303,6 @@ def test_rows_say_which_board_they_show(boards):
     assert session.warnings == ()
 
 
-def test_files_from_elsewhere_come_along(boards, tmp_path):
-    (tmp_path / "floor.toml").write_text(BOARD)
-    changed(boards, "session.toml", "boards/floor.toml", "../floor.toml")
-    session = Session.load(boards)
-    session.save(tmp_path / "far" / "copy")
-    assert (tmp_path / "far" / "copy" / "target_floor.toml").is_file()
-    assert Session.load(tmp_path / "far" / "copy").digest() == session.digest()
-
-
 def test_rows_without_a_robot_are_named_before_frames_that_hang_on_nothing(tmp_path):
     (tmp_path / "session.toml").write_text(
         'schema = 1\nname = "s"\nmount = "eye-in-hand"\ntarget = "charuco_9x6_30mm"\n'

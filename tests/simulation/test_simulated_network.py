@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from visioncal.core.transforms import invert, pose_difference
-from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
     BoardAt,
@@ -21,7 +20,6 @@ from visioncal.simulation import (
     Second,
     cell_session,
     simulate,
-    write_session,
 )
 
 EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
@@ -106,25 +104,6 @@ def test_faults_are_where_the_truth_says(cell):
     early = {sight.view for sight in cell.sights if 0 <= sight.stop < 4}
     assert other & early == set(faulty.wrong_views) & early
     assert other & moved & {sight.view for sight in cell.sights if sight.stop == 4}
-
-
-def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
-    options = replace(
-        OPTIONS,
-        cameras=(CameraAt("low", place_m=(0.0, -0.5, 0.7), state_intrinsics=False),),
-        boards=(BoardAt("plate", "a"), BoardAt("floor", target=EVEN)),
-        stops=1,
-        lens_views=1,
-    )
-    cell = simulate(options)
-    session = Session.load(write_session(cell, tmp_path / "cell"))
-    assert session.digest() == cell_session(cell, "cell").digest()
-    assert all(session.images.exists(view.image) for view in session.views if view.image)
-    assert [view.image for view in session.views if view.is_of_lens] == [
-        f"lens_low/{cell.sights[-1].view:04d}.png"
-    ]
-    assert session.cameras["low"].matrix is None
-    assert (tmp_path / "cell.truth.json").is_file()
 
 
 def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():

@@ -180,7 +180,7 @@ class FakeCamera:
         """Of the lens."""
         return self.lens.resolution
 
-    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+    def frame(self, **_: float) -> Frame:
         """A picture of the true arm's view, smeared where that moves."""
         self.frames += 1
         begun = self.arm.clock.now()

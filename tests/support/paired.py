@@ -48,24 +48,15 @@ class Pair:
 
 @dataclass(frozen=True)
 class Change:
-    """One comparison: the means, the interval of their paired ratio or difference, and its chance.
-
-    Attributes:
-        world: The world.
-        what: What is compared.
-        before, after: Means; geometric ones of errors and times.
-        low, high: The interval of 95 %.
-        chance: Probability of a change at least so large where there is none that matters.
-        is_worse: The direction.
-    """
+    """One comparison: the means, the interval of their paired ratio or difference, its chance."""
 
     world: str
-    what: str
-    before: float
+    what: str  # What is compared.
+    before: float  # Means; geometric ones of errors and times.
     after: float
-    low: float
+    low: float  # The interval of 95 %.
     high: float
-    chance: float
+    chance: float  # Probability of a change at least so large where none is that matters.
     is_worse: bool
 
     def __str__(self) -> str:

@@ -26,35 +26,20 @@ MARGIN = 1
 
 @dataclass(frozen=True)
 class Shot:
-    """How a board is photographed.
+    """How a board is photographed."""
 
-    Attributes:
-        square_px: Mean side of its squares in the image.
-        tilt_deg: How far it is turned out of the image's plane, about a random axis.
-        disc_px: Radius of the disc of defocus.
-        motion_px: Length of the line that everything moves along during the exposure.
-        noise: Standard deviation of a pixel [grey levels of 255].
-        gamma: Exponent of the tone curve.
-        jpeg: Quality of the file; none where 0.
-        ink_px: How far the dark squares' edges are moved outwards.
-        uneven: By how much of itself the light falls off from one side of the image to the other.
-        bayer: Whether a colour sensor's mosaic is interpolated and turned into grey.
-        bend: Radial distortion at the image's edge, as a share of the radius.
-        light: Grey levels of dark and light.
-    """
-
-    square_px: float = 40.0
-    tilt_deg: float = 25.0
-    disc_px: float = 0.0
-    motion_px: float = 0.0
-    noise: float = 2.0
-    gamma: float = 1.0
-    jpeg: int = 0
-    ink_px: float = 0.0
-    uneven: float = 0.0
-    bayer: bool = False
-    bend: float = 0.02
-    levels: tuple[float, float] = (30.0, 210.0)
+    square_px: float = 40.0  # Mean side of its squares in the image.
+    tilt_deg: float = 25.0  # How far it is turned out of the image's plane, about a random axis.
+    disc_px: float = 0.0  # Radius of the disc of defocus.
+    motion_px: float = 0.0  # Length of the line that all moves along during the exposure.
+    noise: float = 2.0  # Standard deviation of a pixel [grey levels of 255].
+    gamma: float = 1.0  # Exponent of the tone curve.
+    jpeg: int = 0  # Quality of the file; none where 0.
+    ink_px: float = 0.0  # How far the dark squares' edges are moved outwards.
+    uneven: float = 0.0  # By how much of itself the light falls off across the image.
+    bayer: bool = False  # Whether a colour sensor's mosaic is interpolated and turned into grey.
+    bend: float = 0.02  # Radial distortion at the image's edge, as a share of the radius.
+    levels: tuple[float, float] = (30.0, 210.0)  # Grey levels of dark and light.
 
 
 @lru_cache(maxsize=16)
