@@ -34,7 +34,8 @@ from visioncal.interchange.formats import (
 from visioncal.interchange.formats.file_search import files_in, images_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 
-SEEN = ImportOptions(mount="eye-in-hand", target=CHARUCO)
+HAND = ImportOptions(mount="eye-in-hand")
+SEEN = replace(HAND, target=CHARUCO)
 CAMERA = "cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"
 ORDER = [4, 0, 7, 2, 8, 1, 6, 3, 5]
 
@@ -63,6 +64,17 @@ def logged(table):
     def write(names, poses):
         camera = quaternions(CAM_FROM_TARGET).tolist()
         return table(f"{names},{CAMERA}", [[*a, *b] for a, b in zip(poses, camera, strict=True)])
+
+    return write
+
+
+@pytest.fixture
+def rows(tmp_path):
+    """Writes rows as a list of JSON: what `fields(at)` gives for each of the world's poses."""
+
+    def write(fields):
+        (tmp_path / "log.json").write_text(json.dumps([fields(at) for at in range(COUNT)]))
+        return tmp_path / "log.json"
 
     return write
 
@@ -125,44 +137,36 @@ def test_numbers_of_rows_are_no_times(table, step, timed):
     assert any("Column 1 is taken for times" in note for note in foreign.notes) == timed
 
 
-def test_joints_too_large_for_radians_are_taken_for_degrees(tmp_path):
-    degrees = np.array([[168.0, 3.0 * at] for at in range(len(BASE_FROM_FLANGE))])
-    rows = [
-        {"joints": them, "robot": value.tolist()}
-        for them, value in zip(degrees.tolist(), BASE_FROM_FLANGE, strict=True)
-    ]
-    (tmp_path / "log.json").write_text(json.dumps(rows))
-    found = read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand"))
-    assert "Joint angles up to 168 are no radians, and are taken for degrees." in found.notes
-    np.testing.assert_allclose(found.joints_rad, np.deg2rad(degrees))
-
-
 @pytest.mark.parametrize(
-    ("name", "count", "degrees"),
+    ("name", "count", "degrees", "noted"),
     [
-        ("J{}", 6, False),
-        ("joint_{}_deg", 5, True),
-        ("a{} [deg]", 6, True),
-        ("J{} [°]", 6, True),
-        ("joint_positions_degrees", 0, True),
+        ("J{}", 6, False, False),
+        ("joint_{}_deg", 5, True, False),
+        ("a{} [deg]", 6, True, False),
+        ("J{} [°]", 6, True, False),
+        ("joint_positions_degrees", 0, True, False),
+        # Too large for radians.
+        ("joints", 0, True, True),
         # They may as well be a quaternion.
-        ("q{}", 4, None),
+        ("q{}", 4, None, False),
     ],
 )
-def test_joints_are_known_by_their_names(tmp_path, name, count, degrees):
-    joints = np.linspace(-0.5, 0.7, len(BASE_FROM_FLANGE) * 6).reshape(-1, 6)[:, : count or 6]
-    written = (np.rad2deg(joints) if degrees else joints).tolist()
-    names = [name.format(at) for at in range(1, count + 1)]
-    rows = [
-        {**(dict(zip(names, them, strict=True)) if count else {name: them}), "robot": pose}
-        for them, pose in zip(written, BASE_FROM_FLANGE.tolist(), strict=True)
-    ]
-    (tmp_path / "log.json").write_text(json.dumps(rows))
-    found = read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand")).joints_rad
+def test_joints_are_known_by_their_names_and_sizes(rows, name, count, degrees, noted):
+    joints = np.linspace(-0.5, 2.9, COUNT * 6).reshape(-1, 6)[:, : count or 6]
+    names, written = [name.format(at) for at in range(1, count + 1)], joints.tolist()
+    if degrees:
+        written = np.rad2deg(joints).tolist()
+
+    def fields(at):
+        told = dict(zip(names, written[at], strict=True)) if count else {name: written[at]}
+        return told | {"robot": BASE_FROM_FLANGE[at].tolist()}
+
+    found = read_foreign(rows(fields), HAND)
+    assert any("are no radians, and are taken" in note for note in found.notes) == noted
     if degrees is None:
-        assert found is None
+        assert found.joints_rad is None
     else:
-        np.testing.assert_allclose(found, joints)
+        np.testing.assert_allclose(found.joints_rad, joints)
 
 
 @pytest.mark.parametrize("unit", ["[deg]", "[°]", "(º)"])
@@ -174,90 +178,49 @@ def test_angles_of_poses_are_in_the_degrees_of_their_header(table, unit):
     np.testing.assert_allclose(found.robot.poses(), BASE_FROM_FLANGE, atol=1e-6)
 
 
-HAND = ImportOptions(mount="eye-in-hand")
-
-
-@pytest.fixture
-def rows(tmp_path):
-    """Writes rows as a list of JSON: what `fields(at)` gives for each of the world's poses."""
-
-    def write(fields, name="log.json"):
-        count = len(BASE_FROM_FLANGE)
-        (tmp_path / name).write_text(json.dumps([fields(at) for at in range(count)]))
-        return tmp_path / name
-
-    return write
-
-
 def vector(pose):
     """Its rvec and tvec, as OpenCV's functions return them."""
     numbers = vectors(pose[None])[0].tolist()
     return {"rvec": numbers[3:], "tvec": numbers[:3]}
 
 
-# How the robot's stream is written, and what the user then says.
-WRITTEN = {
-    "millimetres": (lambda value: value, 1e3, PoseImportOptions(unit="mm")),
-    "inverse": (invert, 1.0, PoseImportOptions(inverse=True)),
-    "by name": (lambda value: value, 1.0, PoseImportOptions(form="ros")),
-}
-
-
-@pytest.mark.parametrize(("turned", "scale", "said"), WRITTEN.values(), ids=WRITTEN.keys())
-def test_what_is_said_of_a_stream_holds_once(tmp_path, turned, scale, said):
+def test_what_is_said_of_a_stream_holds_once(tmp_path):
     recording = streams(tmp_path)
     wanted = read_foreign(recording.source, recording.requested).stream.poses
     table = np.loadtxt(recording.source, delimiter=",")
     poses = PoseNumbers(table[:, 1:4], table[:, 4:], Reading(), tuple(map(str, table[:, 0])))
-    written = quaternions(turned(poses.poses())) * ([scale] * 3 + [1] * 4)
+    written = quaternions(invert(poses.poses())) * ([1e3] * 3 + [1] * 4)
     np.savetxt(recording.source, np.hstack([table[:, :1], written]), "%.12f", delimiter=",")
+    said = PoseImportOptions(unit="mm", inverse=True, form="ros")
     found = read_foreign(recording.source, replace(recording.requested, robot=said)).stream.poses
     # Nine digits are written of the original, twelve here.
     np.testing.assert_allclose(found.poses(), wanted.poses(), atol=1e-8)
 
 
 def test_a_translation_called_t_is_no_time(rows):
-    source = rows(
-        lambda at: {
-            "R": BASE_FROM_FLANGE[at, :3, :3].tolist(),
-            "t": BASE_FROM_FLANGE[at, :3, 3].tolist(),
-            "camera_pose": CAM_FROM_TARGET[at].tolist(),
-        }
-    )
-    requested = replace(HAND, robot=PoseImportOptions(("t", "R")))
-    assert read_foreign(source, requested).stamps_s is None
-    # One number a row, but of the robot's pose.
-    single = rows(
-        lambda at: (
-            dict(zip("txy", BASE_FROM_FLANGE[at, :3, 3].tolist(), strict=True))
-            | {"rvec": vector(BASE_FROM_FLANGE[at])["rvec"]}
-        )
-    )
-    requested = replace(HAND, robot=PoseImportOptions(("t", "x", "y", "rvec")))
-    assert read_foreign(single, requested).stamps_s is None
+    def apart(at):
+        pose = BASE_FROM_FLANGE[at]
+        return {"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist()}
+
+    def single(at):
+        # One number a row, but of the robot's pose.
+        place = dict(zip("txy", BASE_FROM_FLANGE[at, :3, 3].tolist(), strict=True))
+        return place | {"rvec": vector(BASE_FROM_FLANGE[at])["rvec"]}
+
+    for fields, names in ((apart, ("t", "R")), (single, ("t", "x", "y", "rvec"))):
+        asked = replace(HAND, robot=PoseImportOptions(names))
+        assert read_foreign(rows(fields), asked).stamps_s is None
     timed = rows(lambda at: {"t": 0.5 * at, "robot_pose": BASE_FROM_FLANGE[at].tolist()})
     assert read_foreign(timed, HAND).stamps_s[2] == 1.0
 
 
-@pytest.mark.parametrize("first", ["position", "rotation"])
-def test_twelve_numbers_are_read_in_the_order_that_makes_rotations(tmp_path, first):
-    upper = BASE_FROM_FLANGE[:, :3].reshape(-1, 12)
-    apart = np.hstack([BASE_FROM_FLANGE[:, :3, 3], BASE_FROM_FLANGE[:, :3, :3].reshape(-1, 9)])
-    robot = apart if first == "position" else upper
-    header = ",".join([*(f"a{index}" for index in range(12)), *(f"c{index}" for index in range(7))])
-    source = tmp_path / "log.csv"
-    table = np.hstack([robot, quaternions(CAM_FROM_TARGET)])
-    np.savetxt(source, table, "%.15g", delimiter=",", header=header, comments="")
-    columns = header.split(",")
-    requested = replace(
-        HAND,
-        robot=PoseImportOptions(tuple(columns[:12])),
-        camera=PoseImportOptions(tuple(columns[12:]), form="ros"),
-    )
-    # Fifteen digits are written.
-    np.testing.assert_allclose(
-        read_foreign(source, requested).robot.poses(), BASE_FROM_FLANGE, atol=1e-13
-    )
+def test_twelve_numbers_are_read_in_the_order_that_makes_rotations(table):
+    """The position first; rows of a matrix are a form of test_foreign's."""
+    place, turn = BASE_FROM_FLANGE[:, :3, 3], BASE_FROM_FLANGE[:, :3, :3].reshape(-1, 9)
+    columns = [f"a{index}" for index in range(12)]
+    source = table(",".join(columns), np.hstack([place, turn]).tolist())
+    found = read_foreign(source, replace(HAND, robot=PoseImportOptions(tuple(columns))))
+    np.testing.assert_allclose(found.robot.poses(), BASE_FROM_FLANGE, atol=1e-13)
 
 
 def test_the_robots_fields_are_not_the_cameras_as_well(rows):
@@ -275,67 +238,49 @@ def test_the_robots_fields_are_not_the_cameras_as_well(rows):
         read_foreign(both, replace(HAND, robot=PoseImportOptions(("tvec", "rvec"))))
 
 
-def test_half_a_pose_is_refused_by_its_row(tmp_path):
-    robot, camera = (
-        quaternions(value).astype(str) for value in (BASE_FROM_FLANGE, CAM_FROM_TARGET)
-    )
+def test_half_a_pose_is_refused_by_its_row(logged):
+    robot = quaternions(BASE_FROM_FLANGE).astype(str)
     robot[4, 6] = ""
-    header = "x,y,z,qx,qy,qz,qw,cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"
-    source = tmp_path / "log.csv"
-    source.write_text(
-        "\n".join([header, *(",".join(value) for value in np.hstack([robot, camera]))])
-    )
+    source = logged("x,y,z,qx,qy,qz,qw", robot.tolist())
     with pytest.raises(DataError, match=r"log\.csv, line 6: a part of the pose's numbers is"):
         assemble(read_foreign(source, HAND))
 
 
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"robot_pose": quaternions(BASE_FROM_FLANGE)}, "robot's quaternions are taken for x, y"),
-        ({"robot_pose": BASE_FROM_FLANGE}, ""),
-        (
-            dict(
-                zip(
-                    ("x", "y", "z", "qx", "qy", "qz", "qw"),
-                    quaternions(BASE_FROM_FLANGE).T,
-                    strict=True,
-                )
-            ),
-            "",
-        ),
-    ],
-    ids=["seven numbers", "a matrix", "seven names"],
-)
-def test_an_order_that_nothing_tells_is_said(rows, fields, words):
-    source = rows(lambda at: {name: np.array(field)[at].tolist() for name, field in fields.items()})
-    notes = " ".join(read_foreign(source, HAND).notes)
-    assert ("quaternions are taken" in notes) == bool(words)
-    assert words in notes
+@pytest.mark.parametrize("form", ["seven numbers", "a matrix", "seven names"])
+def test_an_order_that_nothing_tells_is_said(rows, form):
+    numbers = quaternions(BASE_FROM_FLANGE)
+    fields = {
+        "seven numbers": lambda at: {"robot_pose": numbers[at].tolist()},
+        "a matrix": lambda at: {"robot_pose": BASE_FROM_FLANGE[at].tolist()},
+        "seven names": lambda at: dict(zip(NAMED, numbers[at].tolist(), strict=True)),
+    }[form]
+    notes = " ".join(read_foreign(rows(fields), HAND).notes)
+    said = "robot's quaternions are taken for x, y" in notes
+    assert said == ("quaternions are taken" in notes) == (form == "seven numbers")
 
 
+NAMED = ("x", "y", "z", "qx", "qy", "qz", "qw")
 BY_ROWS = [525.0, 0, 319.5, 0, 526, 239.5, 0, 0, 1]
 BY_COLUMNS = [525.0, 0, 0, 0, 526, 0, 319.5, 239.5, 1]
-
-
-@pytest.mark.parametrize("matrix", [BY_ROWS, BY_COLUMNS, np.reshape(BY_COLUMNS, (3, 3)).tolist()])
-def test_a_camera_matrix_by_rows_or_by_columns(tmp_path, matrix):
-    (tmp_path / "lens.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
-    assert read_intrinsics(tmp_path / "lens.json")[0]["matrix"] == [525, 526, 319.5, 239.5]
 
 
 @pytest.mark.parametrize(
     ("matrix", "words"),
     [
+        (BY_ROWS, ""),
+        (BY_COLUMNS, ""),
+        (np.reshape(BY_COLUMNS, (3, 3)).tolist(), ""),
         ([525, 0, 320, 0, 526, 240, 7, 8, 9], "are needed"),
         ([525, 0, 320, 0, 526, 240, 0, 0, 0.5], "are needed"),
         ([525, 0, 320, 0, -526, 240, 0, 0, 1], "above 0"),
     ],
-    ids=["last row", "scaled", "negative"],
 )
-def test_a_camera_matrix_that_is_none(tmp_path, matrix, words):
-    (tmp_path / "lens.json").write_text(json.dumps({"K": matrix}))
-    raised(DataError, words, read_intrinsics, tmp_path / "lens.json")
+def test_a_camera_matrix_by_rows_or_by_columns_or_none(tmp_path, matrix, words):
+    (tmp_path / "lens.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
+    if words:
+        raised(DataError, words, read_intrinsics, tmp_path / "lens.json")
+    else:
+        assert read_intrinsics(tmp_path / "lens.json")[0]["matrix"] == [525, 526, 319.5, 239.5]
 
 
 @pytest.mark.parametrize(("model", "noted"), [({}, True), ({"distortion_model": "fisheye"}, False)])
@@ -347,22 +292,14 @@ def test_four_coefficients_may_be_a_fisheyes(tmp_path, model, noted):
     assert bool(notes) == noted
 
 
-WISHES = ImportOptions(mount="eye-in-hand", target=CHARUCO)
-
-
 @pytest.fixture
-def naming(tmp_path):
+def naming(table):
     """Writes a table whose rows name these images, and reads it."""
 
-    def assembled(*names, requested=WISHES):
-        poses = quaternions(BASE_FROM_FLANGE).tolist()
-        lines = [
-            ",".join([name, *map(repr, pose)])
-            for name, pose in zip(names, poses[: len(names)], strict=True)
-        ]
-        header = "image,x,y,z,qx,qy,qz,qw"
-        (tmp_path / "poses.csv").write_text("\n".join([header, *lines]), encoding="utf-8")
-        return assemble(read_foreign(tmp_path / "poses.csv", requested))
+    def assembled(*names):
+        poses = zip(names, quaternions(BASE_FROM_FLANGE).tolist(), strict=False)
+        source = table("image,x,y,z,qx,qy,qz,qw", [[name, *pose] for name, pose in poses])
+        return assemble(read_foreign(source, SEEN))
 
     return assembled
 
@@ -448,23 +385,17 @@ def test_images_are_looked_for_beside_and_some_must_be_there(tmp_path, table):
     )
 
 
-@pytest.mark.parametrize(
-    ("third", "noted"), [(None, True), ("left out", True), ([[1, 2], [3]], False)]
-)
-def test_entries_without_a_pose_are_named_and_ragged_ones_refused(tmp_path, third, noted):
-    pairs = zip(BASE_FROM_FLANGE.tolist(), CAM_FROM_TARGET.tolist(), strict=True)
-    rows = [{"robot": a, "camera": b} for a, b in pairs]
-    if third == "left out":
-        del rows[3]["robot"]
-    else:
-        rows[3]["robot"] = third
-    (tmp_path / "log.json").write_text(json.dumps(rows))
-    if noted:
-        session = assemble(read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand")))
-        assert any(
-            "have no pose of the robot: log.json, entry 3" in warning
-            for warning in session.warnings
-        )
-    else:
-        with pytest.raises(DataError, match="entry 3: robot is no regular list"):
-            read_foreign(tmp_path / "log.json", ImportOptions(mount="eye-in-hand"))
+@pytest.mark.parametrize("third", [None, "left out", [[1, 2], [3]]])
+def test_entries_without_a_pose_are_named_and_ragged_ones_refused(rows, third):
+    def fields(at):
+        pair = {"robot": BASE_FROM_FLANGE[at].tolist(), "camera": CAM_FROM_TARGET[at].tolist()}
+        if at == 3 and third == "left out":
+            del pair["robot"]
+        return pair | ({"robot": third} if at == 3 and third != "left out" else {})
+
+    source = rows(fields)
+    if isinstance(third, list):
+        raised(DataError, "entry 3: robot is no regular list", read_foreign, source, HAND)
+        return
+    notes = " ".join(assemble(read_foreign(source, HAND)).warnings)
+    assert "have no pose of the robot: log.json, entry 3" in notes
