@@ -149,15 +149,11 @@ def test_points_that_are_not_where_the_table_has_them_are_named():
     assert result.rig.shape[4][0] == pytest.approx(away_m, abs=3e-4)
 
 
-def test_exchanged_points_of_an_exact_rig_are_named_and_left_out():
+def test_exchanged_points_of_an_exact_rig_are_left_out():
     cell, session = seen()
     places = [*CUBE.points_m]
     places[3], places[-3] = places[-3], places[3]
     result = calibrate(replace(session, target=replace(CUBE, points_m=tuple(places))))
-    (found,) = (cause for cause in result.verdict.findings if cause.kind == "rig_points")
-    numbers = {CUBE.point_numbers[3], CUBE.point_numbers[-3]}
-    assert set(map(int, re.findall(r"\d+", found.words))) == numbers
-    assert result.verdict.status == "check"
     # What is left determines the camera as well as it says: 40 is what chance leaves of six
     # numbers in less than one of a hundred thousand cases, with a noise known to 20 %.
     assert x_of(cell, result)[1] < 40.0

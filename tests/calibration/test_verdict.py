@@ -1,7 +1,6 @@
 """Verdicts: each doubt with its sentence, what a task needs, and causes by their probability."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from visioncal.calibration.suspects.judge import in_reading_order, judge
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD
 from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import compose, exp, invert, pose_difference
+from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
     CALIBRATE,
@@ -258,25 +257,7 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     cause = calibrate(session_of(cell, flange)).verdict.causes[0]
     assert cause.kind == "something_moved"
     # Of the two parts the larger one is kept.
-    assert "from view 12 on" in cause.words
-    said = re.search(r"another tool frame, (\d+) mm and (\d+) deg from", cause.words)
-    # Seen from 1.5 m away, whose direction is known to 0.5 mrad; and figures are rounded.
-    away = np.abs(np.array(said.groups(), float) - pose_difference(np.eye(4), switched))
-    assert (away < [1.3, 0.55]).all()
-
-
-@pytest.mark.parametrize(("digits", "is_found"), [(3, True), (4, False)])
-def test_poses_with_too_few_digits_are_the_cause(digits: int, is_found: bool) -> None:
-    cell = simulate(CellOptions(views=20))
-    session = session_of(cell, cell.robot.base_from_flange)
-
-    def written(view):
-        rounded = {name: round(value, digits) for name, value in view.numbers.items()}
-        return replace(view, numbers={**view.numbers, **rounded})
-
-    verdict = calibrate(replace(session, views=tuple(map(written, session.views)))).verdict
-    assert (ids(verdict)[:1] == ["rounded_poses"]) == is_found
-    assert not is_found or "positions to 1 mm and their quaternions to 0.001" in verdict.top[0]
+    assert "from view 12 on, the camera, the target or a frame of the controller" in cause.words
 
 
 def test_angles_in_an_order_that_no_reading_brings_back_are_named() -> None:

@@ -219,9 +219,7 @@ WORLDS: dict[str, World] = {
         later(24, camera_moved_m=4e-3),
         seed=2,
         causes=("something_moved", "arm_errors"),
-        words=(r"from view 24 on, as they agree, the camera stood (\S+) mm",),
-        # What an arm errs by at six stops is another mean.
-        figure=(4.0, 0.5),
+        words=("from view 24 on, the camera",),
         of=NONE,
     ),
     "bump": World(
@@ -270,8 +268,7 @@ WORLDS: dict[str, World] = {
         replace(OPEN, views=19),
         printed([-1 / 6, 0.0], [0.0, -1 / 6], since=14),
         causes=("something_moved",),
-        words=(r"from view 14 on.* (\S+) % smaller", "target is another one"),
-        figure=(16.7, 4.2),
+        words=("from view 14 on, the camera, the target",),
         of=NONE,
     ),
     "exchanged rows": World(

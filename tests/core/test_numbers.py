@@ -12,6 +12,7 @@ from visioncal.core import transforms
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, t_chance
+from visioncal.robot import REPEATABILITY
 
 
 @pytest.fixture
@@ -110,7 +111,8 @@ def test_the_page_states_where_doubt_begins_and_where_trust_ends():
     assert f"with {100 * met:g} % or more" in _row("good")
     assert f"under {scatter_mm:g} mm and {scatter_deg:g} deg" in _row("good")
     assert f"known to {sigma_mm:g} mm and {sigma_deg:g} deg" in _row("good")
-    assert f"under {limits.robot_mm:g} mm and {limits.robot_deg:g} deg" in _row("good")
+    robot_mm, robot_deg = (limits.repeatability * value for value in REPEATABILITY)
+    assert f"under {robot_mm:g} mm and {robot_deg:g} deg" in _row("good")
     assert f"corners under {limits.pixel_px[0]:g} px, {limits.stops[0]} stops" in _row("good")
     assert f"{100 * (1 - limits.lost_share[0]):g} % of the views" in _row("good")
     assert f"with {100 * half:g} % or more" in _row("check")

@@ -37,13 +37,9 @@ class CalibrationLimits:
     sigma_deg: Pair = (0.1, 0.3)
     # Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
     pixel_px: Pair = (0.7, 3.0)
-    # Error of an industrial arm's flange from stop to stop, and of rounded poses of any arm [mm];
-    # such arms repeat to 0.1 mm or better, and larger errors are seldom independent between stops,
-    # as the covariance assumes.
-    robot_mm: float = 0.2
-    robot_deg: float = 0.02  # The same in rotation [deg].
-    # Error of the flange over what an arm of its kind has, and how many times as much a task needs
-    # at least, for which it is no doubt.
+    # Error of the flange over what an arm of its kind has (larger ones are seldom independent
+    # between stops, as the covariance assumes), and how many times as much a task needs at least,
+    # for which it is no doubt.
     repeatability: float = 2.0
     good_enough: float = 10.0
     # Left-out scatter over that by the sensor's noise, as of a small board far away.

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, FALSE_REJECTION, chi2_limit, f_limit
-from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
+from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
@@ -189,25 +189,3 @@ def _change_covariance(problem: Problem, fit: Solution, frame: str) -> FloatArra
     covariance = problem.total_covariance(linear, fit.noise)
     inverse = np.linalg.inv(linear.jacobian[:, :, problem.edge_columns(frame)])
     return np.asarray(inverse @ covariance @ np.swapaxes(inverse, 1, 2))
-
-
-def agreed_change(
-    problem: Problem, fit: Solution, frame: str, some: Mask
-) -> tuple[FloatArray, Mask] | None:
-    """The new pose of a frame that (n,) some observations agree on, by a fit of others.
-
-    Returns:
-        (4, 4) the change in the frame's own pose, and for each of them whether noise explains the
-        rest; None where not all involve the frame.
-    """
-    part = problem.subset(some)
-    if not part.observations.involves(frame).all():
-        return None
-    changes, covariance = part.change_of(frame, fit.state), _change_covariance(part, fit, frame)
-    middle = mean_transform(changes)
-    differences = log(invert(middle) @ changes)
-    weights = np.asarray(np.linalg.inv(covariance), dtype=float)
-    mean = _weighted_mean(differences, weights)
-    residuals = differences - mean
-    squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
-    return middle @ exp(mean), squares < _noise_limit(len(problem))

@@ -20,7 +20,6 @@ from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import (
-    explained_by_noise,
     fitted_change,
     moved,
 )
@@ -293,23 +292,3 @@ def evidence(problem: Problem, fit: Solution, step: Step) -> tuple[float, Proble
         logs.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
     prior = float(np.logaddexp.reduce(logs) - np.log(len(logs)))
     return 2.0 * (before - after + prior), widened, step_fit
-
-
-def agreed_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
-    """The new size of a board that (n,) some observations agree on, by a fit of others.
-
-    Returns:
-        The relative increase, and for each of them whether noise explains the rest; None where they
-        are not of one board.
-    """
-    pairs = zip(problem.observations.observed, some.tolist(), strict=True)
-    board, *others = {frame for frame, chosen in pairs if chosen}
-    if others or not board.startswith("target"):
-        return None
-    measured = problem.measured(fit.state)[some, :3, 3]
-    predicted = problem.predicted(fit.state)[some, :3, 3]
-    ratios = np.sum(predicted * measured, axis=1) / np.sum(measured**2, axis=1)
-    share = float(np.median(ratios)) - 1.0
-    widened = problem.with_effects([*problem.effects, _size_effect(problem, fit, board)])
-    resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
-    return share, explained_by_noise(widened, resized, len(problem))[some]

@@ -12,7 +12,6 @@ from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
-from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Corners, Rejection, Target
@@ -159,7 +158,6 @@ def locate_targets(seen: T) -> T:
         DataError: No view shows a target, or a lens's distortion cannot be inverted at any view's
             corners.
     """
-    seen = leave_out_wrong_points(seen)
     session, targets = seen.session, tuple(seen.session.boards.values())
     stated = stated_poses(session).items()
     poses = {**seen.poses, **{view: pose for view, pose in stated if view not in seen.repeats}}

@@ -294,7 +294,7 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
             "Look for what is likelier than noise of the arm: a board of another size than stated "
             "(measure it over many squares) or warped, intrinsics that are not this camera's, an "
             "instrument that was moved or reads worse than stated, a model of the arm that is off "
-            "by as much, or poses that were read before the arm stood still."
+            "by as much, or poses that are rounded or were read before the arm stood still."
         )
         ratio = max(arm.noise_mm / limit_mm, arm.noise_deg / limit_deg)
         yield Finding(

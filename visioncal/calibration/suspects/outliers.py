@@ -13,18 +13,12 @@ from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
-from visioncal.core.transforms import distances, invert, pose_difference
-from visioncal.core.types import FloatArray
+from visioncal.core.transforms import pose_difference
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, or_alone
-from visioncal.estimation.moves import agreed_change
-from visioncal.estimation.steps import agreed_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
-# Views that a large step explains agree on it to within this share of the step: the uncertainty
-# that the fit leaves grows with it.
-_SURELY_ALIKE = 0.05
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
@@ -124,70 +118,30 @@ def _fault(
 
 
 def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers at one end of the session that one step of a frame, or of a board, explains."""
-    # Another active tool frame in the controller looks like a step of what is on the flange, and
-    # another base frame like one of what is fixed in the cell.
+    """Outliers that are all views at one end of the session, as where something moved."""
     inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
-    problem, fit = inliers.problem, inliers.fit
-    order = np.argsort(problem.observations.stops, kind="stable")
+    order = np.argsort(inliers.problem.observations.stops, kind="stable")
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
-    if len(run) < FEWEST_VIEWS or not problem.observations.has_rotation[run].all():
+    if len(run) < FEWEST_VIEWS:
         return
-    some, steps = np.isin(np.arange(len(problem)), run), []
-    for frame in problem.unknown:
-        if (step := agreed_change(problem, fit, frame, some)) is None:
-            continue
-        change, explained = step
-        scatter_m = float(np.median(distances(problem.change_of(frame, fit.state)[run], change)[0]))
-        if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
-            steps.append((scatter_m, frame, change))
-    if steps:
-        what, advice = _moved_words(cell_fit, sorted(steps, key=lambda step: step[0]))
-    elif (size := agreed_size(problem, fit, some)) is not None and size[1].all():
-        share = f"{figure(100.0 * abs(size[0]))} % {'larger' if size[0] > 0.0 else 'smaller'}"
-        what = f"the target is another one, {share} than that of the other views"
-        advice = "Measure both prints, take one of them for all views"
-    else:
-        return
-    last = rows[int(run[-1])].station
     when = f"from view {rows[int(run[0])].view} on"
     if run is before:
+        last = rows[int(run[-1])].station
         following = min((row for row in rows if row.station > last), key=lambda row: row.station)
         when = f"before view {following.view}"
     outliers = np.sort(run).tolist()
-    views = tuple(rows[row].view for row in outliers)
-    do = or_alone(f"{advice}; or calibrate the views before and after it apart.", views)
-    words = f"{{views}} were left out: {when}, as they agree, {what}."
-    short = f"{when}, something had moved"
-    yield _fault(cell_fit, "something_moved", outliers, words, do, short)
-
-
-def _moved_words(
-    cell_fit: CellFit, steps: Sequence[tuple[float, str, FloatArray]]
-) -> tuple[str, str]:
-    """What stood elsewhere, by steps of frames, the likeliest first; and advice."""
-    inliers, (_, frame, change) = cell_fit.inlier_fit, steps[0]
-    problem = inliers.problem
-    stood = [
-        f"the {name.partition('_')[0].replace('cam', 'camera')} stood "
-        f"{mm_and_deg(*pose_difference(np.eye(4), step))} elsewhere"
-        for _, name, step in steps
-    ]
-    advice, on_flange = "Fasten what moved", problem.tree.body(frame) != problem.tree.root
-    if on_flange or len(problem.robots) == 1:
-        which = "tool" if on_flange else "base"
-        edge = inliers.fit.state.edges[problem.unknown[frame]]
-        other = mm_and_deg(*pose_difference(np.eye(4), edge @ change @ invert(edge)))
-        stood.append(
-            f"the controller reported another {which} frame, {other} from that of the other views"
-        )
-        advice = (
-            f"Look which {which} frame was active in the controller, and set the same one for all "
-            "views; or fasten what moved"
-        )
-    return ", or ".join(stood), advice
+    do = or_alone(
+        "Fasten camera and target, keep one board, and one tool and base frame in the controller; "
+        "or calibrate the views before and after it apart.",
+        tuple(rows[row].view for row in outliers),
+    )
+    words = (
+        f"{{views}} were left out: {when}, the camera, the target or a frame of the controller was "
+        "another one."
+    )
+    yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 
 
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:

@@ -14,7 +14,6 @@ from visioncal.calibration.suspects import (
     lens,
     mirrored_cell,
     misread_poses,
-    rounded_poses,
     steps,
 )
 from visioncal.calibration.suspects.outliers import moved_finding
@@ -85,7 +84,6 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.SIZE,
     board.SHAPE,
     *growing.GROWING,
-    rounded_poses.ROUNDED_POSES,
     mirrored_cell.MIRRORED_CELL,
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
@@ -94,7 +92,6 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("repeated_readings", is_doubt=False),
     Suspect("repeated_views", chance=FACT),
     Suspect("corner_numbers", chance=FACT),
-    Suspect("rig_points", chance=FACT),
     Suspect("other_board", _unseen, FACT, hides=("lost_views",)),
     Suspect("other_lens", chance=FACT),
     Suspect("lost_views", chance=REMARK),
