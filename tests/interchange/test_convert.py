@@ -34,25 +34,19 @@ def test_there_and_back_again(folder, tmp_path):
     assert content(again) == content(folder)
 
 
-@pytest.mark.parametrize("name", ["taken", "taken.rrd"])
-def test_what_is_there_stays(folder, tmp_path, name):
-    taken = tmp_path / name
-    taken.write_bytes(b"kept")
-    raised(DataError, "exists, and nothing is overwritten", convert, folder, taken)
-    assert taken.read_bytes() == b"kept"
-
-
-def test_force_replaces_a_recording_and_nothing_else(folder, tmp_path):
-    (tmp_path / "old.rrd").write_bytes(b"old")
-    convert(folder, tmp_path / "old.rrd", force=True)
-    assert Session.load(tmp_path / "old.rrd").digest() == Session.load(folder).digest()
-    (tmp_path / "file").write_bytes(b"kept")
+def test_what_is_there_stays_and_force_replaces_a_recording_alone(folder, tmp_path):
+    for name in ("taken", "taken.rrd"):
+        (tmp_path / name).write_bytes(b"kept")
+        raised(DataError, "exists, and nothing is overwritten", convert, folder, tmp_path / name)
+        assert (tmp_path / name).read_bytes() == b"kept"
+    convert(folder, tmp_path / "taken.rrd", force=True)
+    assert Session.load(tmp_path / "taken.rrd").digest() == Session.load(folder).digest()
     (tmp_path / "folder.rrd").mkdir()
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").write_bytes(b"kept")
-    for name in ("file", "folder.rrd", "full"):
+    for name in ("taken", "folder.rrd", "full"):
         raised(DataError, name, convert, folder, tmp_path / name, force=True)
-    assert (tmp_path / "file").read_bytes() == (tmp_path / "full/file").read_bytes() == b"kept"
+    assert (tmp_path / "taken").read_bytes() == (tmp_path / "full/file").read_bytes() == b"kept"
 
 
 def test_the_recording_that_comes_along_calibrates(tmp_path):
@@ -73,9 +67,7 @@ def test_the_command_converts_and_refuses(folder, tmp_path):
     visioncal("convert", folder, tmp_path / "new.rrd").refused("--force")
 
 
-@pytest.fixture
-def misread(tmp_path):
-    """A session whose copy in the folder `mm` has its positions in millimetres."""
+def test_a_session_whose_poses_are_misread_is_mended(tmp_path):
     session = made_up(9, images=False).session
     cells = [
         [
@@ -85,16 +77,12 @@ def misread(tmp_path):
         for view in session.views
     ]
     Session.assemble(session.document, session.columns, cells, session.images).save(tmp_path / "mm")
-    return session
-
-
-def test_a_session_whose_poses_are_misread_is_mended(misread, tmp_path):
     visioncal("convert", tmp_path / "mm", tmp_path / "no", "--guess").refused("--yes")
     assert not (tmp_path / "no").exists()
     done = visioncal("convert", tmp_path / "mm", tmp_path / "mended", "--guess", "--yes").good()
     assert "positions in mm" in done.err
     mended = Session.load(tmp_path / "mended")
-    for old, new in zip(misread.views, mended.views, strict=True):
+    for old, new in zip(session.views, mended.views, strict=True):
         # Multiplied by 1000 and divided again, each rounded once.
         for name in ("x_m", "y_m", "z_m", "qx", "qw", "cft_x_m"):
             assert new.numbers[name] == pytest.approx(old.numbers[name], abs=1e-14)

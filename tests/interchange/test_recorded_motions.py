@@ -97,33 +97,23 @@ def test_what_a_bag_lacks_is_said(options, message, step, source, rendered, tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_poses_of_a_topic_and_frames_are_named(source, rendered, tmp_path):
+def test_poses_frames_and_lenses_may_be_named(source, rendered, tmp_path):
     path = bag(tmp_path / "b", source, rendered, is_compressed=True, poses="pose")
-    asked = replace(BOARD, mount="eye-in-hand")
+    # Intrinsics without an image size take that of the bag.
+    fx, fy, cx, cy = LENS["matrix"]
+    stated = {"camera_matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}
+    lens = tmp_path / "lens.json"
+    lens.write_text(json.dumps(stated | {"distortion_coefficients": LENS["distortion"]}))
+    asked = replace(BOARD, mount="eye-in-hand", intrinsics=str(lens))
     session = convert(path, tmp_path / "out", requested=asked)
     assert len(session.views) == len(source.views)
+    assert session.declaration.camera.resolution == source.declaration.camera.resolution
+    assert session.declaration.camera.matrix == LENS["matrix"]
     frames = bag(tmp_path / "frames", source, rendered, is_compressed=True)
     wrong = replace(BOARD, robot=PoseImportOptions(("base_link", "tool1")))
     with pytest.raises(DataError, match="no 'tool1'") as caught:
         convert(frames, tmp_path / "none", requested=wrong)
     assert "tool0" in caught.value.next_step
-
-
-def test_intrinsics_without_an_image_size_take_that_of_the_bag(source, rendered, tmp_path):
-    path, lens = bag(tmp_path / "b", source, rendered, is_compressed=True), tmp_path / "lens.json"
-    fx, fy, cx, cy = LENS["matrix"]
-    stated = {"camera_matrix": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]}
-    lens.write_text(json.dumps(stated | {"distortion_coefficients": LENS["distortion"]}))
-    session = convert(path, tmp_path / "out", requested=replace(BOARD, intrinsics=str(lens)))
-    assert session.declaration.camera.resolution == source.declaration.camera.resolution
-    assert session.declaration.camera.matrix == LENS["matrix"]
-
-
-def test_a_damaged_bag_is_refused(source, rendered, tmp_path):
-    path = bag(tmp_path / "b.bag", source, rendered, form="ros1", is_compressed=True)
-    path.write_bytes(path.read_bytes()[:100_000])
-    with pytest.raises(DataError, match="cannot be read as a bag"):
-        convert(path, tmp_path / "out", requested=BOARD)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -163,7 +153,11 @@ def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, 
         convert(path, tmp_path / "none", requested=BOARD)
 
 
-def test_a_data_set_without_its_large_files_is_refused(source, rendered, tmp_path):
+def test_what_is_damaged_is_refused(source, rendered, tmp_path):
+    path = bag(tmp_path / "b.bag", source, rendered, form="ros1", is_compressed=True)
+    path.write_bytes(path.read_bytes()[:100_000])
+    with pytest.raises(DataError, match="cannot be read as a bag"):
+        convert(path, tmp_path / "out", requested=BOARD)
     path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
     next((path / "data").rglob("*.parquet")).write_text("version https://git-lfs.github.com")
     with pytest.raises(DataError, match="cannot be read as parquet"):

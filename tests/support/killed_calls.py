@@ -21,16 +21,8 @@ ALL, LESS, NONE = (
 # Other people's files, some of them much like ours.
 FOREIGN = {"views.csv": "view", ".notes.tmp": "a note", f".{31 * 'a'}.tmp": "another"}
 _KILLED = 9
-_CALLS = {
-    "open",
-    "os.link",
-    "os.mkdir",
-    "os.remove",
-    "os.rename",
-    "os.rmdir",
-    "os.scandir",
-    "os.symlink",
-    "fcntl.flock",
+_CALLS = {"open", "fcntl.flock"} | {
+    f"os.{name}" for name in ("link", "mkdir", "remove", "rename", "rmdir", "scandir", "symlink")
 }
 
 
@@ -72,17 +64,14 @@ def killed_everywhere(folder: Path, before: dict[str, str], after: dict[str, str
         whole = ended(lambda: written(folder, after), call)
         seen = visible(folder)
         allowed = [after] if whole else [before, after]
-        expect(
-            seen in [FOREIGN | mapping for mapping in allowed],
-            f"{before} to {after}, {call}: {seen}",
-        )
+        assert seen in [FOREIGN | mapping for mapping in allowed], (before, after, call, seen)
         # The next writer is killed, too, while it puts things in order.
         for again in (12, 30):
             ended(lambda: written(folder, after), again)
             seen = visible(folder)
-            expect(seen in [FOREIGN | before, FOREIGN | after], f"{call}, {again}: {seen}")
+            assert seen in [FOREIGN | before, FOREIGN | after], (call, again, seen)
         written(folder, after)
-        expect(visible(folder) == FOREIGN | after, f"{call}: the next run shows {visible(folder)}")
+        assert visible(folder) == FOREIGN | after, call
         expect_no_leftovers(folder, FOREIGN | after)
         if whole:
             return call - 1
@@ -100,13 +89,7 @@ def begin(folder: Path, content: dict[str, str]) -> None:
 def expect_no_leftovers(folder: Path, content: dict[str, str]) -> None:
     """The folder holds regular files alone, and none but these."""
     left = [path.name for path in folder.iterdir() if path.name not in content or path.is_symlink()]
-    expect(not left, f"left: {left}")
-
-
-def expect(holds: bool, words: str) -> None:
-    """Fails with words."""
-    if not holds:
-        raise AssertionError(words)
+    assert not left
 
 
 def killed_single(folder: Path) -> int:
@@ -115,7 +98,7 @@ def killed_single(folder: Path) -> int:
     for call in count(1):
         begin(folder, ALL)
         whole = ended(lambda: write_atomically(path, "new"), call)
-        expect(path.read_text() in ("new", *([] if whole else [ALL[path.name]])), f"{call}")
+        assert path.read_text() in ("new", *([] if whole else [ALL[path.name]])), call
         write_atomically(folder / "report.html", "new")
         expect_no_leftovers(folder, FOREIGN | ALL)
         if whole:
@@ -127,7 +110,6 @@ if __name__ == "__main__":
     # What a kill leaves does not depend on the disk, and waiting for it takes most of the time.
     os.fsync = lambda _: None
     place = Path(sys.argv[1]) / "out"
-    changes = [(NONE, ALL), (LESS, ALL | {"result.json": "another"}), (ALL, LESS)]
-    for change in changes:
+    for change in ((NONE, ALL), (LESS, ALL | {"result.json": "another"}), (ALL, LESS)):
         print(killed_everywhere(place, *change))
     print(killed_single(place))
