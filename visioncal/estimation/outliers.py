@@ -96,11 +96,14 @@ class _ObservationSearch:
     problem: Problem
 
     def fit(self, used: Mask, start: Solution) -> Solution:
-        return self.fit_from(used, start.state, start.noise)
+        # The noise follows the inliers, from fit to fit.
+        return self.fit_from(used, start.state, start.noise, turns=1)
 
-    def fit_from(self, used: Mask, state: State, noise: Noise | None = None) -> Solution:
+    def fit_from(
+        self, used: Mask, state: State, noise: Noise | None = None, *, turns: int = 20
+    ) -> Solution:
         part = self.problem.subset(used)
-        fit = fit_problem(part, state, noise)
+        fit = fit_problem(part, state, noise, turns=turns)
         if np.all(fit.noise.robots <= _MOST_NOISE):
             return fit
         # With more noise than robots have, frames may be fitted anywhere.
@@ -150,6 +153,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         involved = problem.observations.involves(move.twin)
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
+    fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
@@ -183,6 +187,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         movable = (*movable, move.twin)
         moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))
+    fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
@@ -202,6 +207,7 @@ def find_inliers(
             else (used, fit_problem(problem.subset(used), state, noise))
         )
         mask, fit = _refined(problem, mask, fit)
+        fit = _ObservationSearch(problem).fit_from(mask, fit.state, fit.noise)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
         if mask.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
             return _inlier_fit(problem, mask, fit, ())

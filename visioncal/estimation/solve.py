@@ -62,15 +62,20 @@ def starting_noise(problem: Problem) -> Noise:
     return Noise(np.full((len(problem.robots), 2), START_SIGMA), np.ones(sensors))
 
 
-def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> Solution:
-    """Minimises the whitened residuals and estimates the noise levels, from given ones on."""
+def fit_problem(
+    problem: Problem, state: State, noise: Noise | None = None, *, turns: int = 20
+) -> Solution:
+    """Minimises the whitened residuals and estimates the noise levels, from given ones on.
+
+    Both in turn, until the levels change no more, or for a number of turns.
+    """
     is_near, given = noise is not None, noise or starting_noise(problem)
     # REML includes one linear step of the unknowns, so levels are close before the first solve.
     noise = estimate_noise(problem, state, given, from_above=not is_near)
     is_unchanged = is_near and _are_close(given, noise)
     if is_unchanged:
         noise = given
-    for turn in range(0 if is_unchanged else 20):
+    for turn in range(0 if is_unchanged else turns):
         start, previous = state, noise
         state, _ = solve_problem(
             problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY

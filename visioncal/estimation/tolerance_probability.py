@@ -11,6 +11,7 @@ of freedom, r^2 / d is F of (d, n).
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy.special import fdtr, ndtri
@@ -113,6 +114,7 @@ def _errors(spreads: FloatArray, offsets: FloatArray | None) -> tuple[FloatArray
     return errors, np.zeros_like(errors) if offsets is None else offsets[at]
 
 
+@cache
 def _directions() -> FloatArray:
     """(n, 6) evenly distributed unit vectors, by an additive recurrence (Roberts 2018)."""
     # Steps are powers of the root of x^7 = x + 1, a golden ratio of six dimensions.

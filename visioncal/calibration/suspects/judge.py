@@ -45,10 +45,12 @@ def judge(findings: Findings) -> Verdict:
     notes = remarks((*findings.notes, *(finding.words for finding in small)), NOTE)
     findings = replace(findings, warnings=[found for found in warnings if found not in small])
     doubts = collect_findings(findings)
-    good_for_mm, uncorrected_mm = _good_for_mm(picks, doubts), None
+    worst = least_precise(picks) if picks else None
+    good_for_mm, uncorrected_mm = _good_for_mm(worst, doubts), None
     is_calibrated = any(pick.uncorrected is not None for pick in picks)
     if is_calibrated:
-        uncorrected_mm = _good_for_mm([pick.uncorrected or pick for pick in picks], doubts)
+        uncorrected = least_precise([pick.uncorrected or pick for pick in picks])
+        uncorrected_mm = _good_for_mm(uncorrected, doubts)
     met = need_met(findings.need, findings.judged_picks)
     enough, least = NeedLimits.probability
     is_met = met is not None and met.probability >= enough
@@ -72,8 +74,8 @@ def judge(findings: Findings) -> Verdict:
         ]
     if met is not None:
         stated.insert(len(stated) * is_met, Finding("need", _need_words(findings, met)))
-    elif good_for_mm is not None:
-        stated.append(_good_for(findings, good_for_mm, status))
+    elif worst is not None and good_for_mm is not None:
+        stated.append(_good_for(worst, good_for_mm, status))
     if not doubts:
         stated.append(_agreement(findings, is_enough=status == "good"))
     stated += [warning for warning in warnings if not SUSPECTS[warning.kind].is_doubt]
@@ -106,17 +108,14 @@ def in_reading_order(findings: Sequence[Finding], status: VerdictStatus) -> tupl
     return tuple({id(finding): finding for finding in ordered}.values())
 
 
-def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
+def _good_for_mm(worst: Picks | None, doubts: Sequence[Finding]) -> float | None:
     """The least need that all pairs would meet; None without one, or where unknown."""
     least = max((doubt.until_mm for doubt in doubts), default=0.0)
-    if not picks or np.isinf(least):
-        return None
-    return max(least, least_precise(picks).good_for_mm)
+    return None if worst is None or np.isinf(least) else max(least, worst.good_for_mm)
 
 
-def _good_for(findings: Findings, good_for_mm: float, status: VerdictStatus) -> Finding:
+def _good_for(worst: Picks, good_for_mm: float, status: VerdictStatus) -> Finding:
     verb = "would be" if status == "bad" else "is"
-    worst = least_precise(findings.picks)
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     return Finding(
