@@ -55,28 +55,15 @@ Z = exp(np.array([2.9, 0.2, -0.4, 0.5, 0.2, 0.1]))
 TOOL = exp(np.array([0.1, 0.0, 0.2, 0.01, 0.02, 0.1]))
 
 
-def erring(robot, blocks=("links",)):
-    """An arm with errors of some blocks to be estimated, and a tool on its flange."""
-    sizes = sum(SIZES[index] for index in blocks) * robot.joint_count
-    return ArmModel(robot, TOOL, dict.fromkeys(blocks, 1.0), np.zeros(sizes))
-
-
-def problem_of(model, mount, q, flange=None, noise=None):
-    """What is seen at stops with joint angles q, the flange being elsewhere, up to some noise."""
-    poses = model.robot.base_from_flange(q)
-    seen = invert(robot_part(poses if flange is None else flange, mount) @ X) @ Z
-    errors = ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True)
-    covariance = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
-    effect = replace(errors.effect(ROBOT, values=model.values), values=np.zeros(len(model.values)))
-    return chain(
-        mount, poses, seen if noise is None else seen @ noise, covariance, effects=[effect]
-    )
-
-
 def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     """What is seen of an arm that is as stated."""
-    model = erring(robot, blocks)
-    problem = problem_of(model, mount, q)
+    sizes = sum(SIZES[index] for index in blocks) * robot.joint_count
+    model = ArmModel(robot, TOOL, dict.fromkeys(blocks, 1.0), np.zeros(sizes))
+    poses = model.robot.base_from_flange(q)
+    effect = ArmErrors(model.basis(q), ERROR_RAD, 0.0, of_links=True).effect(ROBOT)
+    covariance = np.tile(np.diag(CAMERA_SIGMAS**2), (len(q), 1, 1))
+    seen = invert(robot_part(poses, mount) @ X) @ Z
+    problem = chain(mount, poses, seen, covariance, effects=[effect])
     state = State(np.stack([X, Z]), np.zeros(len(model.values)))
     covariance = covariance_of(problem, Solution(state, NOISE))
     return ArmData(
@@ -97,11 +84,11 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     )
 
 
-def identified(data, convention=None):
+def identified(data):
     """The arm's section with its parameters, and which stops to add."""
     level = ArmLevel(level="nominal", unknowns=0, rms_mm=0.0, held_out_mm=0.0, likelihood_ratio=0.0)
     result = ArmResult(level="nominal", levels=(level,))
-    return add_parameters(result, data, convention)
+    return add_parameters(result, data, None)
 
 
 # Three axes and a wrist, with rails among them.

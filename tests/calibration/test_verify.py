@@ -6,6 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
@@ -24,6 +25,7 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Second, simulate, write_session
+from visioncal.vision.targets import corner_positions
 
 BUMP = np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0])
 ANEW = np.array([0.0, 0.0, 0.3, 0.02, 0.01, 0.0])
@@ -49,6 +51,25 @@ def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     # Chi-square of thirty directions; the mean of four is known to 3.9, and the noise's scale to
     # a tenth, which is three more.
     assert np.mean([value.misfit for value in found]) == pytest.approx(30.0, abs=15.0)
+
+
+def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
+    known = known_again(place.cell, np.random.default_rng(0))
+    prior, result = CalibrationPrior.of(place.calibration), with_field(place.calibration)
+    plain = predict_detected(known, prior)
+    ((frame, look),) = known.cameras.items()
+    points, lens, displaced = corner_positions(place.cell.options.target), result.camera, {}
+    for view, seen in look.corners.items():
+        pose = plain.observed.poses[view].cam_from_target[0]
+        far_m = float(np.mean(points[seen.ids] @ pose[2, :3] + pose[2, 3]))
+        away_px = lens.displacements(seen.px, far_m) @ lens.field.coefficients
+        displaced[view] = replace(seen, px=seen.px + away_px)
+    shown = known.with_camera(frame, replace(look, corners=displaced))
+    for calibration, is_near in ((result, True), (place.calibration, False)):
+        other = CalibrationPrior.of(calibration)
+        off = predict_detected(shown, other).away(other) - plain.away(prior)
+        # A field of 0.3 px changes by some thousandths of that over itself.
+        assert (1e3 * np.abs(off[:, :3, 3]).max() < 0.02) == is_near
 
 
 def test_stops_that_repeat_calibrated_ones_show_what_the_arms_errors_hide():

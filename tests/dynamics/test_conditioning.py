@@ -1,12 +1,9 @@
 """From recorded samples to motions and torques: filters, clocks, lags, mistaken samples."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.commands import visioncal as run
-from support.marks import slow
 from support.moved_arms import changed, robot_with_bodies
 from support.refusals import raised
 
@@ -14,14 +11,12 @@ from visioncal.core.errors import DataError
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import LowPass, condition
 from visioncal.dynamics.convention_hypotheses import check_recording
-from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import Options, find_lag
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import (
     Senses,
-    exercise_session,
     multi_sine,
     nominal_dynamics,
     real_dynamics,
@@ -60,7 +55,7 @@ def test_the_filter_knows_what_it_leaves_of_white_noise():
     assert seen == pytest.approx(lowpass.correlation[:3], abs=0.02)
 
 
-@pytest.mark.parametrize("senses", [Senses(), Senses(dq_rad_s=None), Senses(q_rad=1e-4)])
+@pytest.mark.parametrize("senses", [Senses(), Senses(q_rad=1e-4, dq_rad_s=None)])
 def test_motions_are_recovered(senses):
     rng = np.random.default_rng(6)
     done = multi_sine(6, rng)
@@ -73,7 +68,7 @@ def test_motions_are_recovered(senses):
     size = max(senses.q_rad / 1e-5, 1.0)
     for got, true, most in (
         (motion.q, done.q, 3e-6 * size),
-        (motion.dq, done.dq, 4e-4),
+        (motion.dq, done.dq, 4e-4 * size),
         (motion.ddq, done.ddq, 1e-3 * size),
     ):
         assert np.sqrt(np.mean((got - true[rows]) ** 2)) < most
@@ -106,8 +101,8 @@ def test_nothing_is_interpolated_across_gaps(moved):
     assert not gap.any()
 
 
-@pytest.mark.parametrize("resolved_rad", [1e-6, 1e-4])
-def test_torques_of_joints_at_rest_are_not_used(resolved_rad):
+def test_torques_of_joints_at_rest_are_not_used():
+    resolved_rad = 1e-4
     rng = np.random.default_rng(12)
     built, done = real_dynamics("ur5e", rng), slow_sweep(6, rng)
     # To rest and off again, from 20 s to 23 s, with as much as a controller's own ramps take.
@@ -245,26 +240,14 @@ def test_mistakes_are_named(stream, change, words):
     raised(DataError, words, check, changed(stream, change))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (swapped(5, 6, TORQUE), "the torques of joints 5 and 6 are swapped"),
-        (scaled(57.2958, ALL, ANGLE, SPEED), "angles are in degrees"),
-    ],
-)
-def test_mistakes_are_named_without_inertias(stream, change, words):
+def test_mistakes_are_named_without_inertias(stream):
     """No inertias at all explain them: only a scale of all torques is open."""
-    raised(DataError, words, check, changed(stream, change), with_inertias=False)
+    degrees = changed(stream, scaled(57.2958, ALL, ANGLE, SPEED))
+    raised(DataError, "angles are in degrees", check, degrees, with_inertias=False)
 
 
 @pytest.mark.parametrize(
-    ("seed", "motion", "with_inertias"),
-    [
-        (0, multi_sine, True),
-        (1, slow_sweep, True),
-        (1, multi_sine, False),
-        slow(2, slow_sweep, False),
-    ],
+    ("seed", "motion", "with_inertias"), [(0, multi_sine, False), (1, slow_sweep, True)]
 )
 def test_right_recordings_pass(seed, motion, with_inertias):
     name = "ur10e" if seed % 2 else "ur5e"
@@ -299,7 +282,7 @@ def lag_of(stream, name="ur5e"):
     return find_lag(robot_with_bodies(nominal_dynamics(name)), [condition(rows)], TERMS)
 
 
-@pytest.mark.parametrize(("lag_s", "whole"), [(0.02, True), (-0.03, False), (0.2, True)])
+@pytest.mark.parametrize(("lag_s", "whole"), [(-0.03, False), (0.2, True)])
 def test_lags_are_found_to_their_sigmas(lag_s, whole):
     away = []
     for seed in range(3):
@@ -316,10 +299,10 @@ def test_lags_are_found_to_their_sigmas(lag_s, whole):
     assert np.abs(away).max() < 4.5
 
 
-@pytest.mark.parametrize("motion", [multi_sine, slow_sweep])
-def test_torques_in_time_have_none(motion):
+def test_torques_in_time_have_none():
     rng = np.random.default_rng(4)
-    assert lag_of(record(real_dynamics("ur5e", rng, stribeck=True), motion(6, rng), rng)) is None
+    built = real_dynamics("ur5e", rng, stribeck=True)
+    assert lag_of(record(built, multi_sine(6, rng), rng)) is None
 
 
 def test_what_no_lag_mends_has_none():
@@ -333,36 +316,3 @@ def test_what_no_lag_mends_has_none():
             columns[name] = kept[other]
 
     assert lag_of(changed(stream, shuffle)) is None
-
-
-@pytest.mark.slow
-def test_late_torques_are_named_and_taken_earlier(tmp_path):
-    """The same motions, with torques in time, 10 ms late, and 80 ms late."""
-    results = {}
-    for lag_s in (0.0, 0.01, 0.08):
-        rng = np.random.default_rng(6)
-        built = real_dynamics("ur5e", rng)
-        streams = {
-            name: late(record(built, multi_sine(6, rng, rate_hz=250.0), rng), lag_s)
-            for name in ("excite", "fresh")
-        }
-        exercise_session("ur5e", streams).save(tmp_path / f"session {lag_s}")
-        asked = ("--stream", "excite", "--validate-on", "fresh", "-o", tmp_path / str(lag_s))
-        done = run("dynamics", "identify", tmp_path / f"session {lag_s}", *asked).good()
-        results[lag_s] = Identified.load(tmp_path / str(lag_s)), done.out
-    assert results[0.0][0].lag is None
-    # Late by a little it is a note, by much a reason to look for the cause.
-    for lag_s, word in ((0.01, "good"), (0.08, "check")):
-        result, words = results[lag_s]
-        assert result.lag.seconds == pytest.approx(lag_s, abs=5e-4)
-        assert words.startswith(word)
-        assert "The torques lag the angles by" in words
-        assert ("Record angles and torques by one clock" in words) is (word == "check")
-        # Taken earlier, they are predicted as those in time are, but for the rows at the ends,
-        # which are lost, and for the noise that interpolation averages.
-        known = results[0.0][0].validation.rms_nm
-        assert (result.validation.rms_nm < 1.25 * known).all()
-    # Those of another day likewise.
-    asked = ("--against", tmp_path / "0.0", "--stream", "fresh", "--json")
-    (figures,) = json.loads(run("dynamics", "validate", tmp_path / "session 0.08", *asked).out)
-    assert (np.array(figures["rms_nm"]) / np.array(figures["torque_nm"]) < 0.02).all()

@@ -20,18 +20,16 @@ from visioncal.dynamics import (
     FrictionTerms,
     JointMotion,
 )
-from visioncal.dynamics.base import null_space
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import (
     SLOW_RAD_S,
     Options,
-    block_of,
     identify,
     predict,
     validate,
 )
-from visioncal.dynamics.reading import RecordedSamples, read_recorded
+from visioncal.dynamics.reading import RecordedSamples
 from visioncal.dynamics.regression import NoiseBlock, regress
 from visioncal.robot import (
     Inertias,
@@ -43,14 +41,11 @@ from visioncal.robot import (
     torque_regressor,
 )
 from visioncal.robot.writing import small_urdf, urdf_with_inertias, with_inertias
-from visioncal.session import Stream
 from visioncal.simulation.dynamics import (
-    Senses,
     drive_torques,
     multi_sine,
     nominal_dynamics,
     real_dynamics,
-    record,
     slow_sweep,
 )
 
@@ -339,25 +334,6 @@ def test_parameters_are_within_their_sigmas(worlds):
     assert max(shares) < 1.9
 
 
-def test_parameters_are_within_their_sigmas_where_samples_are_lost():
-    shares, wider = [], []
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        built = real_dynamics("ur5e", rng)
-        stream = record(built, multi_sine(6, rng, rate_hz=100.0), rng)
-        sigmas = []
-        for kept in (np.arange(len(stream)), np.sort(rng.permutation(len(stream))[:1600])):
-            rows = read_recorded(Stream(stream.columns, stream.values[kept]), "robot.csv", 6)
-            result = identify(known_arm(), [condition(rows)], PLAIN).identified
-            away = result.values - true_base(result.base, built)
-            shares.append(away @ np.linalg.solve(result.covariance, away) / len(away))
-            sigmas.append(result.sigmas)
-        wider.append(float(np.median(sigmas[1] / sigmas[0])))
-    # As without losses; and four samples in five tell by 12 % less.
-    assert np.mean(shares[1::2]) == pytest.approx(np.mean(shares[::2]), abs=0.3)
-    assert np.mean(wider) == pytest.approx(1.12, abs=0.1)
-
-
 def test_torques_of_another_motion_are_predicted_to_their_noise(worlds):
     for built, found, fresh, rng in worlds:
         motion = recorded(built, fresh, rng).pieces[0].measured.motion
@@ -421,18 +397,6 @@ def test_joints_that_stand_still_are_named():
     with pytest.raises(DegenerateError, match=r"joint 4 \(wrist_1_joint\) stands still") as told:
         identify(known_arm(), [recorded(built, done, rng)])
     assert "visioncal dynamics plan" in told.value.next_step
-
-
-def test_motion_about_one_line_is_named():
-    rng = np.random.default_rng(9)
-    done = multi_sine(6, rng)
-    for values in (done.q, done.dq, done.ddq):
-        values[:, 1:] = values[:, :1] * np.array([1e-6, 0.0, 0.0, 0.0, 0.0])
-    base = BaseModel.reduce(DynamicModel(known_arm(), TERMS))
-    stream = recorded(real_dynamics("ur5e", rng), done, rng, Senses(q_rad=0.0))
-    lost = [base.names[index] for index in null_space(base, [block_of(base, stream)])]
-    assert "Fc4" in lost
-    assert len(lost) > 20
 
 
 def test_results_survive_the_disk(tmp_path, worlds):

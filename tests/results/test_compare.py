@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.cells import reporting
 from support.commands import visioncal
-from support.marks import slow
 from support.picks import calibration_of
 from support.samples import made_up
 
@@ -50,14 +49,13 @@ def with_moved_board(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
     return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": x, "target": moved})
 
 
-PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
 
 
 @cache
 def cells(mount, seed):
     """Two cells of one truth, with a lens that is to be estimated."""
-    options = CellOptions(mount=mount, views=40, seed=seed, state_intrinsics=False)
+    options = CellOptions(mount=mount, views=24, seed=seed, state_intrinsics=False)
     return halves(simulate(options))
 
 
@@ -65,41 +63,6 @@ def cells(mount, seed):
 def pair(mount, seed):
     first, second = cells(mount, seed)
     return calibration_of(first), calibration_of(second)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_noise_is_no_change(mount):
-    compared = [compare(*pair(mount, seed)) for seed in range(PAIRS)]
-    # One in a hundred may be told apart: two of eight come once in four hundred such runs.
-    assert sum(comparison.is_change for comparison in compared) <= 1
-    p_values = np.array(
-        [
-            test.p_value
-            for comparison in compared
-            for edge in comparison.edges
-            for test in (edge.rotation, edge.translation)
-        ]
-    )
-    # Where the covariance is right half of the chances lie under one half; 32 of them scatter by
-    # 0.09, and by up to twice that as the two transforms of one pair share their noise.
-    assert abs(np.mean(p_values < 0.5) - 0.5) < 0.36
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
-def test_a_camera_moved_by_five_sigma_is_found(mount):
-    for seed in range(2):
-        reference, second = pair(mount, seed)[0], cells(mount, seed)[1]
-        sigma_m = 1e-3 * compare(*pair(mount, seed)).edges[0].sigma_mm
-        moved = calibration_of(with_moved_camera(second, 5 * sigma_m * SHIFT))
-        comparison = compare(reference, moved)
-        camera, board = comparison.edges
-        assert camera.translation.is_change
-        assert not board.is_change
-        assert comparison.findings[0].startswith("The camera moved")
-        # The noise of the difference, one sigma to an axis or so, is added to the move.
-        assert 3.0 < camera.moved_mm / camera.sigma_mm < 7.0
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

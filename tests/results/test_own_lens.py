@@ -80,12 +80,3 @@ def test_every_output_carries_it(result, tmp_path):
     assert "own lens" in result._repr_html_()
     for name in ("ur", "kuka", "urdf", "easy-handeye", "zivid"):
         assert condition.words in document(result, name).warnings, name
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
-def test_an_ordinary_lens_has_no_condition(seed):
-    """Its decentring is that of the simulated wide lens, which is significant."""
-    result = result_of(calibrated(simulate(replace(ORDINARY, seed=seed)), joints=False))
-    assert np.abs(result.camera.camera.distortion[2:4]).max() > 1e-4
-    assert result.conditions == ()

@@ -8,10 +8,9 @@ import pytest
 from support.arm_documents import arm_of
 from support.commands import visioncal
 from support.refusals import raised
-from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
+from support.whole_cells import misfit, saved, simulated, truth
 
 import visioncal as package
-from visioncal.calibration.verification import verify
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import invert, log
@@ -19,7 +18,7 @@ from visioncal.results import Calibration, RobotResult, to_document
 from visioncal.results.views import left_out_rms
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.simulation import cell_session, simulate
+from visioncal.simulation import cell_session
 
 # Chi-square of twelve, and of six, exceed these in one case of a thousand.
 MOST_OF_TWELVE, MOST_OF_SIX = 32.9, 22.5
@@ -217,48 +216,3 @@ def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
     np.testing.assert_allclose(
         one.robot.base_from_flange(q), Robot.from_document(arm.model.document).base_from_flange(q)
     )
-
-
-@pytest.mark.slow
-def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
-    cell = simulate(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
-    session = recorded(cell)
-    found = package.calibrate(session)
-    assert {view.view for view in found.views if not view.used} == set(cell.wrong_views)
-    check = verify(session, found, camera="left", robot="b", target="plate_b")
-    assert check.passed
-    assert set(check.predicted.observed.reasons) < set(cell.wrong_views)
-
-
-@pytest.mark.slow
-def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():
-    robots = tuple(replace(robot, offset_sigma_rad=3e-3) for robot in OPTIONS.robots)
-    cell = simulate(replace(OPTIONS, robots=robots, stops=LATER + 8, seed=4))
-    session = recorded(cell)
-    found = package.calibrate(part(session, 0, LATER))
-    assert {robot.arm.level for robot in found.cell.robots.values()} == {"offsets"}
-    later = part(session, LATER, LATER + 8)
-    for camera, robot, target in PAIRS:
-        # As by its nominal arm it would be off by millimetres.
-        check = verify(later, found, camera=camera, robot=robot, target=target)
-        assert check.passed, check.named
-    # A place has what is open of the arm, its first joint's zero above all, and no more.
-    floor_m = truth(cell, "base_a", "target_floor")[:3, 3]
-    picks = package.locate_views(later, found, camera="hand", robot="a", target="floor").found
-    for place in picks.values():
-        assert "arm" not in place.budget_mm
-        away = place.p_base - floor_m
-        # Chi-square of three exceeds this in one case of a thousand.
-        assert away @ np.linalg.solve(place.covariance, away) < 16.3
-    slipped = replace(
-        later,
-        views=tuple(
-            replace(view, numbers={**view.numbers, "q3_rad": view.numbers["q3_rad"] + 2e-3})
-            if "q3_rad" in view.numbers
-            else view
-            for view in later.views
-        ),
-    )
-    check = verify(slipped, found, camera="hand", robot="a", target="floor")
-    assert not check.passed
-    assert check.named[0].name == "joint 3"
