@@ -102,12 +102,6 @@ def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[
     return rows
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(
-        "| " + " | ".join(group) + " |" for group in [head, ["---"] * len(head), *rows]
-    )
-
-
 def main() -> None:
     """Prints the tables and keeps them."""
     kinds = [
@@ -126,7 +120,8 @@ def main() -> None:
         head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
                 "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
                 "API / OpenCV, wall"]  # fmt: skip
-        text += f"\n\n{table(head, rows)}"
+        lines = ("| " + " | ".join(row) + " |\n" for row in (head, ["---"] * len(head), *rows))
+        text += "\n\n" + "".join(lines)
     print(text)
     write_section(
         "A whole calibration", "PYTHONPATH=tests python tests/benchmarks/calibrate.py", text
