@@ -2,14 +2,7 @@
 
 import pytest
 from support.fuzz.broken_sessions import BROKEN
-from support.kept_answers import (
-    REAL,
-    away_in_sigmas,
-    cases,
-    checkup_of,
-    kept,
-    sizes_apart,
-)
+from support.kept_answers import REAL, away_in_sigmas, cases, checkup_of, kept, sizes_apart
 
 # Beside an edge's own uncertainty, no user sees another estimator that is a fifth of it away.
 EDGE_SIGMAS = 0.2

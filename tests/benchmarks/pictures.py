@@ -24,13 +24,7 @@ from support.fuzz.broken_sessions import BROKEN, broken_session
 import visioncal as package
 from visioncal.present.recording import paths
 from visioncal.present.viewer.native import free_port, viewer_process
-from visioncal.simulation import (
-    CellOptions,
-    cell_session,
-    fine_camera,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import CellOptions, cell_session, fine_camera, simulate, write_session
 
 _FOLDER = Path(__file__).parents[2] / "recordings"
 # How long the viewer has for its drawing, without a graphics card [s].

@@ -29,12 +29,7 @@ from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import dynamics, progress
 from visioncal.cli.app import app, main
 from visioncal.cli.summary import truth_rows
-from visioncal.core.choices import (
-    SIMULATED_ARMS,
-    SIMULATED_CELLS,
-    Convention,
-    SolverName,
-)
+from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, Convention, SolverName
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
@@ -43,13 +38,7 @@ from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results import Calibration
 from visioncal.session import Session
-from visioncal.simulation import (
-    CellOptions,
-    cell_names,
-    read_truth,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import CellOptions, cell_names, read_truth, simulate, write_session
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
 
 FILES = ["calibration.json", "recording.rrd", "report.html"]

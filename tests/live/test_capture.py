@@ -94,11 +94,7 @@ def test_an_arm_that_never_rests_gives_no_view(plan, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("failure", "words"),
-    [
-        ("gone", "link is lost"),
-        ("emergency-stop", "emergency stop: .*"),
-    ],
+    ("failure", "words"), [("gone", "link is lost"), ("emergency-stop", "emergency stop: .*")]
 )
 def test_a_failure_on_the_way_halts_and_leaves_a_session(plan, tmp_path, failure, words):
     arm, camera = fake_devices(plan)

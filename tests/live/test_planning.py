@@ -42,13 +42,7 @@ def plan_cell(options: CellOptions, sigma_rad: float = 0.0, sigma_m: float = 0.0
     return replace(true, x=true.x @ off[0], z=true.z @ off[1], sigma_rad=sigma_rad, sigma_m=sigma_m)
 
 
-def next_best(
-    begun: SessionStart,
-    purpose: Purpose,
-    q: FloatArray,
-    count: int,
-    **draw,
-) -> Design:
+def next_best(begun: SessionStart, purpose: Purpose, q: FloatArray, count: int, **draw) -> Design:
     """The stops that a plan adds to a session, wherever the arm can drive."""
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
     worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)

@@ -16,12 +16,7 @@ from support.samples import BASE_FROM_FIXTURE, FLANGE_FROM_TOOL, made_up, with_f
 
 from visioncal.core.transforms import exp, invert
 from visioncal.present import coverage
-from visioncal.present.recording import (
-    arm,
-    board,
-    paths,
-    write_recording,
-)
+from visioncal.present.recording import arm, board, paths, write_recording
 from visioncal.present.report import plots
 from visioncal.present.viewer import blueprint
 from visioncal.results import Edge

@@ -14,11 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.transforms import exp, invert, log
 from visioncal.session import Session
 
-FORMS = {
-    "ros1": None,
-    "sqlite3": StoragePlugin.SQLITE3,
-    "mcap": StoragePlugin.MCAP,
-}
+FORMS = {"ros1": None, "sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 # Of each stop the arm rests, of each way to the next it moves for so long [s].
 REST_S, WAY_S = 1.2, 0.6
 

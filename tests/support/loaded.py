@@ -4,9 +4,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.simulation import Payload, arm_named
-from visioncal.simulation.instrument_session import (
-    random_postures,
-)
+from visioncal.simulation.instrument_session import random_postures
 
 GRAVITY = 9.80665
 LOADS_N = (0.0, 10.0, 20.0, 50.0)

@@ -263,16 +263,8 @@ def mujoco(text):
 
 
 # By the format's name: every format that holds a tool, and every one that holds a fixture.
-TOOL_READERS = {
-    "ur-tcp": ur_tcp,
-    "abb-tooldata": abb_tooldata,
-    "kuka-tool": kuka_tool,
-}
-FIXTURE_READERS = {
-    "ur-feature": ur_feature,
-    "abb-wobjdata": abb_wobjdata,
-    "kuka-base": kuka_base,
-}
+TOOL_READERS = {"ur-tcp": ur_tcp, "abb-tooldata": abb_tooldata, "kuka-tool": kuka_tool}
+FIXTURE_READERS = {"ur-feature": ur_feature, "abb-wobjdata": abb_wobjdata, "kuka-base": kuka_base}
 
 # Those of an arm, which test_cell_exports.py reads.
 ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")

@@ -2,12 +2,7 @@
 
 from dataclasses import replace
 
-from visioncal.calibration.suspects.judged import (
-    Findings,
-    JudgedArm,
-    JudgedPair,
-    Sensor,
-)
+from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.estimation.observability import Direction
 from visioncal.results import HELD_BACK, ViewResult
 
@@ -31,12 +26,7 @@ def views(count=20, **odd):
 PAIR = JudgedPair(views())
 SENSOR = Sensor(20, pixel_px=0.05)
 ARM = JudgedArm(20, 0.1, 0.0057)
-SOUND = Findings(
-    (PAIR,),
-    (SENSOR,),
-    (ARM,),
-    directions(1e-4, 1e-4, 1e-4, 1e-4),
-)
+SOUND = Findings((PAIR,), (SENSOR,), (ARM,), directions(1e-4, 1e-4, 1e-4, 1e-4))
 PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
 
 

@@ -2,13 +2,7 @@
 
 from dataclasses import replace
 
-from visioncal.simulation import (
-    CameraAt,
-    NetworkOptions,
-    SimulatedCell,
-    Swept,
-    simulate,
-)
+from visioncal.simulation import CameraAt, NetworkOptions, SimulatedCell, Swept, simulate
 
 AHEAD_S = 0.037
 # At its stops it takes no image.

@@ -13,14 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
 from visioncal.core.types import Camera, Target
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    prepare_scene,
-    project,
-    render,
-    simulate,
-)
+from visioncal.simulation import BOARDS, CellOptions, prepare_scene, project, render, simulate
 from visioncal.simulation.render import light_on
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board

@@ -5,13 +5,7 @@ import pytest
 from support.commands import visioncal
 
 from visioncal.core.errors import DataError
-from visioncal.simulation import (
-    CAMERAS,
-    CellOptions,
-    prepare_scene,
-    render,
-    simulate,
-)
+from visioncal.simulation import CAMERAS, CellOptions, prepare_scene, render, simulate
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target
 from visioncal.vision.targets import (
     corner_positions,
