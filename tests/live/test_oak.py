@@ -22,29 +22,6 @@ except DriverError:
 PATIENT_S = 20.0
 
 
-class Device:
-    """What an OAK says of itself."""
-
-    def __init__(self, calibration, sensor):
-        self.calibration, self.sensor, self.is_closed = calibration, sensor, False
-
-    def getDeviceName(self):  # noqa: N802
-        """As depthai names it."""
-        return "OAK-D"
-
-    def getConnectedCameraFeatures(self):  # noqa: N802
-        """Its sensors."""
-        return [self.sensor]
-
-    def readCalibrationOrDefault(self):  # noqa: N802
-        """What its factory wrote."""
-        return self.calibration
-
-    def close(self):
-        """Lets go of it."""
-        self.is_closed = True
-
-
 class CameraNode(dai.node.ThreadedHostNode):
     """A camera node that runs on this host: it takes pictures all the time, on automatic."""
 
@@ -97,7 +74,10 @@ def a_device(monkeypatch, *, lens=0, coefficients=(), is_colour=True, has_autofo
         hasAutofocus=has_autofocus,
         supportedTypes=[kind],
     )
-    device, seen = Device(handler, sensor), SimpleNamespace(sent=[])
+    device, seen = SimpleNamespace(sensor=sensor, is_closed=False), SimpleNamespace(sent=[])
+    device.getDeviceName, device.readCalibrationOrDefault = (lambda: "OAK-D"), (lambda: handler)
+    device.getConnectedCameraFeatures = lambda: [device.sensor]
+    device.close = lambda: setattr(device, "is_closed", True)
 
     class Pipeline:
         """A pipeline without a device."""

@@ -34,11 +34,6 @@ def arm_of(robot: Robot, **changes: Any) -> ArmResult:
     return replace(found, robot=robot, **changes)
 
 
-def stays_stated() -> dict[str, Any]:
-    """An arm of which no level was taken."""
-    return {"level": "nominal", "levels": levels()[:1]}
-
-
 def bent_ur10e() -> tuple[dict[str, Any], FloatArray]:
     """The document of a UR10e whose third joint's zero is off by 10 mrad, and by how much [rad]."""
     functions = np.zeros((6, 4))
@@ -70,15 +65,8 @@ def calibrated() -> dict[str, Any]:
         "observability": {"columns": 48, "identifiable": 30, "determined": 29, "condition": 54.2}
         | {"o1": 0.21, "o2": 0.0184, "o3": 0.0031, "o4": 6e-5, "o5": 0.0012},
         "not_determined": [NOT_TOLD],
-        "left_out": [_unseen(view) for view in (0, 1, 2, 4, 5, 7, 8)],
+        "left_out": [unseen(view) for view in (0, 1, 2, 4, 5, 7, 8)],
     }
-
-
-def with_holdout() -> dict[str, Any]:
-    """The same, of a session that keeps two views from every fit."""
-    document = calibrated()
-    document["left_out"] = document["left_out"][:-2]
-    return document | {"holdout": [_unseen(7), _unseen(8)]}
 
 
 def _parameter(
@@ -89,6 +77,6 @@ def _parameter(
     return {"joint": joint, "name": name} | figures
 
 
-def _unseen(view: int) -> dict[str, Any]:
+def unseen(view: int) -> dict[str, Any]:
     figures = {"nominal_mm": 0.6 + 0.05 * view, "nominal_deg": 0.08, "mm": 0.06, "deg": 0.004}
     return {"view": view} | figures

@@ -241,16 +241,15 @@ def kuka_named(text):
     return name.strip(), transform(rotation, np.array([x, y, z]) / 1000)
 
 
-def kuka_tool(text):
-    name, pose = kuka_named(text)
-    assert re.fullmatch(r"\$TOOL|TOOL_DATA\[\d+\]", name)
-    return pose
+def kuka_frame(kind):
+    """Reads the active tool or base, or one of their numbered data."""
 
+    def read(text):
+        name, pose = kuka_named(text)
+        assert re.fullmatch(rf"\${kind}|{kind}_DATA\[\d+\]", name)
+        return pose
 
-def kuka_base(text):
-    name, pose = kuka_named(text)
-    assert re.fullmatch(r"\$BASE|BASE_DATA\[\d+\]", name)
-    return pose
+    return read
 
 
 def mujoco(text):
@@ -263,8 +262,12 @@ def mujoco(text):
 
 
 # By the format's name: every format that holds a tool, and every one that holds a fixture.
-TOOL_READERS = {"ur-tcp": ur_tcp, "abb-tooldata": abb_tooldata, "kuka-tool": kuka_tool}
-FIXTURE_READERS = {"ur-feature": ur_feature, "abb-wobjdata": abb_wobjdata, "kuka-base": kuka_base}
+TOOL_READERS = {"ur-tcp": ur_tcp, "abb-tooldata": abb_tooldata, "kuka-tool": kuka_frame("TOOL")}
+FIXTURE_READERS = {
+    "ur-feature": ur_feature,
+    "abb-wobjdata": abb_wobjdata,
+    "kuka-base": kuka_frame("BASE"),
+}
 
 # Those of an arm, which test_cell_exports.py reads.
 ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")

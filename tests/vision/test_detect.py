@@ -148,21 +148,6 @@ def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
     assert list(refused.corners) == [1]
 
 
-@pytest.mark.slow
-def test_all_corners_of_the_smallest_boards_suffice():
-    charuco = replace(BOARDS["charuco"], columns=3, rows=3, square_m=0.06, marker_m=0.045)
-    tag = replace(BOARDS["aprilgrid"], columns=1, rows=1, square_m=0.06)
-    for target in (charuco, tag):
-        cell, images = images_of(CellOptions(views=2, target=target, cut_views=0.0, seed=6), 2)
-        seen = detect(
-            session_of({f"{at}.png": encoded(image) for at, image in enumerate(images)}, target)
-        )
-        for view, corners in seen.corners.items():
-            assert corners.ids.tolist() == [0, 1, 2, 3]
-            np.testing.assert_allclose(corners.px, cell.exact_corners[view].px, atol=0.05)
-        assert len(seen.corners) == 2
-
-
 @pytest.mark.parametrize("declared", [{"legacy": True}, {"columns": 6, "rows": 9}])
 def test_another_layout_than_declared_is_named(charuco, declared):
     cell, images = charuco

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
+import tomli_w
 from scipy.spatial.transform import Rotation
 
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -218,26 +219,13 @@ def _as_jpg(folder: Path) -> None:
 
 def _board(**changes: object) -> Callable[[Path], None]:
     """Declares a board of another make than the printed one, in a file beside the session."""
-    declared = {
-        "kind": "charuco",
-        "columns": 9,
-        "rows": 6,
-        "square_m": 0.03,
-        "marker_m": 0.022,
-        "dictionary": "DICT_5X5_100",
-    }
-    document = declared | changes
-    if document["kind"] == "checkerboard":
-        document = {
-            k: value for k, value in document.items() if k not in ("marker_m", "dictionary")
-        }
-    lines = (
-        f"{k} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
-        for k, value in document.items()
-    )
+    declared = {"kind": "charuco", "columns": 9, "rows": 6, "square_m": 0.03}
+    declared |= {"marker_m": 0.022, "dictionary": "DICT_5X5_100"} | changes
+    if declared["kind"] == "checkerboard":
+        del declared["marker_m"], declared["dictionary"]
 
     def planted(folder: Path) -> None:
-        (folder / "board.toml").write_text("".join(lines).replace("'", '"'))
+        (folder / "board.toml").write_text(tomli_w.dumps(declared))
         edit(folder, lambda text: text.replace('"charuco_9x6_30mm"', '"board.toml"'))
 
     return planted
