@@ -1,6 +1,6 @@
 """The simulated cell and arm: is its truth true, and do its pictures show it where it says?"""
 
-import dataclasses
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,12 +9,22 @@ from support.cells import exact
 from support.marks import slow
 from support.moved_arms import robot_with_bodies
 
-from visioncal.core.transforms import invert, log, rotation_angle
+from visioncal.core.transforms import invert, log, pose_difference, rotation_angle
 from visioncal.robot import body_regressor, joint_torques
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
+    BoardAt,
+    CameraAt,
     CellOptions,
+    InstrumentAt,
+    Moved,
+    NetworkOptions,
+    Payload,
+    PointAt,
+    RobotAt,
+    Second,
+    cell_session,
     fine_camera,
     fisheye_camera,
     forward,
@@ -38,10 +48,8 @@ from visioncal.simulation.dynamics import (
 )
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-SMALL = dataclasses.replace(
-    wide_camera(), resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2])
-)
-RATIONAL = dataclasses.replace(
+SMALL = replace(wide_camera(), resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2]))
+RATIONAL = replace(
     wide_camera(), distortion=np.array([0.31, -0.12, 4e-4, -3e-4, 0.01, 0.42, -0.1, 0.02])
 )
 
@@ -139,15 +147,15 @@ def test_same_seed_same_cell_and_each_option_has_its_own_randomness():
     np.testing.assert_array_equal(once.cam_from_target, again.cam_from_target)
     np.testing.assert_array_equal(once.corners[2].px, again.corners[2].px)
     np.testing.assert_array_equal(render(prepare_scene(once), 0), render(prepare_scene(again), 0))
-    shaken = simulate(dataclasses.replace(options, robot_sigma_m=1e-3, pixel_sigma_px=0.5))
+    shaken = simulate(replace(options, robot_sigma_m=1e-3, pixel_sigma_px=0.5))
     np.testing.assert_array_equal(shaken.robot.joints, once.robot.joints)
     assert not np.array_equal(shaken.cam_from_target, once.cam_from_target)
-    other = simulate(dataclasses.replace(options, seed=12))
+    other = simulate(replace(options, seed=12))
     assert np.abs(other.robot.joints - once.robot.joints).max() > 0.1
 
 
 def test_wrong_views_are_as_wrong_as_promised():
-    cell = simulate(dataclasses.replace(exact(CellOptions(views=30, seed=5)), wrong_views=9))
+    cell = simulate(replace(exact(CellOptions(views=30, seed=5)), wrong_views=9))
     error = invert(cell.robot.true_base_from_flange) @ cell.robot.base_from_flange
     shift, turn = np.linalg.norm(error[:, :3, 3], axis=1), np.rad2deg(rotation_angle(error))
     wrong = np.isin(np.arange(30), cell.wrong_views)
@@ -221,14 +229,14 @@ def detection_errors(options):
         CellOptions(),
         CellOptions(camera=fisheye_camera(), tilt_rad=(0.1, 0.5)),
         slow(CellOptions(target=BOARDS["checkerboard"], blur_px=1.0)),
-        CellOptions(target=dataclasses.replace(BOARDS["charuco"], legacy=True)),
+        CellOptions(target=replace(BOARDS["charuco"], legacy=True)),
         slow(CellOptions(board_scale=1.01, board_bow_m=0.003)),
         CellOptions(mount="eye-to-hand", distance_m=(0.5, 0.8)),
     ],
     ids=["charuco", "fisheye", "checkerboard", "legacy", "bowed", "to-hand"],
 )
 def test_pictures_show_the_corners_where_they_are(options):
-    errors = detection_errors(dataclasses.replace(options, views=2, seed=2))
+    errors = detection_errors(replace(options, views=2, seed=2))
     assert len(errors) > 120
     # Half a pixel's shift, or a third of one from the sub-pixels, would stand out. Some 150
     # corners at 0.04 px give their mean to 0.003 px.
@@ -239,14 +247,14 @@ def test_pictures_show_the_corners_where_they_are(options):
 def test_noise_blur_and_vignetting_are_in_the_picture():
     plain = exact(CellOptions(views=1, camera=SMALL, vignetting=0.0, seed=1))
     clean = render(prepare_scene(simulate(plain)), 0).astype(float)
-    noisy = render(prepare_scene(simulate(dataclasses.replace(plain, image_noise=3.0))), 0) - clean
+    noisy = render(prepare_scene(simulate(replace(plain, image_noise=3.0))), 0) - clean
     # 256,000 draws; rounding to grey levels adds 0.4 to 3.0 in squares.
     assert noisy.std() == pytest.approx(3.0, rel=0.05)
-    dark = render(prepare_scene(simulate(dataclasses.replace(plain, vignetting=0.4))), 0)
+    dark = render(prepare_scene(simulate(replace(plain, vignetting=0.4))), 0)
     # The outermost pixels are a little inside the corner, and the black level stays.
     ratio = (dark[:8, :8].mean() - 4.0) / (clean[:8, :8].mean() - 4.0)
     assert ratio == pytest.approx(0.6, abs=0.03)
-    soft = render(prepare_scene(simulate(dataclasses.replace(plain, blur_px=2.0))), 0)
+    soft = render(prepare_scene(simulate(replace(plain, blur_px=2.0))), 0)
     sharpness = [cv2.Laplacian(np.float32(image), cv2.CV_32F).std() for image in (clean, soft)]
     # A Laplacian of sigma 0.7 against 2.0 px: its response falls with the square of the sigma.
     assert sharpness[1] < 0.4 * sharpness[0]
@@ -254,7 +262,7 @@ def test_noise_blur_and_vignetting_are_in_the_picture():
 
 @pytest.mark.parametrize("quality", [None, 90])
 def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
-    target = dataclasses.replace(BOARDS["charuco"], name="own", square_m=0.025, marker_m=0.018)
+    target = replace(BOARDS["charuco"], name="own", square_m=0.025, marker_m=0.018)
     options = CellOptions(
         views=2, camera=SMALL, target=target, jpeg_quality=quality, wrong_views=1, seed=3
     )
@@ -265,7 +273,7 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
     assert shares[-1] == 1.0
     session = Session.load(folder)
     assert session.warnings == ()
-    assert dataclasses.replace(session.target, name="own") == target
+    assert replace(session.target, name="own") == target
     np.testing.assert_array_equal(session.camera.matrix, SMALL.matrix)
     for view in session.views:
         np.testing.assert_array_equal(view.joints_rad, cell.robot.joints[view.number])
@@ -350,3 +358,128 @@ def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
         # 500 random pixels against the grid that the size is set on: the edge counts most, a
         # fisheye's above all.
         assert np.sqrt(np.mean(np.sum(away**2, axis=1))) == pytest.approx(0.3, rel=0.25)
+
+
+EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
+OPTIONS = NetworkOptions(
+    cameras=(*NetworkOptions().cameras, CameraAt("hand", "a")),
+    boards=(*NetworkOptions().boards[1:], BoardAt("even", target=EVEN)),
+    instruments=(InstrumentAt("tracker", (1.0, -1.5, 0.5), 0.3),),
+    points=(PointAt("nest", "cell", (0.2, 0.1, 0.0)), PointAt("ball", "b", (0.0, 0.05, 0.1))),
+    stops=8,
+    lens_views=3,
+)
+
+
+STOPS = 8
+ONE_ARM = NetworkOptions(
+    robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=STOPS
+)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return simulate(OPTIONS)
+
+
+def chained(cell, frame, robots):
+    """`cell_from_frame` by the poses that rows tell, written out anew."""
+    parent, placed = cell.parents[frame], cell.mountings[frame]
+    if parent == "cell":
+        return placed
+    name = parent.removeprefix("flange_")
+    told = robots[name].base_from_flange().as_matrix()
+    return cell.mountings[f"base_{name}"] @ told @ placed
+
+
+def test_rows_tell_all_that_their_observations_need(cell):
+    session = cell_session(cell, "cell", seen="poses")
+    assert session.frames["target_even"] == "cell"
+    assert session.frames["cam_hand"] == "flange_a"
+    assert session.frames["point_ball"] == "flange_b"
+    pairs = {(observation.seer, observation.seen) for observation in session.observations}
+    # The camera on one robot looks at the board on the other.
+    assert ("cam_hand", "target_plate_b") in pairs
+    for observation in session.observations:
+        assert not observation.missing_robots
+        seer = chained(cell, observation.seer, observation.robots)
+        seen = chained(cell, observation.seen, observation.robots)
+        if observation.view.reading_m is not None:
+            off_mm = 1e3 * np.linalg.norm((invert(seer) @ seen)[:3, 3] - observation.view.reading_m)
+            # Four sigma of the tracker (15 um) and of the arm, whose turn acts at 0.1 m.
+            assert off_mm < 0.2
+            continue
+        mm, deg = pose_difference(
+            invert(seer) @ seen, observation.view.cam_from_target().as_matrix()
+        )
+        # Arms repeat to 0.03 mm and 0.003 deg, but the depth of small boards is seen to 1 mm.
+        assert mm < 6.0
+        assert deg < 0.5
+
+
+def test_faults_are_where_the_truth_says(cell):
+    faulty = simulate(
+        replace(
+            OPTIONS,
+            swapped_rows=1,
+            stray_images=2,
+            moved=(Moved("target_plate_b"), Moved("cam_left", 6, 0.02)),
+        )
+    )
+    assert len(faulty.wrong_views) == 4
+    other = {
+        new.view
+        for old, new in zip(cell.sights, faulty.sights, strict=False)
+        if old.view == new.view and not np.allclose(old.cam_from_target, new.cam_from_target)
+    }
+    moved = {
+        sight.view
+        for sight in cell.sights
+        if (sight.board == "plate_b" and sight.stop >= 4)
+        or (sight.camera == "left" and sight.stop >= 6)
+    }
+    # A push may take a board out of an image: then rows are numbered otherwise from there on.
+    early = {sight.view for sight in cell.sights if 0 <= sight.stop < 4}
+    assert other & early == set(faulty.wrong_views) & early
+    assert other & moved & {sight.view for sight in cell.sights if sight.stop == 4}
+
+
+def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
+    loads = (Payload(), Payload(5.0, (0.0, 0.0, 0.1)))
+    soft = RobotAt(
+        "a",
+        (-0.6, 0.0, 0.0),
+        robot_sigma_m=0.0,
+        robot_sigma_rad=0.0,
+        compliance_rad_per_nm=(1e-5,) * 6,
+        backlash_rad=(0.0, 1e-3, 0.0, 0.0, 0.0, 0.0),
+        payloads=loads,
+    )
+    cell = simulate(replace(ONE_ARM, robots=(soft,)))
+    for robot in (soft, replace(soft, payloads=())):
+        expected = robot.flange_at(
+            cell.robots["a"].true_arm,
+            cell.robots["a"].joints,
+            robot.loads(STOPS),
+            np.resize([-1.0, 1.0], STOPS),
+        )
+        away = np.abs(expected - cell.robots["a"].true_base_from_flange).max(axis=(1, 2))
+        # The second load of 5 kg bends the arm by some tenths of a millimetre.
+        assert (away[::2] < 1e-12).all()
+        assert (away[1::2] > 1e-5).all() == (not robot.payloads)
+    for view in cell_session(cell, "cell", seen="corners").views:
+        if view.text.get("robot"):
+            assert view.numbers["payload_kg"] == loads[view.stop % 2].kg
+            assert view.text["approach"] == "-+"[view.stop % 2]
+
+
+def test_one_robot_with_one_camera_is_a_cell_whose_things_have_no_names():
+    single = simulate(CellOptions(views=4, second=Second()))
+    assert single.robot_of("cam") == ""
+    assert single.robot_of("target_first") is None
+    for sight in single.sights:
+        board = single.mountings[f"target_{sight.board}"]
+        flange = single.robot.true_base_from_flange[sight.stop]
+        seen = invert(flange @ single.mountings["cam"]) @ board
+        # A product of matrices of order one.
+        np.testing.assert_allclose(seen, sight.cam_from_target, atol=1e-12)

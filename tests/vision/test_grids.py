@@ -1,4 +1,4 @@
-"""AprilGrids and circles: numbered as their makers do, exact, told from other pages."""
+"""AprilGrids, circles and dots: numbered as their makers do, exact, told from other pages."""
 
 import re
 from dataclasses import replace
@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.boards import any_page, aprilgrid, circles, printed
+from support.commands import visioncal
 from support.marks import slow
 from support.rendered import Shot, photograph
 
 from visioncal.calibration.run import run
+from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.intrinsics import read_target_description
 from visioncal.session import Session
@@ -28,6 +30,7 @@ from visioncal.vision.printing.page import pages_named
 from visioncal.vision.printing.request import requested_target
 from visioncal.vision.targets import (
     corner_positions,
+    load_target,
     rotation_transforms,
     rotations,
     target_document,
@@ -218,3 +221,40 @@ def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
         errors.append(error @ np.linalg.solve(result.joint_covariance, error))
     # Twelve values, to one case in a thousand.
     assert min(errors) < 32.9
+
+
+@pytest.fixture(scope="module")
+def dots(tmp_path_factory):
+    """A printed board, by the files that its printing wrote."""
+    folder = tmp_path_factory.mktemp("board")
+    done = visioncal("target", "make", "--kind", "dots", "-o", folder)
+    assert done.status == 0, done.err
+    (path,) = folder.glob("*.toml")
+    assert path.with_suffix(".pdf").stat().st_size > 0
+    return load_target(path)
+
+
+def test_a_board_is_what_its_files_say(dots):
+    assert target_from_document(target_document(dots), dots.name) == dots
+    assert len(corner_positions(dots)) == 14 * 9
+    alike = {"points": {**target_document(dots)["points"], "radius_m": [2e-3] * 126}}
+    with pytest.raises(DataError, match=r"4 dots of 1\.3 times the usual radius"):
+        target_from_document({"kind": "dots", **alike}, "mine")
+
+
+@pytest.mark.parametrize("camera", ["wide", "fisheye"])
+def test_centres_are_exact_and_rightly_numbered(dots, camera):
+    cell = simulate(
+        CellOptions(target=dots, camera=CAMERAS[camera], views=4, cut_views=0.0, seed=1)
+    )
+    scene = prepare_scene(cell)
+    for view, exact in enumerate(cell.exact_corners):
+        seen = find_target(render(scene, view), dots)
+        assert isinstance(seen, DetectedCorners), seen
+        # A fisheye sees the rim so aslant that its dots are thin ellipses.
+        assert len(seen.ids) >= (0.9 if camera == "wide" else 0.7) * len(exact.ids)
+        places = dict(zip(exact.ids.tolist(), exact.px, strict=True))
+        error = seen.px - [places[number] for number in seen.ids.tolist()]
+        # The centre of an ellipse would be off by 0.05 px and more where it is seen aslant.
+        assert np.sqrt(np.mean(error**2)) < 0.015
+    assert isinstance(find_target(np.full((400, 600), 200, np.uint8), dots), NotFound)
